@@ -1,4 +1,4 @@
-"""Everything a run may be told: four records whose fields say type, range, unit and meaning once.
+"""The options of a run: four records whose fields declare type, range, unit and meaning once.
 
 A record checks what is put into it, whoever does it: Python, an options file, a flag, or `replace`. The flags of the
 command line, the page of options, the JSON schema and `help(AdjustOptions)` are made of the same declarations.
@@ -33,10 +33,10 @@ HOOK = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"  # a name in a module
 _MAX_EXACT_INTEGER = 1 << 53  # whole numbers stay below: beyond, not every one has a double of its own
 _REAL = 1e30  # no option is larger, or smaller and not 0: squares, and squares of them, are numbers then
 GEOID_HELP = (
-    "Geoid that heights of a DEM, or of ground points, count from: `egm96`, `egm2008`, the file of a grid, or `none` "
-    "of ellipsoidal ones. Without: the one that their file names."
+    "Geoid of the heights of a DEM or of ground points: `egm96`, `egm2008`, the file of a grid, or `none` for "
+    "ellipsoidal heights. Without: the one that their file names."
 )
-HEIGHTS_HELP = "What heights count from in files that do not say it: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
+HEIGHTS_HELP = "Vertical datum of heights in files that state none: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
 MOST_POINTS = (TABLE.most or 0) // (5 * BYTES_PER_NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
@@ -210,23 +210,23 @@ class TieOptions(Options):
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
     matcher: str = option(
         "guided",
-        """What matches a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients
-        whatever the grey values, and where that finds nothing `fine-structure`, at whole pixels.
-        `module:name`: a function of yours, in a module that Python finds; it is run.""",
+        """Matcher of a pair: `guided`, keypoints, and structure where they find few; `structure`, gradients independent
+        of grey values, and `fine-structure`, at whole pixels, where that finds nothing. `module:name`: your own
+        function in an importable module; it is run.""",
         rows="barpc.tie.matchers.matching.MATCHERS",
         hook=True,
     )
-    tile: int = option(1024, "Side of the tiles that are read and searched for keypoints.", unit="px", least=128)
+    tile: int = option(1024, "Side of the tiles for reading and keypoint detection.", unit="px", least=128)
     min_overlap: float = option(
         0.05, "Share of the smaller footprint that a pair of views must have in common.", least=0, most=1
     )
     angles: tuple[float, float] = option(
         (0.0, 60.0), "Smallest and largest convergence angle of a pair.", unit="deg", least=0, most=180
     )
-    neighbours: int = option(8, "Best partners tried for a view, on top of what connects all views.", least=1)
+    neighbours: int = option(8, "Best partners tried for a view, besides the pairs that connect all views.", least=1)
     search: float | None = option(
         None,
-        "How far a camera may be wrong, in any direction. Without: 700 m on the ground, 20 px at least, 700 at most.",
+        "Largest expected camera error in any direction. Without: 700 m on the ground, 20 px at least, 700 at most.",
         unit="px",
         above=0,
     )
@@ -237,11 +237,11 @@ class TieOptions(Options):
         most=1,
     )
     min_matches: int = option(
-        12, "Verified matches that a pair needs to count; two thirds where thresholds are loosened.", least=4
+        12, "Verified matches that a pair needs; two thirds where thresholds are relaxed.", least=4
     )
     points_per_image: int = option(
         5000,
-        "Observations kept in an image, at most, evenly spread; with more, images are looked at more closely.",
+        "Most observations kept in an image, evenly spread; a larger number makes the search denser.",
         least=1,
     )
 
@@ -261,30 +261,30 @@ class AdjustOptions(Options):
     model: Model = option(
         "auto",
         """Unknowns of each view; the last three act in the image. `auto`: a rotation and a translation, or an affine in
-        the image where they leave a trend that the affine takes away.""",
+        the image where they leave a trend that the affine removes.""",
     )
     center: Literal["line", "projective"] = option(
         "line",
-        """What a view turns about: where the rays of its middle line meet, or, as in the paper, the centre of a
-        projective camera over the whole image, at about twice the distance.""",
+        """Centre of rotation of a view: the intersection of the rays of its middle line, or, as in the paper, the
+        centre of a projective camera over the whole image, at about twice the distance.""",
     )
     drift: int | None = option(
         None,
         """Degree of the rotation as a polynomial of the image row, 0: constant. Without: 1 for models with a
-        rotation, and 2 where the residuals ask for it.""",
+        rotation, and 2 where the residuals require it.""",
         least=0,
         most=2,
     )
     jitter: str = option(
         "auto",
-        """What rotations leave along the rows: a spline in every image. `auto`: where the residuals ask for it and tie
-        points that took no part are met better, and `drift` is not 0; `off`; or the rows between its knots.""",
+        """Splines along the rows of every image for attitude jitter. `auto`: where the residuals require them, check
+        tie points improve and `drift` is not 0; `off`; or the number of rows between knots.""",
         unit="auto|off|rows",
     )
     detectors: tuple[float, ...] = option(
         (),
-        """Column of every image at which another detector begins. Without: found, with `jitter`, where residuals
-        step.""",
+        """Column of every image at which another detector begins. Without: detected, with `jitter`, by steps of the
+        residuals.""",
         unit="px",
         above=0,
     )
@@ -297,20 +297,20 @@ class AdjustOptions(Options):
     )
     sigma_position: float | None = option(
         None,
-        """Prior standard deviation of the translation along an axis; of a radar's range and place along the flight.
-        Without: as for the attitude, or what a radar's orbit and metadata state.""",
+        """Prior standard deviation of the translation along an axis; of a radar's range and position along the flight.
+        Without: as for the attitude, or the accuracy stated by a radar's orbit and metadata.""",
         unit="m",
         above=0,
     )
     learn_priors: bool = option(
         True,
-        """Widen the priors of rotation and translation where the corrections contradict them, of all views or of an
-        odd one, and learn the drift's.""",
+        """Widen the priors of rotation and translation where the corrections contradict them, for all views or
+        single ones, and estimate that of the drift.""",
     )
     noise_floor: float = option(
         0.02,
-        """Part of a view's tie-point errors that does not average away: however many observations a view has, their
-        information together is at most 1 / noise_floor^2. 0 for independent errors.""",
+        """Tie-point error common to a view, which does not average out: the information of all its observations
+        together is at most 1 / noise_floor^2. 0 for independent errors.""",
         unit="px",
         least=0,
     )
@@ -319,23 +319,23 @@ class AdjustOptions(Options):
         "Robust loss of the first rounds; `linear` skips them.",
         rows="barpc.ba.robust.weights.LOSSES",
     )
-    estimate_noise: bool = option(True, "Scale the observations' sigmas by what the residuals show.")
-    fixed: tuple[str, ...] = option((), "A view that keeps the camera it came with.", unit="name")
+    estimate_noise: bool = option(True, "Scale the observations' sigmas by the scatter of the residuals.")
+    fixed: tuple[str, ...] = option((), "A view that keeps its delivered camera.", unit="name")
     dem_sigma: float = option(
         10.0,
-        """Standard deviation of single heights of the DEM, until the tie points show it.""",
+        """Standard deviation of single heights of the DEM, until it is estimated from the tie points.""",
         unit="m",
         above=0,
     )
     dem_bias_sigma: float | None = option(
         None,
-        """Standard deviation of what all heights of the DEM are wrong by together, and of its slopes and bends at the
-        scene's edges. Without: 5 m where it is known what they count from, else 20 m (a geoid left out is as much).""",
+        """Standard deviation of the error common to all heights of the DEM, and of its tilts and bends at the scene's
+        edges. Without: 5 m where their vertical datum is known, else 20 m (the effect of a missing geoid).""",
         unit="m",
         above=0,
     )
     min_convergence: float = option(
-        1.0, "Tracks whose rays meet under a smaller angle are held in height.", unit="deg", least=0, most=180
+        1.0, "Tracks with a smaller convergence angle are constrained in height.", unit="deg", least=0, most=180
     )
     solver: Literal["auto", "scipy", "sparse"] = option(
         "auto",
@@ -388,24 +388,24 @@ class FitOptions(Options):
     )
     space: Literal["image", "ground"] = option(
         "image",
-        """Whether the grid goes by (col, row, alt), on Chebyshev-Lobatto nodes, or as in the paper by (lon, lat, alt),
-        in even steps.""",
+        """Axes of the grid: (col, row, alt) at Chebyshev-Lobatto nodes, or as in the paper (lon, lat, alt) in even
+        steps.""",
     )
     tolerance: float = option(
-        0.01, "A fit whose check points miss by more in one coordinate is refused.", unit="px", above=0
+        0.01, "Largest error of a check point in one coordinate; a fit with more is refused.", unit="px", above=0
     )
     pole_margin: float = option(
         0.1,
-        """How far around the image's own ground, as a share of its half width, denominators stay above a tenth of what
-        they are in its middle: room for those who leave the image. With 0 a camera that cubics follow badly is often
-        followed better.""",
+        """Margin around the ground of the image, as a share of its half width, in which denominators stay above a tenth
+        of their value at the centre, for use outside the image. With 0 the fit to a camera that cubics represent badly
+        is often better.""",
         least=0,
     )
-    precision: Literal["nitf", "rpcm"] | None = option(None, "Fit numbers that a format with few digits can hold.")
+    precision: Literal["nitf", "rpcm"] | None = option(None, "Fit coefficients to the few digits of a format.")
     localisation: bool = option(
         False,
-        """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude, which txt, json and
-        vrt files hold.""",
+        """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude; txt, json and vrt
+        files store it.""",
     )
 
     def __post_init__(self) -> None:
@@ -423,8 +423,8 @@ class RunOptions(Options):
     fit: FitOptions = field(default_factory=FitOptions)
     images: Literal["vrt", "copy", "none"] = option(
         "vrt",
-        """What carries the corrected RPC: a small VRT that points at the untouched image, a full copy, or no image
-        at all.""",
+        """Image file with the corrected RPC: a small VRT that points at the untouched image, a full copy, or
+        none.""",
     )
     rpc_formats: tuple[str, ...] = option(("txt",), "RPC files to write.", rows="barpc.rpcio.WRITABLE")
     grids: bool = option(
@@ -433,16 +433,15 @@ class RunOptions(Options):
         corrected camera by more than 0.02 px. RPCs that miss the fit's tolerance are no failure then.""",
     )
     resample: bool = option(
-        False, "Write every image resampled, too, so that one RPC holds its camera; and its correction grid."
+        False, "Also write every image resampled, so that one RPC represents its camera, and its correction grid."
     )
     stop_after: Literal["matching", "adjustment", "all"] = option(
         "all", "End early: after the tracks, or before RPCs are written."
     )
     keep_going: bool = option(
         False,
-        """Do what can be done instead of stopping: leave out a file that cannot be used and images that the largest
-        connected group is not tied to, write an RPC that misses the fit's tolerance. Such a run ends with exit code
-        3.""",
+        """Continue where possible instead of stopping: leave out unusable files and images not tied to the largest
+        connected group, and write RPCs that miss the fit's tolerance. Such a run ends with exit code 3.""",
     )
     overwrite: bool = option(False, "Replace the results of an earlier run in the same folder.")
     allow_remote: tuple[str, ...] = option(
@@ -480,39 +479,39 @@ class RunOptions(Options):
     altimetry: tuple[str, ...] = option(
         (),
         """Heights without image coordinates (ICESat-2, GEDI, lidar): CSV of lon, lat, alt, perhaps sigma and sigma_flat
-        [m]. They hold the scene where most of them agree with the surface of the tie points.""",
+        [m]. They constrain the scene where most of them agree with the surface of the tie points.""",
         unit="file",
     )
     check_points: tuple[str, ...] = option(
-        (), "Ground points that stay out of the adjustment and are measured after it.", unit="file"
+        (), "Independent check points: not used in the adjustment, measured after it.", unit="file"
     )
     add_to: str | None = option(
         None,
-        "A finished run that the images are added to: only those of its images that they meet are matched.",
+        "A finished run to add the images to: only its images that overlap new ones are matched.",
         unit="dir",
     )
     update: bool = option(
         False,
-        "With `add_to`: write cameras of that run that move, too.",
+        "With `add_to`: also write changed cameras of that run.",
     )
     dem: tuple[str, ...] = option(
         (),
-        """Terrain heights: they hold the scene's height and, as far as its relief tells, its place. Of several the
-        first that knows a place counts.""",
+        """Terrain heights: they constrain the scene's height and, as far as its relief allows, its position. Of
+        several, the first with a height at a point counts.""",
         unit="file",
     )
     geoid: str | None = option(None, GEOID_HELP, unit="file")
     heights: str | None = option(None, HEIGHTS_HELP, unit="file")
     reference: tuple[str, ...] = option(
         (),
-        """Orthoimage in the right place, of any date, resolution and CRS: with the heights of `dem` it holds the block.
-        Where several show a place, the first counts.""",
+        """Correctly positioned orthoimage of any date, resolution and CRS: with the heights of `dem` it constrains the
+        block. Of several, the first that covers a point counts.""",
         unit="file",
     )
     reference_sigma: float | None = option(
         None,
-        """Standard deviation of the reference's own place, along an axis. Without: a quarter of its pixel, but at least
-        0.5 m.""",
+        """Standard deviation of the reference's own position along an axis. Without: a quarter of its pixel, but at
+        least 0.5 m.""",
         unit="m",
         above=0,
     )
@@ -520,11 +519,11 @@ class RunOptions(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.update and self.add_to is None:
-            raise InputError("update is given without add_to: there is no run whose cameras could move")
+            raise InputError("update is given without add_to: there is no run with cameras to update")
         if self.geoid is not None and not (self.dem or self.gcp or self.check_points):
             raise InputError("geoid is given without dem or ground points: there are no heights to convert")
         if self.reference and not self.dem:
-            raise InputError("reference is given without dem: an orthoimage tells no heights")
+            raise InputError("reference is given without dem: an orthoimage has no heights")
         if self.reference_sigma is not None and not self.reference:
             raise InputError("reference_sigma is given without reference")
         if self.matches_only and not self.matches:
@@ -537,7 +536,7 @@ class RunOptions(Options):
                 raise InputError(f"{name} is given with matches_only: nothing is matched then; leave one of them out")
 
 
-# --- what is made of them ---------------------------------------------------------------------------------
+# --- derived from the records -----------------------------------------------------------------------------
 
 
 PAPER: Mapping[str, Mapping[str, Any]] = {
@@ -571,20 +570,18 @@ class DsmOptions(Options):
     )
     alt: tuple[float, float] | None = option(
         None,
-        """Altitudes between which the ground is looked for. Without: those of a run's tie points and a margin, or
-        those that the cameras are made for.""",
+        """Range of altitudes to search for the ground. Without: that of a run's tie points and a margin, or that of the
+        cameras.""",
         unit="m",
         least=-1000,
         most=10000,
     )
-    pairs: int = option(
-        4, "Pairs of images that a place is matched in, at most; the best come first.", least=1, most=16
-    )
+    pairs: int = option(4, "Most image pairs matched at a point; the best come first.", least=1, most=16)
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
     minus: str | None = option(
         None,
-        """Take away the surface of the images that this run has, and give what changed: a finished run of one date's
-        images, which the run of both dates has, too. What both dates share is no error of the difference.""",
+        """Subtract the surface of the images of this run, and write the change: a finished run of the images of one
+        date, which the run of both dates also has. Errors common to both dates cancel.""",
         unit="dir",
     )
     overwrite: bool = option(False, "Replace the file if it exists.")
@@ -638,7 +635,7 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
     for name in data:
         if (one := declared(RunOptions).get(name)) is not None and one.rule.cli_only:
-            raise InputError(f"{path}: {name} is not taken from a file, which may be anybody's; give the flag")
+            raise InputError(f"{path}: {name} is not accepted from a file of unknown origin; give the flag")
     _refuse_code(path, RunOptions, data)
     return with_values(options or RunOptions(), data, str(path))
 
@@ -651,7 +648,7 @@ def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, A
             _refuse_code(path, type(one.default), value)
         elif one.rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
             raise InputError(
-                f"{path}: {name} {value!r} would run code, which is not taken from a file; give the flag --{name}"
+                f"{path}: {name} {value!r} would run code, which is not accepted from a file; give the flag --{name}"
             )
 
 

@@ -37,14 +37,14 @@ COMMANDS = {
     "match": "Match tie points and stop.",
     "check": "Measure how well cameras agree, without adjusting.",
     "fit": "Fit an RPC to any camera or to points, and certify it.",
-    "info": "Where cameras come from, how they look at the ground and at each other.",
+    "info": "Sources of cameras, their view angles, and the geometry of pairs.",
     "project": "Ground points to image points.",
     "localize": "Image points to ground points, at an altitude or on a DEM.",
     "triangulate": "Corresponding image points to ground points.",
-    "convert": "Write RPCs in other formats, cut out windows, hand images over.",
-    "export": "Hand a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
+    "convert": "Write RPCs in other formats, cut out windows, deliver images.",
+    "export": "Export a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
-    "verify": "Whether a finished run is still what it was: inputs, outputs, cameras.",
+    "verify": "Verify that inputs, outputs and cameras of a finished run are unchanged.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
@@ -114,7 +114,7 @@ class Verbs(click.Group):
     "-q",
     "--quiet",
     is_flag=True,
-    help="Errors only, and numbers or JSON that were asked for: no verdict, no progress, no log.",
+    help="Errors only, and requested numbers or JSON: no verdict, no progress, no log.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Results as JSON on stdout.")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
@@ -126,8 +126,8 @@ def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
     Example:
       barpc adjust scene/*.tif -o adjusted
 
-    Exit codes: 0 done, and nothing needs a look; 1 an error (one line says which file and what to do); 2 wrong
-    usage; 3 finished, but an image, a control point or a file needs a look (the last line says which and why); 130
+    Exit codes: 0 done without reservation; 1 an error (one line names the file and the remedy); 2 wrong usage; 3
+    finished, but an image, a control point or a file needs review (the last line names it and the reason); 130
     interrupted.
     """
     if not has_room(_LIBRARIES):  # OpenBLAS tries for ever, deaf to signals

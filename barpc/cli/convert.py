@@ -68,7 +68,7 @@ GroundBox = tuple[float, float, float, float]
     "--move",
     callback=read_move,
     metavar="E,N,U",
-    help="With -o: move the ground by metres east, north, up, from where the cameras put it to its true place.",
+    help="With -o: shift the ground by metres east, north, up, from its position by the cameras to the true one.",
 )
 @click.option(
     "--transform",
@@ -79,7 +79,7 @@ GroundBox = tuple[float, float, float, float]
 @click.option(
     "--bbox",
     type=(float, float, float, float),
-    help="Cut out WEST SOUTH EAST NORTH [deg]; with -o of every image that shows it.",
+    help="Cut out WEST SOUTH EAST NORTH [deg]; with -o of every image that covers it.",
 )
 @click.option("--aoi", metavar="FILE", help="Cut out the box around polygons in lon/lat (GeoJSON), as --bbox.")
 @with_heights("Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]")
@@ -274,7 +274,7 @@ def windows_of(
                 raise
             remark(f"{path} is left out: {error.message}")
     if not found:
-        raise click.UsageError("no image shows what is to be cut out")
+        raise click.UsageError("no image covers the area to be cut out")
     return found
 
 

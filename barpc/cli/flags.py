@@ -144,7 +144,7 @@ paper = click.option(
     "--paper",
     is_flag=True,
     help="The method of Akiki et al. (IGARSS 2021) whole: one rotation and translation about a projective centre, no "
-    "drift, no splines, least_squares, RPCs by the joint L-curve on a grid in lon and lat. Options, other flags win.",
+    "drift, no splines, least_squares, RPCs by the joint L-curve on a grid in lon and lat. Options and flags win.",
 )
 
 

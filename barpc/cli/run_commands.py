@@ -66,9 +66,9 @@ def report(run_dir: str, other: str | None) -> int:
 )
 @click.option("--overwrite", is_flag=True, help="Replace what an earlier export wrote.")
 def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | None, overwrite: bool) -> int:
-    r"""Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
+    r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
-    satnerf: JSON an image with the RPC; colmap: pinhole cameras that come near the RPCs, with the largest error of
+    satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
     each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
     commands for orthoimages; stac: a collection for catalogues; points: tie points with their covariance. Images are
     pointed at, relative to OUT_DIR, and never copied.
@@ -88,7 +88,7 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     for path in paths:
         tell(path)
     if target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
-        remark("the images stay where they are: move them together with both folders, or adjust with --images copy")
+        remark("the images are not copied: move them together with both folders, or adjust with --images copy")
     return 0
 
 
@@ -97,12 +97,12 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
 @click.option("--expect", metavar="ROOT", help="The root that was printed, or a later one.")
 def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
-    r"""Say which files of a run or export are changed, missing or added, and whether cameras read as certified.
+    r"""List changed, missing and added files of a run or export, and check that cameras read as certified.
 
-    SHA256SUMS lists all (but .barpc), for `sha256sum -c`, too; its own SHA-256 is the root. Edits of files and list
-    alike are found by --expect alone. Inputs that are gone are looked for by name beside the run, in it, and in the
-    folders given; other hosts are not asked. Exit code 0: all that was asked is as it was; 3: something is
-    not; 1: no SHA256SUMS (interrupted, or of release 0.3), or a damaged one.
+    SHA256SUMS lists all (but .barpc), also for `sha256sum -c`; its own SHA-256 is the root. Only --expect detects
+    edits of a file together with the list. Missing inputs are searched by name beside the run, in it, and in the
+    folders given; other hosts are not accessed. Exit code 0:
+    everything is unchanged; 3: something is not; 1: no SHA256SUMS (interrupted, or of release 0.3), or a damaged one.
 
     \b
     Examples:
@@ -127,7 +127,7 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
             tell(f"{kind}s: {told or 'none'}")
     if not wrong:
         return 0
-    return tell_gate("the run is not what it was:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
+    return tell_gate("the run has changed:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
 
 
 # --- a surface --------------------------------------------------------------------------------------------
@@ -155,17 +155,17 @@ def _field_option(name: str, kind: Any, metavar: str | None = None) -> Callable[
 @_field_option("overwrite", bool)
 @click.pass_obj
 def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:
-    r"""Make a first surface model (DSM) of a finished run, or of images with the cameras that come with them.
+    r"""Make a first surface model (DSM) of a finished run, or of images with their delivered cameras.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
     cell of a map gets the median of the pairs that agree. The file, a Cloud-Optimised GeoTIFF, has five bands: height
     above the ellipsoid, number of pairs, their disagreement, and the height's standard deviation by matching and by
-    cameras; its tag SIGMA_SHARED_BY_ALL_CELLS_M says how well the height of the whole is known. Only a run knows its
-    cameras'.
+    cameras; its tag SIGMA_SHARED_BY_ALL_CELLS_M is the standard deviation of the height common to all cells. Those by
+    cameras exist for a run only.
 
     The run's report.html then shows a window of the ground by the delivered and by the corrected cameras.
 
-    Exit code 3: nothing is written, as the images cannot be matched in this way, and a line says why.
+    Exit code 3: nothing is written, as the images cannot be matched in this way; a line states the reason.
 
     \b
     Examples:
@@ -180,7 +180,7 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
     run = runs[0] if runs else None
     options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
     if run is None and options.minus is not None:
-        raise click.UsageError("--minus goes with a RUN: what two dates share is not known of images")
+        raise click.UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
     surface = made(obj, run or expanded(source), out, options, jobs)
     if surface is not None and wants_json():
         from barpc.report.records import json_form
@@ -192,7 +192,7 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
 def made(
     obj: dict[str, Any], source: Path | list[str], out: str | Path, options: DsmOptions, jobs: int | str
 ) -> Surface | None:
-    """Make a surface and tell of it; None where the images cannot be matched, and a line says why."""
+    """Make a surface and print its figures; None, with a line on the reason, where the images cannot be matched."""
     from barpc.dsm import NoSurfaceError, make_dsm
 
     try:

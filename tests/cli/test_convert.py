@@ -310,7 +310,7 @@ def test_an_area_that_no_image_shows_leaves_no_folder(
     paths, _ = four
     area = an_area(tmp_path / "a.geojson", 100.0, 10.0, 100.1, 10.1)
     assert run("convert", *paths, "-o", str(tmp_path / "crops"), "--aoi", str(area)) == 2
-    assert "no image shows what is to be cut out" in capsys.readouterr().err
+    assert "no image covers the area to be cut out" in capsys.readouterr().err
     assert not (tmp_path / "crops").exists()
 
 

@@ -293,7 +293,7 @@ def test_an_export_names_its_files_and_says_where_images_stay(
     assert run(*words) == 0
     said = capsys.readouterr()
     assert said.out == "x\ny\n"
-    assert ("the images stay where they are" in said.err) == told
+    assert ("the images are not copied" in said.err) == told
     assert run(*words, "--json", "--overwrite", "--alt", "80", "320") == 0
     said = capsys.readouterr()
     assert (json.loads(said.out), said.err) == (["x", "y"], "")
