@@ -123,7 +123,7 @@ def real(data: Path, work: Path) -> Iterator[str]:
     """Real pairs: epipolar offset and dense matching."""
     yield "\n## Real images\n"
     yield (
-        "Pléiades crops, 0.5 m. *Tie points*: RMS of what is left. *dy*: vertical offset of patches that "
+        "Pléiades crops, 0.5 m. *Tie points*: RMS residual. *dy*: vertical offset of patches that "
         "are no tie points, in images resampled along the epipolar lines; *valid*: share of pixels that "
         "OpenCV's semi-global matching keeps ([how](recipes/stereo.md#before-and-after-in-numbers))."
     )

@@ -56,7 +56,7 @@ class TiePointError(BarpcError):
 
 class DisconnectedError(TiePointError):
     """The views fall into groups that share no tie point: `groups`, tuples of their names, the largest first; `said`,
-    what is known to be wrong with some of them, by name.
+    known faults of some of them, by name.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class AdjustError(BarpcError):
 
 
 class FitError(BarpcError):
-    """A fitted RPC does not reach the tolerance that was asked for."""
+    """A fitted RPC misses its tolerance."""
 
 
 class InputError(BarpcError, ValueError):

@@ -1,4 +1,4 @@
-"""Numbers that mean the same wherever something is decided or computed, each in one place."""
+"""Statistical constants: significance levels, robust estimation, sample sizes and limits of iterations."""
 
 from typing import Any
 
@@ -6,108 +6,108 @@ import numpy as np
 
 from barpc.base.geodesy import Array
 
-# --- what is sure -----------------------------------------------------------------------------------------
+# --- significance -----------------------------------------------------------------------------------------
 
 LEVEL = 0.05
-"""Usual level of a test: what is less probable by chance is asked about."""
+"""Usual significance level of a test."""
 
 CHANCE = 1e-3
-"""Level of a test that names something in a block: one sound block in a thousand."""
+"""Significance level of a test with a finding in the verdict: one false alarm in a thousand sound blocks."""
 
 SURE = 5.0
-"""Nats: an explanation that gains less is none, and of two that differ by less (a factor of 150) none is ruled out."""
+"""Log evidence [nats] that selects a hypothesis over another: a Bayes factor of 150."""
 
 SURELY = 3.0
-"""Standard deviations: normal errors are larger once in 370."""
+"""Standard deviations of a significant difference: exceeded by normal errors once in 370."""
 
 OUTLIER = 5.0
-"""Standard deviations: of a million normal errors not one is larger. What is farther off is something else."""
+"""Standard deviations of an outlier: not one of a million normal errors is larger."""
 
 CRITICAL = 4.0
-"""Standard deviations of what many are tested by: a component is larger by chance once in 16,000, one of five points
-once in a thousand."""
+"""Critical value of a test of many residuals: exceeded by a component once in 16,000, by one of five points once in a
+thousand."""
 
 BIWEIGHT = 4.685
-"""Standard deviations at which Tukey's biweight ends: 95 % as efficient as least squares where all is normal."""
+"""Constant of Tukey's biweight: 95 % efficiency for normal errors."""
 
 MAD = 1.4826
-"""Of a median of distances: the standard deviation of normal errors."""
+"""Standard deviation of normal errors over their median absolute deviation."""
 
 MUCH_NOISE = 1.5
-"""Times what is stated: more noise than that is no noise."""
+"""Upper limit of a noise estimate over the stated noise."""
 
 LEAST_NOISE = 0.25
-"""Times what is stated: less noise than that is a few that fit by chance."""
+"""Lower limit of a noise estimate over the stated noise: less is a chance fit of few observations."""
 
 TIMES = 30.0
-"""What is learnt lies within so many times of what is guessed, either way."""
+"""Largest ratio of an estimate to its initial value, either way."""
 
 GROSS = 100.0
-"""Standard deviations of what holds nothing: of another place, or open."""
+"""Standard deviations of an effectively unconstrained quantity, or of a gross error."""
 
-# --- what is enough ---------------------------------------------------------------------------------------
+# --- sample sizes and iterations --------------------------------------------------------------------------
 
 FEW = 30
-"""Observations that tell a standard deviation to an eighth, 1 / sqrt(2 n): fewer tell nothing by themselves."""
+"""Sample size that determines a standard deviation to an eighth, 1 / sqrt(2 n)."""
 
 FEWEST = 20
-"""Observations, or degrees of freedom, that tell a variance to a third, sqrt(2 / n): of fewer nothing is said."""
+"""Degrees of freedom that determine a variance to a third, sqrt(2 / n)."""
 
 MANY = 100
-"""Observations that can be told apart into two kinds, or of which some can be spared."""
+"""Sample size for a mixture of two classes, or for check observations."""
 
 SAMPLE = 2000
-"""Observations or points that stand for all."""
+"""Size of a representative subsample."""
 
 BEST = 0.2
-"""Part of the observations, the nearest: even where many are wrong right ones are among them."""
+"""Lower quantile of residuals assumed free of outliers."""
 
 TRIALS = 150
-"""Draws of three: where half are right, all of them miss three right ones once in 5e8."""
+"""Random samples of three: with half inliers, none is free of outliers once in 5e8."""
 
 STATED_FREEDOM = 4.0
-"""Observations, or degrees of freedom, that a figure stated counts for beside what is seen."""
+"""Degrees of freedom of a stated standard deviation as a prior."""
 
 RIVALS = 3
-"""Ways to explain the same, the best and those after it, that are gone on with."""
+"""Hypotheses kept in a beam search."""
 
 TRIED = 6
-"""What is tried, or taken, one by one where each is a solve of its own, at most."""
+"""Most candidates tried one by one, each with its own solution."""
 
 STEPS = 3
-"""Of what is nearly linear: kilometres away, what is left is below a micrometre."""
+"""Iterations of a nearly linear problem: kilometres away, the remainder is below a micrometre."""
 
 BACKFITTING = 6
-"""Turns of parts that are fitted in turn: what is left of a guess is below a thousandth of it."""
+"""Sweeps of backfitting: the influence of initial values is below a thousandth."""
 
 ITERATIONS = 100
-"""Of what ends by itself when it stands, at most."""
+"""Most iterations of a convergent procedure."""
 
 STANDS = 0.05
-"""Change of a size, as part of it, below which it stands."""
+"""Relative change at convergence."""
 
 SLIGHT = 1e-3
-"""Part of the observations that decides nothing."""
+"""Negligible share of the observations."""
 
 SHRINK = 0.25
-"""Of a loss's scale that is left in one step, at least: it follows what is right out of what is wrong."""
+"""Least factor of a loss scale in one step of graduated non-convexity."""
 
 # --- arithmetic -------------------------------------------------------------------------------------------
 
 KEPT = 1_000_000
-"""Observations whose derivatives are kept from one step to the next, some 200 bytes each."""
+"""Most observations with derivatives kept between steps, some 200 bytes each."""
 
 ROUNDING = 1e-9
-"""Of a size: what differs by less is the same but for rounding, and a column that adds less to others is none."""
+"""Relative rounding error: limit of equality, and of linear dependence of columns."""
 
 RIDGE = 1e-6
-"""Of the weight of what is known: what nothing tells stays where it is."""
+"""Relative weight of a ridge that keeps undetermined unknowns at their initial values."""
 
 LARGEST = 12_000
-"""Unknowns of a block up to which parts of it are solved again for what may explain them."""
+"""Most unknowns of a block in which hypotheses on parts of it are tested."""
 
 SMALL = 400
-"""Unknowns up to which a block is solved again for every explanation that is tried."""
+"""Most unknowns of a block that is solved again for every hypothesis."""
 
 
 def robust_spread(values: Array, center: float | Array = 0.0) -> Any:

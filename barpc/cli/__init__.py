@@ -37,14 +37,14 @@ COMMANDS = {
     "match": "Match tie points and stop.",
     "check": "Measure how well cameras agree, without adjusting.",
     "fit": "Fit an RPC to any camera or to points, and certify it.",
-    "info": "Sources of cameras, their view angles, and the geometry of pairs.",
+    "info": "Sources, view angles and pair geometry of cameras.",
     "project": "Ground points to image points.",
     "localize": "Image points to ground points, at an altitude or on a DEM.",
     "triangulate": "Corresponding image points to ground points.",
     "convert": "Write RPCs in other formats, cut out windows, deliver images.",
     "export": "Export a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
-    "verify": "Verify that inputs, outputs and cameras of a finished run are unchanged.",
+    "verify": "Whether inputs, outputs and cameras of a run are unchanged.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""

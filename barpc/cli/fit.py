@@ -113,7 +113,7 @@ def _fit_source(source: str, output: str | None, flags: dict[str, Any]) -> tuple
         if points.note:
             remark(points.note)
         if (alt := ground[:, 2]).min() == alt.max():
-            say(f"all points are at {alt[0]:g} m: the RPC's heights hold no terms, it is good at that altitude only")
+            say(f"all points are at {alt[0]:g} m: the RPC has no terms in height and is valid at that altitude only")
         fit = fit_rpc_points(ground, image, sigma=points.sigma, size=size, options=options, strict=False)
         return fit, options.tolerance, size
     camera = open_camera(source)
@@ -128,7 +128,9 @@ def _fit_source(source: str, output: str | None, flags: dict[str, Any]) -> tuple
         if not fit.verdict(options.tolerance):
             return fit, options.tolerance, camera.size
         low, high = alt_range
-        remark(f"no RPC holds all ground on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m")
+        remark(
+            f"no RPC represents all altitudes on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m"
+        )
     fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
     return fit, options.tolerance, camera.size
 

@@ -36,7 +36,7 @@ def info(
     terrain: Dem | None,
     outlines: bool,
 ) -> int:
-    r"""Say where a camera comes from, what it covers and how it looks at the ground; of several, each pair's angle.
+    r"""Print the source of a camera, its coverage and view angles; of several, each pair's angle.
 
     The azimuth is that of the direction from the ground to the sensor, clockwise from north. A pair's convergence
     angle is taken at the first image's centre, or at --at. An IMAGE is a file with an RPC, a Sentinel-1 or TerraSAR-X

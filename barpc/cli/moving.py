@@ -144,7 +144,7 @@ def _tell_motion(matrix: Array, middle: Array) -> None:
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
     if rounding > _NOTEWORTHY_ROUNDING:
-        remark(f"the matrix is written with few digits: it places the ground to some {rounding:.2g} m only")
+        remark(f"the matrix is written with few digits: it determines the ground to some {rounding:.2g} m only")
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
     scale, place = float(stretch.mean()), f"lon {at[0]:.7f}, lat {at[1]:.7f}"
     turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))

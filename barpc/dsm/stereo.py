@@ -253,9 +253,9 @@ class CameraErrors:
 
 @dataclass(frozen=True, eq=False)
 class StereoBlock:
-    """Views with the cameras that are believed, their pairs, and the errors of the cameras where known.
+    """Views with their best cameras, their pairs, and the errors of the cameras where known.
 
-    `run`: what was said of the run that they are of.
+    `run`: the summary of their run.
     """
 
     views: Sequence[View]
@@ -345,7 +345,7 @@ def _ranked_pairs(
     if not rows:
         said = [f"{views[p.views[0]].name} and {views[p.views[1]].name} {p.angle:.1f} deg" for p in found[:3]]
         raise NoSurfaceError(
-            f"no pair meets under {CONVERGENCE_RANGE[0]:g} to {CONVERGENCE_RANGE[1]:g} degrees, where SGBM can match "
+            f"no pair has a convergence angle of {CONVERGENCE_RANGE[0]:g} to {CONVERGENCE_RANGE[1]:g} degrees for SGBM "
             f"({'; '.join(said) or 'no two images overlap at the altitudes that they are used for'})"
         )
     rows.sort()

@@ -294,7 +294,7 @@ class Grid:
 
 
 def _crs(given: str | None, middle: Array) -> CRS:
-    """Return the CRS that was asked for, in metres, or the UTM zone of a place."""
+    """Return the requested CRS, in metres, or the UTM zone of a position."""
     if given is None:
         return CRS.from_string(utm(*middle[:2])[1])
     try:

@@ -49,7 +49,7 @@ class Sampled:
 class Shot:
     """An image of a run with its corrected camera.
 
-    `file`: what holds its pixels: the image, or a URL; `carrier`: the run's VRT or copy, with the RPC in it, if there
+    `file`: the image, or its URL; `carrier`: the run's VRT or copy, with the RPC in it, if there
     is one; `index` (n,), `xy` (n, 2), `track` (n,): its tie points, places among the scene's points, and where it shows
     them [px].
     """
@@ -238,7 +238,7 @@ def _noise(files: RunFiles, counted: Any) -> float:
 def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
     """Return the pairs that stereo is made of: of images without reservation, at an angle that shows heights; else all.
 
-    Of those under such an angle: two images that need no look, with enough matches to know it, where there are any.
+    Of those under such an angle: two images without reservation with enough matches, where there are any.
     """
     shown = [pair for pair in scene.summary.pairs if 2.0 <= (pair.convergence_deg or 0.0) <= 50.0]
     sure = sure_pairs(scene.summary.views, shown)

@@ -16,7 +16,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import LEAST_RANGE
 
 _POINT, _PLANE = 100.0, 1e4
-"""Times that another reading is better before it is believed. What a model errs by is in all its readings alike: of 160
+"""Times that another reading is better before it is accepted. Errors of a model are common to all its readings: of 160
 honest models none was better by more than 2.2 in a wrong one; one over a flat Earth may be by tens, its planes by 2000.
 Of models with axes exchanged or upside down physical ones were better by 320 and more, the planes of radars by 5e6."""
 _FLAT_CONVERGENCE = (

@@ -1,11 +1,11 @@
 """Certificate of an RPC over a whole image: its errors, poles and round trips, and the cause of its misfit.
 
-`RpcFit` is a fit with its certificate, and says in words what is wrong with it.
+`RpcFit` is a fit with its certificate, and names its fault in words.
 
 The errors of an RPC, less what a small change of its coefficients takes away, are asked whether they are a function of
 the row, the column or the altitude. If they are, those of neighbours in that order are alike: half the mean square of
 their differences is what the function leaves (Yatchew, "An elementary estimator of the partial linear model", 1997). No
-shape is assumed, so that swings, bursts and steps count alike.
+shape is assumed, so that oscillations, bursts and steps count equally.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _ALTITUDE_POWERS = np.arange(1, 8)  # of altitudes
 _CAUSE_CELLS = 4  # along each side: where all errors are in one of them, they are in one place
 _DOMINANT_SHARE = 0.5  # of the squares: a cause of more is named
 _CAUSE_WORDS = {
-    "row": "go by the row (a swing of the attitude, bursts, a long pass): a grid of the camera follows it",
-    "column": "go by the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
-    "altitude": "go by the altitude: fit a smaller altitude range",
-    "place": "are in one place, about col {col:.0f}, row {row:.0f}: look at the camera there",
+    "row": "depend on the row (attitude oscillation, bursts, a long pass): a grid of the camera represents them",
+    "column": "depend on the column (a lens, detectors, a scan): fit fewer columns, or take a grid",
+    "altitude": "depend on the altitude: fit a smaller altitude range",
+    "place": "are in one place, about col {col:.0f}, row {row:.0f}: check the camera there",
     "corner": "are in the corner at col {col:.0f}, row {row:.0f}: leave it out, or fit a smaller image",
-    "pole": "are what the bound on denominators around the image costs: lower pole_margin, or fit a smaller image",
+    "pole": "come from the bound on denominators around the image: lower pole_margin, or fit a smaller image",
     "all": "are all over the image and its altitudes: not an RPC's shape, fit a smaller image, or take a grid",
 }
 
@@ -41,7 +41,7 @@ class Reason:
     Parameters
     ----------
     cause : str, "row", "column", "altitude", "place", "corner", "pole" or "all"
-    share : float, part of the squared errors that is due to it; of "all", what is left by the best of the others
+    share : float, part of the squared errors that is due to it; of "all", the remainder of the best of the others
     size_px : float, root mean square of that part
     col, row : float, position of a place [px]
     """
@@ -144,7 +144,7 @@ class RpcFit:
     localisation : Localisation or None, the certificate of `rpc.direct`, where it was asked for
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
-        there [px]; 0 for given points. What else projects with the model may be off by as much more.
+        there [px]; 0 for given points. What else projects with the model may err by as much more.
     axes : str, exchanged longitude and latitude, or the altitude's sign, of a model or a grid, in words
     reason : Reason or None, cause of a miss of the tolerance, of a model
     height_px : float
@@ -221,13 +221,13 @@ class RpcFit:
         if not self.height_px <= tolerance:
             low, high = self.rpc.ground_offset[2] + self.rpc.ground_scale[2] * np.array([-1.0, 1.0])
             return (
-                f"the points hold no height terms: the RPC is good at their altitudes alone, {low:.6g} to {high:.6g} "
-                f"m, and 100 m beyond off by {self.height_px:.3g} px or more: give points at other altitudes too"
+                f"the points determine no height terms: the RPC is valid at their altitudes alone, {low:.6g} to "
+                f"{high:.6g} m, and 100 m beyond errs by {self.height_px:.3g} px or more: add points at other altitudes"
             )
         return "" if self.localisation is None else self.localisation.verdict(tolerance)
 
 
-# --- why it misses -----------------------------------------------------------------------------------------
+# --- causes of misfit -----------------------------------------------------------------------------------------
 
 
 def reason(rpc: RPC, sample: Sample) -> Reason | None:

@@ -248,7 +248,7 @@ class Sample:
         return cls(model, size, alt_range, points[known], ground[known], int(inside.sum()), 1.0 - share)
 
     def also(self, points: Array) -> Sample:
-        """Return the sample with more points (M, 3) col, row [px], altitude [m] to look for the worst around."""
+        """Return the sample with more points (M, 3) col, row [px], altitude [m] around which to search for errors."""
         ground, known = _on_ground(self.model, points)
         more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
         return replace(self, points=more[0], ground=more[1])

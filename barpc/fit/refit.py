@@ -33,7 +33,7 @@ from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
 LocalisationCheck = Callable[[RPC, FitSolution], tuple[Errors, Array]]
-"""What a localisation RPC is off by on points that it has not seen [m, px], and the largest (2,)."""
+"""Errors of a localisation RPC on independent points [m, px], and the largest (2,)."""
 
 _ABOUT = 1.1  # times the error
 _MAX_MISSING_SHARE = 0.1  # part of the image without a ground point, at most

@@ -41,7 +41,7 @@ TAU = 0.003
 """Standard deviation that ``ridge`` expects of a denominator coefficient of degree one (no unit)."""
 EPS = float(np.finfo(np.float64).eps)
 MAX_PASSES = 20
-"""Of what is iterated."""
+"""Most passes of an iteration."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,7 +135,7 @@ class FitProblem:
     first: TriangularSystem | None = None  # of col without a denominator, where it is known already
 
     def screened(self) -> FitProblem:
-        """Return the problem without the monomials that its points cannot tell from those of lower degree.
+        """Return the problem without the monomials that depend at its points on those of lower degree.
 
         All twenty stay where altitudes abound; of points at one altitude those without H, of two altitudes those of
         degree one in H. A dependent one would make a = b = 0 a solution.

@@ -81,7 +81,7 @@ class Earlier:
             raise InputError(f"{folder}: no summary.json, so no finished run; give the folder of one")
         table, block = table_path(folder, IMAGES), table_path(folder, PRIOR_FILE)
         if not block.exists():
-            raise InputError(f"{block}: missing, and it is what a later run goes on from: run the adjustment again")
+            raise InputError(f"{block}: missing, and later runs start from it: run the adjustment again")
         if not table.exists():
             raise InputError(f"{table}: missing, as of a run of another release: run the adjustment again")
         _refuse_edited(folder, (table, block))
@@ -133,12 +133,12 @@ class Earlier:
             image = self.images[self.number[view.name]] if view.name in self.number else None
             if image is not None and _sha(inputs, view.path) != image.sha256:
                 raise InputError(
-                    f"{view.path}: is not the image that {self.folder} was made of (it was changed since); give the "
+                    f"{view.path}: is not the image used by {self.folder} (it was changed since); give the "
                     "new one under another name"
                 )
             if image is not None and _sha(inputs, str(source.path.absolute())) != image.camera_sha256:
                 raise InputError(
-                    f"{source.path}: is not the camera of {view.path} that {self.folder} was made of (it was changed "
+                    f"{source.path}: is not the camera of {view.path} used by {self.folder} (it was changed "
                     "since); put the former one back, or adjust all images together"
                 )
 
@@ -228,7 +228,7 @@ def _is_there(image: Known, folder: Path) -> bool:
     if image.choices is not None and (is_url(image.path) or Path(image.path).is_file()):
         return True
     why = "no such file any more" if image.choices is not None else "its camera came from no file"
-    logger.warning("%s: an image of %s that is not matched: %s; give it, too, where it is now", image.path, folder, why)
+    logger.warning("%s: an image of %s is not matched: %s; give its present path, too", image.path, folder, why)
     return False
 
 

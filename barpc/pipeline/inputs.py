@@ -69,7 +69,7 @@ def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
     lon, lat = np.concatenate(rings).T
     if np.isnan(dem(lon, lat)).all():
         raise InputError(
-            f"{path}: holds no height at the images' place ({lon[0]:.4f}, {lat[0]:.4f}); is it another tile?"
+            f"{path}: has no height at the images' position ({lon[0]:.4f}, {lat[0]:.4f}); check for another tile"
         )
 
 
@@ -223,7 +223,7 @@ def _linked(paths: Sequence[str | Path], views: Sequence[View], partly: bool = F
             logger.warning("%s", error)
             continue
         if not parts[-1].joins_views:
-            logger.warning("%s: holds no match of two of the images, which is as if it were not given", path)
+            logger.warning("%s: holds no match between two of the images and has no effect", path)
         parts[-1] = _matches_inside(path, views, parts[-1])
     return Links.joined(parts[1:] or parts)
 
@@ -320,10 +320,10 @@ def _load_control(
 def _with_altitudes(
     points: GroundPoints, views: Sequence[View], options: RunOptions, dem: Dem | None
 ) -> tuple[GroundPoints, list[str]]:
-    """Return the points with the altitudes that a DEM has where theirs are 0, as tools write where none is known; and
-    what is to be said where none has.
+    """Return the points with altitudes of a DEM where theirs are 0, which tools write for unknown ones; and remarks on
+    those without either.
 
-    These are held sideways alone: in height to the middle of the cameras' altitudes, and together to their range.
+    These constrain the images horizontally only: in height, the middle and range of the cameras' altitudes are assumed.
     """
     unknown = points.lonlatalt[:, 2] == 0.0
     if not unknown.any():
@@ -342,7 +342,7 @@ def _with_altitudes(
         unknown &= ~known
     low, high = min(view.alt_range[0] for view in views), max(view.alt_range[1] for view in views)
     ground[unknown, 2], sigma[unknown, 2] = 0.5 * (low + high), (high - low) * np.sqrt(max(unknown.sum(), 1))
-    said = f"{what}: {int(unknown.sum())} hold the images sideways alone; give their altitudes, or --dem"
+    said = f"{what}: {int(unknown.sum())} constrain the images horizontally only; give their altitudes, or --dem"
     return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
 
 

@@ -203,8 +203,8 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     if not os.path.lexists(folder / SUMS):
         read_summary(folder)
         raise InputError(
-            f"{folder / SUMS}: missing, as of a run that was interrupted, or of release 0.3 or older, if nobody took "
-            "it away; nothing else says what the files were: run the adjustment again"
+            f"{folder / SUMS}: missing: the run was interrupted, is of release 0.3 or older, or the file was removed; "
+            "without it nothing can be verified: run the adjustment again"
         )
     root, layers = manifest.read(folder)
     noted, listed = noted_outputs(folder), {name: sha for layer in layers for name, sha in layer.files.items()}

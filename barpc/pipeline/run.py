@@ -392,8 +392,8 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
     centers = _centers(run.views, options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
-            f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else holds the "
-            "images: check its place and the DEM's, or take a finer one"
+            f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else constrains "
+            "the images: check its position and the DEM's, or use a finer one"
         )
     altimetry = load_altimetry(options.altimetry, run.views, options.heights)
     adjustment = adjust_tracks(
@@ -481,7 +481,7 @@ def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple
     found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views], how)
     for view, center in zip(views, found, strict=True):
         if center.method == "nominal":
-            logger.warning("%s: its camera does not tell where it stands; a nominal centre is used", view.name)
+            logger.warning("%s: its camera determines no projection centre; a nominal one is used", view.name)
     return tuple(found)
 
 

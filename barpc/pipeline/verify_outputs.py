@@ -102,7 +102,7 @@ def verify(
     """
     ground, image = control_grid(model, size, alt_range) if grid is None else _ground_and_image(grid)
     if not len(ground):
-        raise OutputError("hand-off: the model sees no ground point inside its own image")
+        raise OutputError("hand-off: the model projects no ground point into its own image")
 
     def measured(_: Consumer, read: Projection) -> tuple[float, float]:
         return _max_difference(read, ground, image), float("nan")
@@ -111,7 +111,7 @@ def verify(
 
 
 def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
-    """Open a file of more than an RPC as its consumers do and look for its largest error against a model's sample.
+    """Open a file of more than an RPC as its consumers do, and find its largest error against a model's sample.
 
     It is a localisation or correction grid, by the end of its name; else the image, resampled by `correction`.
     """
@@ -330,7 +330,7 @@ def _keywords(path: Path) -> Projection:
     """Return an OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
     pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
-        raise OutputError("type or polynomial_format is not what OSSIM expects")
+        raise OutputError("type or polynomial_format is not one of OSSIM's")
     axes, sets = ("line", "samp", "lat", "long", "height"), ("line_num", "line_den", "samp_num", "samp_den")
     keys = (f"{axis}_{what}" for axis in axes for what in ("off", "scale"))
     values: dict[str, Any] = {key: float(pairs[key]) for key in keys}

@@ -285,8 +285,8 @@ def _point(wkb: bytes) -> list[float]:
 def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     """Return the GCP tags of an image, seen in that image alone, and its width and height [px].
 
-    GDAL leaves to the application where they count from: what they cover tells (`_first_pixel`), or that the raster is
-    one of points, whose tags GDAL hands on counted from the corner. Where nothing tells they are taken as they stand.
+    GDAL leaves their origin to the application: their range determines it (`_first_pixel`), or AREA_OR_POINT of the
+    raster, whose tags GDAL returns counted from the corner. Else they are used unchanged.
     """
     with open_raster(path) as dataset:
         (gcps, crs), size, tags = dataset.gcps, (int(dataset.width), int(dataset.height)), dataset.tags()
@@ -299,7 +299,7 @@ def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     at, why = table.numbers[:, 6:8], ""
     if (first := _first_pixel(at, np.array(size))) is None:
         points = tags.get("AREA_OR_POINT") == "Point"
-        first, why = (0.5, ", as of a raster of points") if points else (0.0, ", as nothing says otherwise")
+        first, why = (0.5, ", as of a raster of points") if points else (0.0, ", by default")
     at -= first
     where = {0.0: "the centre", 0.5: "the corner"}.get(first, f"{first:g} px before the centre")
     said = f"{len(gcps)} GCPs of {path.name}, counted from {where} of the first pixel{why}"

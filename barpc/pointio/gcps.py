@@ -133,10 +133,10 @@ def _assembled(
 
 
 def _geolocated(place: Array, table: GcpTable, frame: ControlReference) -> tuple[Array, tuple[HeightDatum, ...], str]:
-    """Return lon, lat, altitude [m above the ellipsoid; 0: none], what is known of the altitudes' datum, and words."""
+    """Return lon, lat, altitude [m above the ellipsoid; 0: none], their assumed datums, and remarks."""
     crs, vertical, words = frame.crs or table.crs, table.vertical, list[str]()
     if frame.crs and table.crs and frame.crs != table.crs:
-        words.append(f"not its own reference system {table.crs[:40]!r}")
+        words.append(f"instead of the file's reference system {table.crs[:40]!r}")
     if crs:
         place, own, name = to_wgs84(place, crs, f"{'--gcp-crs' if frame.crs else 'its reference system'}")
         words.append(name)

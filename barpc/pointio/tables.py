@@ -257,7 +257,7 @@ def lacking(path: Path, names: Sequence[str], words: Sequence[str]) -> InputErro
 # --- motions ----------------------------------------------------------------------------------------------
 
 _ROUNDED = 2e-6
-"""What the squares of a rotation's rows are off by at most where each number has the six decimals that `%f` writes."""
+"""Largest error of the squares of a rotation's rows where each number has the six decimals of `%f`."""
 _WANTED = "expected three or four lines of four numbers: a rotation (with a scale) and a translation [m], ECEF"
 _BLANKS = str.maketrans(",;[]()", "      ")
 
@@ -298,7 +298,7 @@ def _no_motion(matrix: Array) -> str:
     off = float(np.abs(square / scale - np.eye(3)).max()) if scale > 0 else np.inf
     if not off <= _ROUNDED:
         return (
-            f"its first three columns are no rotation times a scale (off by {off:.2g}): a matrix of map "
+            f"its first three columns are no rotation times a scale (deviation {off:.2g}): a matrix of map "
             "coordinates or of longitudes and latitudes, or one that shears? A motion of ECEF coordinates is needed"
         )
     return "its first three columns mirror the ground" if np.linalg.det(matrix[:3, :3]) < 0 else ""

@@ -152,7 +152,7 @@ def ground_map(files: RunFiles) -> str:
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
-    """Return images whose outlines are drawn, with their indices: those that need a look last, so on top."""
+    """Return images whose outlines are drawn, with their indices: those that need review last, so on top."""
     whole = {view.name: (k, view, files.outlines[k]) for k, view in enumerate(files.summary.views)}
     bad = flagged(files.summary.views)[:MAX_SHOWN]
     good = [row for name, row in whole.items() if name not in {view.name for view in bad}]

@@ -66,14 +66,14 @@ class Added:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Everything that a run found out.
+    """The results of a run.
 
-    `sources`: where the views' RPCs came from (empty: not from files); `matched`: pairs that were matched (empty: tie
-    points from a file); `adjustment`, `centers`, `fits`: of an adjustment that went so far; `written`, per view: file,
-    consumer that reopened it, largest difference to P_BA [px] or why it does not read it; `left_out`: files, and why;
-    `stages`: their seconds and peak memory so far; `check_points` stayed out of the adjustment; `reference`: what an
-    orthoimage said; `datums`: what heights that hold the scene were taken to count from, where no person said it;
-    `detail`: where keypoints of the views, as matching saw them, let tie points be expected.
+    `sources`: cameras as opened (empty: not from files); `matched`: reports of matched pairs (empty: given tie points);
+    `adjustment`, `centers`, `fits`: of an adjustment as far as it went; `written`, per view: file, consumer that
+    reopened it, largest difference to P_BA [px] or the reason without one; `left_out`: files and reasons; `stages`:
+    their seconds and peak memory so far; `check_points` were not used; `reference`: matches of an orthoimage; `datums`:
+    vertical datums assumed for heights that constrain the scene, if the user stated none; `detail`: density of the
+    views' keypoints, from which tie points are expected.
     """
 
     kind: Literal["adjust", "check", "match"]
@@ -122,22 +122,22 @@ class Run:
 
     @cached_property
     def keep(self) -> BoolArray:
-        """The observations (K,) that count: all of them, or those that the adjustment kept."""
+        """The observations (K,) in use: all of them, or the inliers of the adjustment."""
         return self._rows("inlier", none=True)
 
     @cached_property
     def held_out(self) -> BoolArray:
-        """The observations (K,) that took no part in the adjustment, to be measured on."""
+        """The observations (K,) of check tie points, which the adjustment did not use."""
         return self._rows("held_out")
 
     @cached_property
     def moving(self) -> BoolArray:
-        """The observations (K,) of tie points that move together: they took no part either."""
+        """The observations (K,) of tie points that move together, which were excluded."""
         return self._rows("moving")
 
     @cached_property
     def gaps(self) -> dict[int, Gap]:
-        """The columns or rows of views that have no tie points though their detail lets these be expected."""
+        """The columns or rows of views without tie points, although their detail makes these expected."""
         found, tracks = dict[int, Gap](), self.tracks
         for v, (view, detail) in enumerate(zip(self.views, self.detail, strict=False)):
             one = gap(detail, in_parts(tracks.xy[tracks.view == v], view.size), view.size)
@@ -146,9 +146,9 @@ class Run:
 
     @cached_property
     def met_worse(self) -> list[ImageRegion]:
-        """Rows, columns and cells of images in which tie points that took no part are met worse than elsewhere."""
+        """Rows, columns and cells of images with larger residuals of check tie points than in the rest."""
         found, tracks = self.adjustment, self.tracks
-        # who asks for plain least squares has no tie point that may be wrong
+        # plain least squares assumes no wrong tie point
         if found is None or not found.held_out.any() or found.options.loss == "linear":
             return []
         known = np.isfinite(found.held_out_noise)
@@ -166,9 +166,9 @@ class Run:
 
     @cached_property
     def beside(self) -> dict[int, int]:
-        """Views most of whose tie points that took no part are seen, too, in one whose own contradict the others.
+        """Views of which most check tie points are also observed in a view that contradicts the others.
 
-        View -> that view: tie points are intersected with its rays, so it is seen in the residuals of all.
+        View -> that view: tie points are intersected with its rays, so its errors are in the residuals of all.
         """
         view, point, num = self.tracks.view, self.tracks.point, len(self.views)
         kept = np.bincount(view[self.keep], minlength=num)
@@ -184,7 +184,7 @@ class Run:
 
     @cached_property
     def whole_pixels(self) -> frozenset[str]:
-        """Names of the views most of whose matches were found at whole pixels: their rounding may be common to all."""
+        """Names of the views with most matches at whole pixels: their rounding error may be common to all."""
         count: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
         for report in self.matched:
             for name in report.names if report.status == "ok" else ():
@@ -217,7 +217,7 @@ class Run:
 
     @cached_property
     def copies(self) -> dict[str, str]:
-        """Views that show the very pixels of another one, and in words whose, and how far moved.
+        """Views with the same pixels as another one -> that view and the shift, in words.
 
         Two images of one scene never match by whole pixels: only one that is a part, or a copy, of the other.
         """

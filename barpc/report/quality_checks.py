@@ -126,7 +126,7 @@ def _of_camera(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
         yield "foreign_camera", {"stated": stated, "strangeness": strangeness(apart)}
     if prior.odd[i]:
         others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
-        either = f" (or that of {listed(others)}: tie points cannot tell which)" if others else ""
+        either = f" (or that of {listed(others)}: undetermined by tie points)" if others else ""
         yield "odd", {"scale": prior.scale[i], "either": either}
     if is_smooth(i, adjustment):
         along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
@@ -205,7 +205,7 @@ def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
 
 
 def anywhere(view: ViewEntry, run: Run) -> bool:
-    """Return whether rejected tie points of a view have errors in random directions, as wrong matches do."""
+    """Return whether rejected tie points of a view have errors in random directions, typical of mismatches."""
     return run.adjustment is not None and bool(-np.inf < run.adjustment.alike[run.number[view.name]] <= SURE)
 
 

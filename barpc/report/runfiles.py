@@ -145,7 +145,7 @@ def ply(columns: Mapping[str, npt.NDArray[Any]], *comments: str) -> bytes:
 
 
 def gcps_geojson(run: Run) -> bytes:
-    """Return the points of a reference that held the block, as `--gcp` reads them: a feature an observation."""
+    """Return the reference points that constrain the block, as `--gcp` reads them: a feature an observation."""
     control = None if run.reference is None else run.reference.control
     assert control is not None
     assert run.adjustment is not None

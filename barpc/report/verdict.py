@@ -234,7 +234,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if many := [view.name for view in unsaid if anywhere(view, run)]:
         # errors in one image reject tie points of the others, too
         alike = [view.name for view in unsaid if view.name not in many]
-        why = f"but in {listed(alike)} in the same direction" if alike else "as of wrong matches"
+        why = f"but in {listed(alike)} in the same direction" if alike else "as of mismatches"
         yield (
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, with "
             f"neighbouring errors in random directions, {why}."
@@ -260,7 +260,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 def _added_lines(added: Added, num: int) -> Iterator[str]:
     """Yield the images added, and the changes that they ask of the cameras of the earlier run."""
     new = counted(num - added.met, "image")
-    yield f"{new} added to the {counted(added.images, 'image')} of {added.run}, {added.met} of which share tie points."
+    old = counted(added.images, "image")
+    yield f"{new} added to the {old} of {added.run}; {added.met} of these have new tie points."
     name, far = added.largest
     if not added.beyond:
         yield f"Their cameras stay valid: the largest change, of {name}, is {far:.3f} px (limit: {added.floor:g} px)."

@@ -172,7 +172,7 @@ def printable(rpc: RPC) -> RPC:
 
     A longitude offset of 17 digits cut to 15 would move an image by up to 2e-8 px. The coefficients take up the
     difference: a normalised coordinate x becomes a x + b with b and a - 1 of 1e-13, the polynomials change by
-    b dp/dx + (a - 1) x dp/dx, and what is left of second order is 1e-26.
+    b dp/dx + (a - 1) x dp/dx, and the second-order remainder is 1e-26.
     """
     ground_offset, ground_scale = _fifteen(rpc.ground_offset), _fifteen(rpc.ground_scale)
     shift = (ground_offset - rpc.ground_offset) / rpc.ground_scale

@@ -6,7 +6,7 @@ its nodes are the centres of its pixels, as GDAL sees them, and its RPC tag is t
 
 An image is resampled block by block, so that its RPC holds without a rest, by cubic B-splines: of the contrast at half
 the highest frequency 1.5 % is lost, and positions are not rounded (OpenCV's `remap` knows 32 a pixel, which alone is as
-much as the result may be off by).
+much as the error allowed).
 """
 
 from __future__ import annotations

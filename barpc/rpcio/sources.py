@@ -308,7 +308,7 @@ _TILE = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[-_]|$)", re.IGNORECASE)
 
 
 def _strip_name(stem: str) -> str:
-    """Return the name of the strip of a tile, ``X`` of ``X_R1C2``; empty of what is called otherwise."""
+    """Return the name of the strip of a tile, ``X`` of ``X_R1C2``; empty for other names."""
     found = _TILE.search(stem)
     return stem[: found.start()] + stem[found.end() :] if found else ""
 

@@ -61,7 +61,7 @@ class Pointwise(Frozen):
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
-        Longitudes run on across the antimeridian; NaN off what the model is believed for, or where it sees no ground.
+        Longitudes run on across the antimeridian; NaN outside the model's validity, or off the ground.
         """
         return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt, rows=self._memory)[0]
 

@@ -52,7 +52,7 @@ def warn_off_grid(name: str, off: Array) -> None:
     worst = np.abs(off).max(axis=0)
     if not (worst <= GRID_TOLERANCE).all():
         warnings.warn(
-            f"{name}: the geolocation grid does not belong to the orbit (off by {worst[0]:.1f} samples, "
+            f"{name}: the geolocation grid does not belong to the orbit (difference {worst[0]:.1f} samples, "
             f"{worst[1]:.1f} lines); the model follows the orbit",
             BarpcWarning,
             stacklevel=4,

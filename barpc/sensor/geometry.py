@@ -181,7 +181,7 @@ def base_to_height(sensor_a: SensorModel, sensor_b: SensorModel, ground: Array) 
 class Several:
     """Many cameras as one, each point with its own: row n of an argument belongs to camera `view[n]`.
 
-    So what is asked of one camera is asked of a block with one call, not one a pair.
+    One call evaluates a whole block instead of one pair.
     """
 
     def __init__(self, sensors: Sequence[SensorModel], view: npt.ArrayLike) -> None:
@@ -223,7 +223,7 @@ class Several:
         return self._given_back(self._stack.localize(image[self._order], alt[self._order], self._bounds))
 
     def _given_back(self, found: Array) -> Array:
-        """Return values (..., N), sorted by camera, as rows (N, ...) in the order that was asked for."""
+        """Return values (..., N), sorted by camera, as rows (N, ...) in the order of the request."""
         out = np.empty_like(found)
         out[..., self._order] = found
         return np.moveaxis(out, -1, 0)

@@ -1,10 +1,10 @@
 """Corrections in the image beyond rotations and RPCs; a model with such a correction is again a sensor model.
 
-An affine map, as others correct RPCs. A spline over the rows, steps, strips and swings: attitude jitter moves image
-rows against each other, a focal plane that is put together of detectors moves its columns, a jump of the attitude or of
-the clock a strip of rows, a wheel out of balance swings them. All are functions of where a point is *seen*, so that
-x = P(X) + s(x): localisation is explicit, projection iterates. What an RPC lacks on a grid, by where the RPC has a
-point: true image position = RPC's + (dcol, drow).
+An affine map, as others correct RPCs. A spline over the rows, steps, strips and sinusoids: attitude jitter displaces
+image rows, a focal plane of several detectors columns, a jump of the attitude or of the clock a strip of rows, an
+unbalanced wheel all rows periodically. All are functions of where a point is *seen*, so that
+x = P(X) + s(x): localisation is explicit, projection iterates. The correction grid of an RPC, by
+the RPC's image point: true image position = RPC's + (dcol, drow).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 ITERATION_TOLERANCE = 1e-7
-"""Of image points that are iterated [px]: what is left after so small a step is a hundredth of it."""
+"""Last step of iterated image points [px]: the remaining error is a hundredth of it."""
 
 
 _MAX_ITERATIONS = 100  # a step leaves a hundredth of the error: four suffice where it converges at all
@@ -168,10 +168,10 @@ class RowSpline(Frozen):
     edges : (C,), columns at which another detector begins [px], ascending
     steps : (C + 1, 2), displacement of each detector, (col, row) [px]; without any detector (0, 2)
     strips : (M, 5)
-        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their fading,
+        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their decay,
         exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
-    moved : (M, 2), displacement of each strip, (col, row) [px]; of one that fades, at its origin
-    periods : (M,), periods of the swings of all rows [px]
+    moved : (M, 2), displacement of each strip, (col, row) [px]; with a decay, at its origin
+    periods : (M,), periods of the sinusoids over all rows [px]
     swings : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
     """
 
@@ -194,7 +194,7 @@ class RowSpline(Frozen):
         if len(self.strips) != len(self.moved) or not fine:
             raise RpcError("strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement")
         if len(self.periods) != len(self.swings) or not (self.periods > 0).all():
-            raise RpcError("swings: each has a period above 0 and what its cosine and sine move")
+            raise RpcError("sinusoids: each has a period above 0 and amplitudes of its cosine and sine")
         if 0 < len(self.coeffs) < 4:
             raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
         if len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges)) or (np.diff(self.edges) <= 0).any():
@@ -257,7 +257,7 @@ class RowSpline(Frozen):
 
 @dataclass(frozen=True)
 class Splined(Displaced):
-    """`sensor`, usually P_BA, with its image points displaced by a spline, steps and swings; itself a `SensorModel`."""
+    """`sensor`, usually P_BA, with image points displaced by spline, steps and sinusoids; itself a `SensorModel`."""
 
     correction: RowSpline  # what is added to its image points
 

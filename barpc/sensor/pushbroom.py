@@ -166,14 +166,14 @@ class Pushbroom(Pointwise):
     def advice(self) -> str:
         """Remedy where no RPC represents this model; empty where its motion is one polynomial."""
         sampled = (
-            "the attitude may swing within the image, which no RPC follows: raise the tolerance, fit a part, or"
-            " let 'barpc adjust --grids' write what the RPC leaves"
+            "the attitude may oscillate within the image, which no RPC represents: raise the tolerance, fit a part, or"
+            " write correction grids with 'barpc adjust --grids'"
         )
         return sampled if len(self.attitude.coeffs) > 1 else ""
 
     @property
     def _span(self) -> tuple[float, float]:
-        """First and last time that both curves are believed for [s]."""
+        """First and last time of validity of both curves [s]."""
         (a, b), (c, d) = self.orbit.span, self.attitude.span
         return max(a, c), min(b, d)
 

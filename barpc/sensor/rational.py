@@ -184,7 +184,7 @@ class Rational:
         return ok
 
     def _damped_newton(self, target: Array, x: Array, steps: int = 60) -> Array:
-        """Step `x[:2]` by Newton, halved until errors fall, never across a pole; return what is left (2, N)."""
+        """Step `x[:2]` by Newton, halved until errors fall, never across a pole; return the remaining errors (2, N)."""
         left = np.full(target.shape, np.inf)
         active = np.arange(target.shape[1])
         sign = np.sign(self.coeffs[1::2, :1])

@@ -1,7 +1,7 @@
 """Common geometry of radars: the range-Doppler circle of a pixel, the look side, and timing corrections.
 
-The points of one range and one Doppler lie on a circle about the line of flight. Range and azimuth time are off by an
-amount and a slope along the flight, not by an attitude.
+The points of one range and one Doppler lie on a circle about the line of flight. Their errors are an
+offset and a slope of range and azimuth time along the flight, no attitude.
 """
 
 from __future__ import annotations

@@ -202,7 +202,7 @@ def test_few_digits_are_told_in_metres(image: Path, tmp_path: Path, capsys):
     ground, _ = _seen(open_camera(image))
     np.savetxt(tmp_path / "t.txt", _similarity(ecef_from_ground(ground).mean(axis=0), 1.0), fmt="%f")
     assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 0
-    assert "few digits: it places the ground to some" in capsys.readouterr().err
+    assert "few digits: it determines the ground to some" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,7 @@ def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp
 
     monkeypatch.setattr(stereo, "CONVERGENCE_RANGE", (2.0, 3.0))
     assert run("dsm", *rendered.paths[:2], "-o", tmp_path / "dsm.tif") == 3
-    assert "no pair meets under 2 to 3 degrees, where SGBM can match (view_00 and view_01" in capsys.readouterr().err
+    assert "no pair has a convergence angle of 2 to 3 degrees for SGBM (view_00 and view_01" in capsys.readouterr().err
     monkeypatch.undo()
     views = load_views(rendered.paths[:2]).views
 

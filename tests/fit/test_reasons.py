@@ -127,7 +127,7 @@ def test_each_cause_is_named_with_its_size_and_its_place(name):
 @pytest.mark.slow
 def test_the_refusal_says_it_too_and_a_fit_that_holds_says_nothing():
     model = CASES["a swing of 7 waves"][0]()
-    with pytest.raises(FitError, match=r"wanted 0\.01: 9\d% of its squares, 0\.4\d+ px RMS, go by the row"):
+    with pytest.raises(FitError, match=r"wanted 0\.01: 9\d% of its squares, 0\.4\d+ px RMS, depend on the row"):
         fit_rpc(model, SIZE, ALTS)
     held = fit_rpc(model, SIZE, ALTS, options=FitOptions(tolerance=1.0))
     assert held.reason is None

@@ -87,7 +87,7 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     here = views(1)[0]
     there = View("far", "/x/far.tif", (100, 80), far, (0.0, 300.0))
     assert side_inputs(options, [there, here]) is not None
-    with pytest.raises(InputError, match=r"holds no height at the images' place \(15\.\d+, 43\.\d+\)"):
+    with pytest.raises(InputError, match=r"has no height at the images' position \(15\.\d+, 43\.\d+\)"):
         side_inputs(options, [there])
     assert side_inputs(RunOptions(), [there]) is None
 

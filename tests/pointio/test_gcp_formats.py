@@ -210,7 +210,7 @@ def test_the_flag_counts_before_the_file_and_that_is_said(tmp_path) -> None:
     path.write_text(f"EPSG:32631\n{x} {y} 100 1 2 left\n", encoding="utf-8")
     found = read_gcps(path, NAMES, ControlReference("EPSG:32632"))
     np.testing.assert_allclose(found.lonlatalt[0, :2], [LON, LAT], atol=1e-9)
-    assert "not its own reference system 'EPSG:32631'; WGS 84 / UTM zone 32N" in found.said[0]
+    assert "instead of the file's reference system 'EPSG:32631'; WGS 84 / UTM zone 32N" in found.said[0]
 
 
 @pytest.mark.parametrize(

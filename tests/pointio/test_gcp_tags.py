@@ -51,10 +51,10 @@ def write(path: Path, given: np.ndarray, point: bool, by_gdal: bool) -> Path:
         (grid(0, 0), False, True, 0.5, CORNER),  # from edge to edge
         (grid(0.5, -0.5), False, True, 0.5, CORNER),  # centres as GDAL counts them
         (grid(0, -1, 1), False, True, 0.0, CENTRES),  # four corners
-        (grid(0, -4), False, True, 0.0, f"{CENTRES}, as nothing says otherwise"),
-        (grid(2, -1), False, True, 0.0, f"{CENTRES}, as nothing says otherwise"),
-        (SCATTERED, False, True, 0.0, f"{CENTRES}, as nothing says otherwise"),
-        (SCATTERED[:1], False, True, 0.0, f"{CENTRES}, as nothing says otherwise"),
+        (grid(0, -4), False, True, 0.0, f"{CENTRES}, by default"),
+        (grid(2, -1), False, True, 0.0, f"{CENTRES}, by default"),
+        (SCATTERED, False, True, 0.0, f"{CENTRES}, by default"),
+        (SCATTERED[:1], False, True, 0.0, f"{CENTRES}, by default"),
         (grid(0, -1), True, False, 0.0, CORNER),  # GDAL hands on what begins at 0 from 0.5 on
         (SCATTERED, True, False, 0.0, f"{CORNER}, as of a raster of points"),
         (grid(3, -7), True, False, 0.0, f"{CORNER}, as of a raster of points"),

@@ -210,7 +210,7 @@ def test_where_nothing_won_it_is_said_why(record):
     assert "The standard camera model explains all residuals" in said(record)
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
-    assert "No extra model that was tested explains the residuals that stand out." in text
+    assert "No extra model that was tested explains the inconsistent residuals." in text
     assert "Nothing stood out" not in text
     many = with_views(record, *[{"unknowns": (0.0,) * 1500}] * 9)
     assert "in blocks of more than 12,000 unknowns none is" in said(many, left=(left,))

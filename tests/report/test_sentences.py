@@ -114,7 +114,7 @@ def test_wrong_matches_that_lie_anywhere_are_told_and_need_no_look():
     calm = run_of(adjusted(alike=np.array([5.0, -np.inf, -1.0])))
     few = {"A": 40, "B": 2, "C": 40}
     lines = said(calm, [a_view(name, num_observations=60, num_rejected=few[name]) for name in NAMES])
-    assert told + "as of wrong matches." in lines
+    assert told + "as of mismatches." in lines
     lost = {"num_observations": 60, "num_rejected": 40}
     assert [view_status(a_view(name, **lost), run)["status"] for name in NAMES] == [
         "adjusted",
@@ -229,7 +229,7 @@ def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
         "image "
         "(IMAGE,camera=FILE names another)"
     )
-    assert "(or that of A, C: tie points cannot tell which)" in advice([0, 1, 2], "B")
+    assert "(or that of A, C: undetermined by tie points)" in advice([0, 1, 2], "B")
     assert "is 8 times" in advice([0, 1, 2], "B")
     assert advice([0], "B") == ""
 

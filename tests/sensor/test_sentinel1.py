@@ -635,7 +635,7 @@ def test_a_product_of_2016_meets_its_grid(shared_data: Path) -> None:
 
 
 def test_an_inconsistent_grid_is_reported(shared_data: Path) -> None:
-    with pytest.warns(BarpcWarning, match=r"off by 128\.3 samples, 1404\.6 lines"):
+    with pytest.warns(BarpcWarning, match=r"difference 128\.3 samples, 1404\.6 lines"):
         RangeDoppler.from_annotation(annotation_path(shared_data, "20190803t164007"))
 
 

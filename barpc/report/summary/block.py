@@ -143,7 +143,7 @@ class ExplanationEntry(Record):
     last: Number = column("Its last row or column", "px", default=None)
     size_px: Number = column("RMS displacement; of a sinusoid its amplitude", "px", default=None)
     period: Number = column("Period of a sinusoid in rows", "px", default=None)
-    candidates: tuple[str, ...] | None = column("Other views that tie points cannot tell from this one", default=None)
+    candidates: tuple[str, ...] | None = column("Other views that explain the tie points as well", default=None)
     share: Number = column("Share of tie points that move together", default=None)
     moved_m: Number = column("Their motion on the ground, apart from an effect of height", "m", default=None)
     between: tuple[str, ...] | None = column("From the first of these views to the second", default=None)

@@ -127,8 +127,8 @@ CAUSES = {
         "{share:.0f} % of its tie points were rejected, with neighbouring errors in the same direction{place}",
         "check for clouds, water, change"),
     "wrong_matches": Cause("doubtful", "wrong matches",
-        "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of wrong "
-        "matches, and check tie points have residuals of {error:.2f} px",
+        "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of "
+        "mismatches, and check tie points have residuals of {error:.2f} px",
         "check for repeated patterns and noise, or supply matches (--matches)"),
     "place": Cause("doubtful", "inconsistent rows or columns",
         "{place} are inconsistent with the rest of the image: {what}", "check for {cause}"),

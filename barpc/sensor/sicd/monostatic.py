@@ -207,7 +207,7 @@ class Monostatic(Clocked):
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
-        """The lowest and highest (x, y) (2, 1) [m] that are believed."""
+        """The lowest and highest valid (x, y) (2, 1) [m]."""
         sides = np.array([self.size[1], self.size[0]], dtype=np.float64)
         spacing, origin = np.array(self.spacing), np.array(self.origin)
         low, high = (-_VALIDITY_MARGIN * sides - origin) * spacing, ((1 + _VALIDITY_MARGIN) * sides - origin) * spacing
