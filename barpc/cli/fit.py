@@ -164,7 +164,7 @@ def _write_rpc_file(
 def _certificate(fit: RpcFit, verdict: str) -> str:
     rows = {"control rmse": fit.rmse_cnp, "control max": fit.max_cnp}
     rows |= {"check rmse": fit.rmse_ckp, "check max": fit.max_ckp}
-    beyond = f"beyond        {fit.beyond:.2%} of the image may miss by more, at most (95 % confidence)"
+    beyond = f"beyond        {fit.beyond:.2%} of the image at most may have larger errors (95 % confidence)"
     more = []
     if (found := fit.localisation) is not None:
         again = f"projected again {found.rmse_px:.3g} and {found.max_px:.3g} px"
@@ -176,7 +176,7 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         "              col [px]     row [px]",
         *(f"{name:14s}{col:<13.3g}{row:.3g}" for name, (col, row) in rows.items()),
         *([beyond] if fit.beyond < 1 else []),  # given points say nothing of the rest
-        f"denominators  at least {fit.min_denominator:.3g} over the image's ground and around it",
+        f"denominators  at least {fit.min_denominator:.3g} of their value at the centre, over the ground and a margin",
         f"round trip    {fit.roundtrip:.1g} px" + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
         *more,
         f"verdict       {verdict or 'within tolerance'}",

@@ -78,7 +78,7 @@ def info(
 _CENTRE_METHODS = {
     "line": "where the rays of an image line meet",
     "stated": "by its orbit",
-    "nominal": "assumed: the rays of an image line meet in no orbit",
+    "nominal": "assumed, as the rays of an image line meet in no orbit",
 }
 
 
@@ -88,7 +88,7 @@ def _labelled_sentences(report: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "camera", f"RPC ({report['rpc'].replace(' in ', ') in ', 1)}" if is_rpc else report["rpc"]
     yield from (("note", note) for note in report["notes"])
     if "size_px" not in report:
-        yield "image", "its size is not known; with FILE,size=WIDTH:HEIGHT angles and places are told"
+        yield "image", "size unknown: give FILE,size=WIDTH:HEIGHT for angles and positions"
     else:
         yield "image", "{} x {} px; (0, 0) is the centre of the first pixel".format(*report["size_px"])
     yield "altitudes", "{:.5g} to {:.5g} m above the ellipsoid".format(*report["altitude_range_m"])

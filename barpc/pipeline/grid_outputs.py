@@ -61,7 +61,7 @@ class GridFiles:
 
 
 def grid_names(view: View, options: RunOptions) -> list[str]:
-    """Return the files that `write_grids` may write for a view, before it is known whether its RPC holds it."""
+    """Return the files that `write_grids` may write for a view, before the misfit of its RPC is known."""
     return GridFiles(grids=True, resampled=options.resample, state=is_writable(view.sensor)).names(view)
 
 
@@ -72,9 +72,9 @@ def write_grids(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Written]:
-    """Write the grids and resampled images that are asked for, and reopen every file.
+    """Write requested grids and resampled images, and grids for RPC misfits above `MISFIT`; reopen every file.
 
-    OutputError where a file cannot be written, or does not hold what was written.
+    OutputError where a file cannot be written, or reads back differently.
     """
     files = []
     for _, fit, model in fitted:
@@ -101,10 +101,10 @@ def made_in_room(
     what: str,
     progress: Progress | None,
 ) -> list[Any]:
-    """Make files of views by workers in a room of the run folder, and give them their places here.
+    """Write files of views by workers into a temporary subfolder of the run folder, then move them to the run folder.
 
-    `make` takes a task, which begins with its view, and the room; it gives the names of the files, which lie there in
-    a folder called as the view.
+    `make` takes a task, which begins with its view, and the subfolder; it returns the names of the files, which it puts
+    there into a folder named after the view.
     """
     room = run.partial / what
     try:
@@ -121,7 +121,7 @@ def made_in_room(
 def _write_grids(
     run: Workspace, tasks: Sequence[GridTask], executor: Executor | None, progress: Progress | None
 ) -> list[Written]:
-    """Write grids, and open them again."""
+    """Write grids and verify the reopened files; return the differences by file and consumer."""
     with CachingExecutor(run, {}, executor, keep=False) as fresh:
         made = made_in_room(run, fresh, make_grids, tasks, "grids", progress)
         pairs, folder = zip(tasks, made, strict=True), str(run.folder)
@@ -132,13 +132,13 @@ def _write_grids(
             read = seen[name]["barpc"]
             worst = max(largest, read) if isinstance(read, float) else largest
             if not worst <= MISFIT:
-                why = "it takes light as straight" if name.endswith(STATE) else "at steps?"
-                logger.warning("%s: %.3g px RMS off, up to %.3g px (%s)", name, rms, worst, why)
+                why = "it has no refraction" if name.endswith(STATE) else "at steps?"
+                logger.warning("%s: errors of %.3g px RMS, up to %.3g px (%s)", name, rms, worst, why)
     return written
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room: str) -> Misses:
-    """Write the grids of a view, and its image resampled, into a temporary folder; return what each misses by [px]."""
+    """Write the grids of a view, and its image resampled, into a temporary folder; return the errors of each [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -167,8 +167,8 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
 def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
     """Return an RPC and its correction grid, and the errors of both together against the camera of a sample.
 
-    What `rpc` lacks may depend on the altitude: the best RPC of all trades denominators, which see altitudes, for what
-    changes with the rows. Then another one serves better here, though it misses by more.
+    The correction of `rpc` may depend on the altitude, where its denominators absorb errors along the rows. Then an RPC
+    with a larger misfit and its grid are better together: the best of three methods is returned.
     """
     model, size, alts = sample.model, sample.size, sample.alt_range
     found: list[tuple[float, float, Array, RPC, CorrectionGrid]] = []
@@ -186,7 +186,7 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
     if not found:
         assert failed is not None
         raise failed
-    # the largest is a step's, if there is one
+    # the largest error is at a step, if there is one
     rms, largest, where, best, lacking = min(found, key=lambda row: row[0])
     return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
 
@@ -200,11 +200,11 @@ def _largest_miss(sample: Sample, camera: SensorModel) -> Miss:
 def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) -> Written:
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads other errors than theirs.
 
-    Compared is what both see at the same points. Between them a step is narrow: who looks for it finds it or not.
+    Errors at the same points are compared: a narrow step between them may be found or missed.
     """
     every, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
     for name, (rms, _, where) in errors.items():
-        sample = every.also(where)  # what was seen as it was written is seen again
+        sample = every.also(where)  # the same points as when it was written
         path, lacking = Path(folder) / name, None
         if name.endswith(RESAMPLED):
             lacking = read_correction(Path(folder) / (view.name + CORRECTION))[1]
@@ -213,7 +213,7 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
             same = reading.rms == rms or abs(reading.rms - rms) <= REOPENED  # infinite: rows are lost there
             if reading.consumer in ("barpc", "gdal") and not same:
                 raise OutputError(
-                    f"{path}: {reading.consumer} reads it {reading.rms:.3g} px RMS off, not {rms:.3g}"
+                    f"{path}: {reading.consumer} reads it with errors of {reading.rms:.3g} px RMS, not {rms:.3g}"
                     f"{f' ({reading.note})' if reading.note else ''}; is the disk full, or another RPC file beside it?"
                 )
         written[name] = {one.consumer: one.note or one.max_error for one in readings}

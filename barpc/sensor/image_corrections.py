@@ -33,18 +33,18 @@ _MAX_ITERATIONS = 100  # a step leaves a hundredth of the error: four suffice wh
 
 
 class Displacement(Protocol):
-    """A correction of image points: from where a model without it has them to where they are seen, and back."""
+    """A correction of image points: from their positions by an uncorrected model to corrected ones, and back."""
 
     def apply(self, image: Array) -> Array:
-        """Return where points that a model has at (..., 2) [px] are seen."""
+        """Return the corrected positions of uncorrected image points (..., 2) [px]."""
         ...
 
     def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and its derivative (..., 2, 2) by the model's image points."""
+        """Return the corrected positions, and their derivative (..., 2, 2) by the uncorrected ones."""
         ...
 
     def undo(self, image: Array) -> Array:
-        """Return where the model has points that are seen at (..., 2) [px]."""
+        """Return the uncorrected positions of corrected image points (..., 2) [px]."""
         ...
 
 
@@ -71,7 +71,7 @@ class Displaced(Behind):
 
 
 def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
-    """Return the image points (..., 2) [px] that `follow` leaves where they are, from a first guess."""
+    """Return the fixed point (..., 2) [px] of the iteration `follow`, from a first guess."""
     change = np.zeros(())
     for _ in range(_MAX_ITERATIONS):
         before, image = image, follow(image)
@@ -116,7 +116,7 @@ class ImageCorrected(Displaced):
     described by rational polynomials", 2003), for comparison with the correction in space.
     """
 
-    correction: ImageAffine  # what is added to its image points
+    correction: ImageAffine  # added to its image points
 
 
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
@@ -158,7 +158,7 @@ def sine_and_cosine(row: Array, period: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RowSpline(Frozen):
-    """A displacement of image points: where a point is seen, less where a model without it projects it.
+    """A displacement of image points: corrected minus uncorrected position, as a function of the corrected one.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ class RowSpline(Frozen):
 class Splined(Displaced):
     """`sensor`, usually P_BA, with image points displaced by spline, steps and sinusoids; itself a `SensorModel`."""
 
-    correction: RowSpline  # what is added to its image points
+    correction: RowSpline  # added to its image points
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -189,7 +189,7 @@ def test_an_rpc_says_what_it_is_made_for() -> None:
 def test_what_cannot_be_told_is_left_out() -> None:
     lines = told(size_px=..., center_deg=...)
     assert list(lines) == ["camera", "image", "altitudes"]
-    assert "its size is not known" in lines["image"]
+    assert "size unknown" in lines["image"]
     lines = told(problem="none there")
     assert list(lines) == ["camera", "image", "altitudes", "problem"]
     pairs = [{"with": "b", "convergence_deg": 12.345, "b_over_h": 0.2166}]

@@ -272,7 +272,7 @@ def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, caps
         f"  centre       lon {lon:.6f}, lat {lat:.6f} deg at {(low + high) / 2:.5g} m",
         f"  pixel        {gsd['col']:.3f} m a column, {gsd['row']:.3f} m a row on the ground",
         f"  looks        {angle:.2f} deg off the vertical, from {side:.2f} deg (north is 0)",
-        f"  sensor       {stand / 1e3:.1f} km high, assumed: the rays of an image line meet in no orbit",
+        f"  sensor       {stand / 1e3:.1f} km high, assumed, as the rays of an image line meet in no orbit",
     ]
 
 
@@ -283,7 +283,7 @@ def test_info_says_in_words_what_is_not_known_of_a_camera(tmp_path, capsys):
     write_rpc(replace(rpc, coeffs=coeffs, err_bias=None, err_rand=None), tmp_path / "a.RPB")
     assert run("info", tmp_path / "a.RPB") == 0
     told = capsys.readouterr().out
-    assert "  image        its size is not known; with FILE,size=WIDTH:HEIGHT angles" in told
+    assert "  image        size unknown: give FILE,size=WIDTH:HEIGHT for angles" in told
     assert "  accuracy     not stated\n" in told
     assert re.search(r"  denominators at least -\d\.\d+ of .*: a pole may lie", told)
     assert "centre of the first" not in told

@@ -40,8 +40,8 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
         "control max   0.003        0.004",
         "check rmse    0.005        0.006",
         "check max     0.007        0.008",
-        "beyond        1.23% of the image may miss by more, at most (95 % confidence)",
-        "denominators  at least 0.9 over the image's ground and around it",
+        "beyond        1.23% of the image at most may have larger errors (95 % confidence)",
+        "denominators  at least 0.9 of their value at the centre, over the ground and a margin",
         "round trip    1e-09 px; the camera's own 3e-09",
         "verdict       within tolerance",
     ]

@@ -144,7 +144,7 @@ def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view,
         lambda grid, *given, **how: real(replace(grid, shift=-grid.shift), *given, **how),
     )
     with pytest.raises(
-        OutputError, match=r"a_correction\.tif: (gdal|barpc) reads it [01]\.\d+ px RMS off, not 0\.00\d+; is"
+        OutputError, match=r"a_correction\.tif: (gdal|barpc) reads it with errors of [01]\.\d+ px RMS, not 0\.00\d+; is"
     ):
         run_of(tmp_path / "out", (view, fit, camera))
 
@@ -199,7 +199,7 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
     with caplog.at_level(logging.WARNING):
         (written,) = run_of(tmp_path, (view, fit, Stepped()), grids=True)
     for end in (GRID_SUFFIX, CORRECTION):  # whoever reads a file sees the step that was seen as it was written
-        (told,) = re.findall(rf"a{end}: \S+ px RMS off, up to (0\.\d+) px", caplog.text)
+        (told,) = re.findall(rf"a{end}: errors of \S+ px RMS, up to (0\.\d+) px", caplog.text)
         assert 0.02 < 0.99 * float(told) <= written["a" + end]["barpc"] < 0.3
 
 
@@ -295,7 +295,7 @@ def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkey
         assert asked == [("a" + GRID_SUFFIX, None, count + 2)]
         return
     ((name, px),) = rms.items()
-    said = rf"a_grid\.tif: {name} reads it {px:.3g} px RMS off, not 0\.005; is the disk full"
+    said = rf"a_grid\.tif: {name} reads it with errors of {px:.3g} px RMS, not 0\.005; is the disk full"
     with pytest.raises(OutputError, match=said):
         grids.verify_grids(view, model, errors, str(tmp_path))
 
@@ -332,7 +332,7 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
     assert found == [{"a.x": {"barpc": read, "gdal": 9.0}}]
     assert (tmp_path / "out/a.x").read_text() == "grid"
     lines = [record.getMessage() for record in caplog.records]
-    assert lines == ([] if told is None else [f"a.x: 0.007 px RMS off, up to {told} px (at steps?)"])
+    assert lines == ([] if told is None else [f"a.x: errors of 0.007 px RMS, up to {told} px (at steps?)"])
 
 
 @pytest.mark.parametrize(

@@ -51,20 +51,20 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     plain = said(matched(record))
     assert f"{count} pairs tied: {count} by guided" in plain
     assert "nothing was matched" not in plain
-    assert "tried again" not in plain
+    assert "matched again" not in plain
     fewer = ("guided 12 of 100", "guided, loosened 20 of 100")
     other = matched(record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date")
     text = said(other)
     assert f"{count} pairs tied: {count - 1} by guided, 1 by structure" in text
-    assert "1 pair tried again" in text
+    assert "1 pair matched again" in text
     first = record.pairs[0]
     assert f"at most 3 % of the matches of a pair are false ({first.a} - {first.b})" in text
-    assert "Why these pairs were tried: 1 same date." in text
+    assert "Pairs by selection criterion: 1 same date." in text
 
 
 def test_the_matcher_is_said_to_be_asked_for(record):
     tie = {**record.options["tie"], "matcher": "structure"}
-    assert "the matcher asked for is structure" in said(
+    assert "the requested matcher is structure" in said(
         replace(matched(record), options={**record.options, "tie": tie})
     )
 

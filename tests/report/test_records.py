@@ -227,8 +227,8 @@ def test_an_image_shows_shares_in_percent():
     assert [cell.text for cell in none] == ["-"] * 3
     every = f"{ViewEntry.PAGE} {ViewEntry.TERMINAL}"
     checked = table("k", "c", [view], ViewEntry, every, adjusted=False).columns
-    assert not {"RPC fit [px]", "after [px]", "shift col, row [px]"} & set(checked)
-    assert "RPC fit [px]" in table("k", "c", [view], ViewEntry, every).columns
+    assert not {"RPC misfit [px]", "after [px]", "shift col, row [px]"} & set(checked)
+    assert "RPC misfit [px]" in table("k", "c", [view], ViewEntry, every).columns
     pairs = table("k", "c", [a_pair()], PairEntry, PairEntry.PAGE, adjusted=False).columns
     assert "now [px]" in pairs
     assert not {"before [px]", "after [px]"} & {*pairs, *checked}

@@ -68,10 +68,10 @@ class PairEntry(Record):
         "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
     )
     decoy_share: Number = column(
-        "Share of false matches, by search bands without true ones", head="false", form=".1%", default=None
+        "Share of false matches, by search bands without true ones", head="false matches", form=".1%", default=None
     )
     noise_px: Number = column(
-        "Spread across epipolar lines before registration", "px", "as matched", ".2f", default=None
+        "Spread across epipolar lines before registration", "px", "matching noise", ".2f", default=None
     )
     beaten: tuple[str, ...] = column("Attempts with too few matches: matcher, matches of those required", default=())
     chosen_by: str | None = column("Reason of its selection: overlap and angle, same date, listed, ...", default=None)

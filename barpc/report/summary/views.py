@@ -33,8 +33,8 @@ _SPLINE_ROWS = 400  # of an image, over which a spline is averaged
 class EllipseEntry(Record):
     """Error ellipse of the ground point at the image centre, at a given altitude."""
 
-    major_m: Number = column("Larger semi-axis of the one-sigma ellipse", "m", "semi-axis", ".2f")
-    minor_m: Number = column("Smaller semi-axis", "m", "other", ".2f")
+    major_m: Number = column("Larger semi-axis of the one-sigma ellipse", "m", "major semi-axis", ".2f")
+    minor_m: Number = column("Smaller semi-axis", "m", "minor semi-axis", ".2f")
     azimuth_deg: Number = column("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
     ce90_m: Number = column("Radius of the circle that contains 90 %", "m", "CE90", ".2f")
 
@@ -167,7 +167,7 @@ class CenterEntry(Record):
 
     ecef_m: Vector = column("Position, ECEF", "m")
     altitude_m: Number = column("Above the ellipsoid", "m", "camera centre", ",.0f")
-    method: str = column("line, or nominal where that was not plausible", head="method")
+    method: str = column("line, or nominal where that was not plausible", head="centre from")
 
 
 class FitEntry(Record):
@@ -206,7 +206,7 @@ class ViewEntry(Record):
             "rejected", lambda view: view.lost if view.num_observations + view.num_rejected else None, ".1%"
         ),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
-        "largest": Column("RPC fit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
+        "largest": Column("RPC misfit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
     PAGE: ClassVar = (
         "name verdict wrong num_observations lost tie_coverage rmse_before rmse_after held_out_px "
@@ -259,7 +259,7 @@ class ViewEntry(Record):
     )
     systematic_px: Number = column("RMS of systematic residuals, noise subtracted", "px", "systematic", ".3f")
     prior_scale: Number = column(
-        "Factor by which the camera's stated standard deviations were widened", "", "widened", ".1f"
+        "Factor by which the camera's stated standard deviations were widened", "", "prior widened", ".1f"
     )
     correction: CorrectionEntry | None = column("The correction; null for a check")
     camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
