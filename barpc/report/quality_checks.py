@@ -199,7 +199,7 @@ def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
     elif view.correction.sinusoid_px:
         follows = "a sinusoidal motion of its rows"
     elif not isinstance(run.views[run.number[view.name]].sensor, RPC):
-        follows = "its own orbit and attitude"
+        follows = "the orbit and attitude of its physical model"
     if left > SMOOTH_LEFT or most > WORST_LEFT:
         yield "follows_more", {"follows": follows, "left": left, "most": most, "image": view.name}
 

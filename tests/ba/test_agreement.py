@@ -258,14 +258,18 @@ def test_control_of_a_world_is_used_where_it_is_right_and_never_bends_the_images
         assert {tuple(points) for points in tested.sets} == {tuple(wrong), tuple(~wrong)}
         assert (one.gauge.sigma > 4.0).all()
         assert any("GCPs contradict each other" in reason for reason in summary.reasons)
-        assert any("Without ground control that agrees its place is known" in line for line in summary.verdict)
-        assert any(line.startswith("0 of") and "GCPs that are seen" in line for line in decisions(summary))
+        assert any(
+            "Without consistent ground control, the scene's position is uncertain" in line for line in summary.verdict
+        )
+        assert any(line.startswith("0 of") and "visible GCPs" in line for line in decisions(summary))
     else:
         assert [word != "used" for word in status] == wrong.tolist()
-        assert any(line.startswith("With") and "its place is known to" in line for line in summary.verdict)
+        assert any(
+            line.startswith("With") and "the scene's position is uncertain by" in line for line in summary.verdict
+        )
     assert summary.passed == (tested.agrees and not wrong.any())
     assert any("Nothing checks" in line for line in summary.verdict) == (kind == "1 point")
-    assert any("is their datum" in line for line in summary.verdict) == ("another datum" in kind)
+    assert any("check their datum" in line for line in summary.verdict) == ("another datum" in kind)
 
 
 def test_points_that_none_outweighs_are_undecided_and_agree_with_nothing() -> None:
@@ -324,7 +328,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     summary = summarize(run)
     assert not summary.passed
     assert any("the images would agree less with each other" in reason for reason in summary.reasons)
-    assert any(line.startswith("Without ground control that agrees") for line in summary.verdict)
+    assert any(line.startswith("Without consistent ground control") for line in summary.verdict)
     assert [point.status for point in summary.gcps] == ["rejected"] * 6
     assert "0 of 6 visible GCPs constrain the block." in decisions(summary)
 

@@ -307,7 +307,7 @@ def test_the_summary_states_metres_and_milliseconds(slc: Scene, found: Adjustmen
     np.testing.assert_allclose(radar.center_sigma_px, np.array(radar.timing_sigma) * [0.4293, 0.4865], rtol=1e-3)
     assert radar.rotation_urad is None
     assert first.range_m is None
-    line = next(line for line in summary.verdict if "clocks" in line)
-    assert line.startswith(f"Radar images are corrected by their clocks: radar: range {told.coeffs[0, 0]:+.2f} ± ")
+    line = next(line for line in summary.verdict if "timing" in line)
+    assert line.startswith(f"Radar timing corrections: radar: range {told.coeffs[0, 0]:+.2f} ± ")
     assert line.endswith(" ms.")
     assert json_form(summary)["views"][2]["correction"]["range_m"] == radar.range_m

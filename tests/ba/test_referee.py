@@ -177,12 +177,12 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         pytest.param(
             "jitter 0.5 at 1 Hz",
             "look",
-            "follows attitude jitter",
+            "includes attitude jitter",
             marks=pytest.mark.nightly,
         ),
-        ("jitter 0.1 at 5 Hz", "look", "px every 27"),
-        ("clouds 60 %", "bad", "check clouds, water and change"),
-        ("RPC 200 px wrong", "look", "farther off than stated"),
+        ("jitter 0.1 at 5 Hz", "look", "px with a period of 27"),
+        ("clouds 60 %", "bad", "check for clouds, water and change"),
+        ("RPC 200 px wrong", "look", "less accurate than stated"),
     ],
 )
 def test_what_is_said_is_true(name, status, word):

@@ -76,7 +76,7 @@ def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path): 
     (tmp_path / "o.toml").write_text("[fit]\ntolerance = 1e-15\n")
     given = ("adjust", *pristine, "--matches", ties, "--matches-only", "--options", tmp_path / "o.toml", "-o")
     assert command(*given, tmp_path / "none").code == 1
-    assert_told(command(*given, tmp_path / "out", "--keep-going"), "not adjusted", "one RPC cannot hold")
+    assert_told(command(*given, tmp_path / "out", "--keep-going"), "not adjusted", "one RPC does not fit")
 
 
 @pytest.mark.slow

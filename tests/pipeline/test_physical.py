@@ -193,7 +193,7 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     for view, name, sensor in zip(summary["views"], "ab", result.adjustment.sensors, strict=True):
         assert view["fit"]["max_px"][1] > 0.5
-        assert "follows its own orbit and attitude, of which one RPC leaves" in view["advice"]
+        assert "includes the orbit and attitude of its physical model, and one RPC misses it by" in view["advice"]
         assert f"({name}_grid.tif)" in view["advice"]
         grid = open_camera(tmp_path / "out" / f"{name}_grid.tif").model
         image, alt = rng.uniform(0, np.array(SIZE) - 1, (200, 2)), rng.uniform(0, 1000, 200)
