@@ -44,11 +44,11 @@ VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
-_CHECKED = "The image was checked"
+_IMAGE_CHECKED = "The image was checked"
 _ALL_WELL = {
     "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
-    "check": (_CHECKED, "The cameras of both images agree", "The cameras of all {} images agree"),
-    "match": (_CHECKED, "Both images are tied together", "All {} images are tied together"),
+    "check": (_IMAGE_CHECKED, "The cameras of both images agree", "The cameras of all {} images agree"),
+    "match": (_IMAGE_CHECKED, "Both images are tied together", "All {} images are tied together"),
 }
 """Kind of a run -> its headline for one, two and more images without reservation."""
 

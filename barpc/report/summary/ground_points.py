@@ -38,11 +38,13 @@ class GcpEntry(KnownPoint):
     PAGE: ClassVar = "GCP status residual_enu_m residual_px w image_w image_w_view sigma_m"
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
-    sigma_m: tuple[float, float, float] = column("Stated", "m", "sigma east, north, up", ".2g")
+    sigma_m: tuple[float, float, float] = column(
+        "Stated standard deviation, east, north, up", "m", "sigma east, north, up", ".2g"
+    )
     residual_enu_m: Vector = column("Position predicted without it, minus given", "m", ("east", "north", "up"), "+.3f")
     used: bool = column("Whether it constrains the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = column(
-        "contradicts: used, residual above 4 sigma; rejected: the others contradict it; undecided: as many against it",
+        "contradicts: used, residual above 4 sigma; rejected: the others contradict it; undecided: no majority",
         head="verdict",
         default="used",
     )

@@ -61,8 +61,8 @@ class PairEntry(Record):
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
-    epipolar_before: OffsetEntry | None = column("Through the delivered cameras")
-    epipolar_after: OffsetEntry | None = column("Through the new cameras")
+    epipolar_before: OffsetEntry | None = column("Epipolar offset through the delivered cameras")
+    epipolar_after: OffsetEntry | None = column("Epipolar offset through the new cameras")
     matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
     tied_by: str | None = column(
         "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None

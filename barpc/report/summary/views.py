@@ -140,13 +140,13 @@ class CorrectionEntry(Record):
     shift_px: Pixel | None = column("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = column("Models in the image: by (col, row)", "px/px", default=None)
     rotation_urad: Vector | None = column("Rotation vector R, ECEF axes", "urad", default=None)
-    angle_urad: Number = column("Its length", "urad", "rotation", ".2f", default=None)
+    angle_urad: Number = column("Angle of R", "urad", "rotation", ".2f", default=None)
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
-    translation_norm_m: Number = column("Its length", "m", "translation", ".2f", default=None)
+    translation_norm_m: Number = column("Length of T", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
     range_m: Number = column("Radar: correction of the range", "m", "range", "+.3f", default=None)
     azimuth_ms: Number = column("Radar: correction of the azimuth time", "ms", "azimuth", "+.4f", default=None)
-    timing_sigma: Pixel | None = column("Their posterior standard deviations, m and ms", default=None)
+    timing_sigma: Pixel | None = column("Posterior standard deviations of both, m and ms", default=None)
     timing_slopes: tuple[Pixel, ...] | None = column(
         "Radar: further correction at the end, m and ms, by power", default=None
     )
@@ -166,8 +166,10 @@ class CenterEntry(Record):
     """Projection centre of a camera."""
 
     ecef_m: Vector = column("Position, ECEF", "m")
-    altitude_m: Number = column("Above the ellipsoid", "m", "camera centre", ",.0f")
-    method: str = column("line, or nominal where that was not plausible", head="centre from")
+    altitude_m: Number = column("Altitude above the ellipsoid", "m", "camera centre", ",.0f")
+    method: str = column(
+        "line: intersection of the rays of an image line; nominal: assumed where implausible", head="centre from"
+    )
 
 
 class FitEntry(Record):
@@ -175,7 +177,9 @@ class FitEntry(Record):
 
     rmse_px: Pixel = column("Error col, row on check points", "px", "RMSE col, row", ".1e")
     max_px: Pixel = column("Largest error col, row on check points", "px")
-    min_denominator: Number = column("Relative to the centre's", "", "smallest denominator", ".3f")
+    min_denominator: Number = column(
+        "Smallest denominator over the image's ground, relative to the centre", "", "smallest denominator", ".3f"
+    )
     roundtrip_px: Number = column(
         "Largest change by projection and localisation; null where it fails", "px", "round trip", ".1e"
     )
