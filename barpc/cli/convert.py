@@ -178,8 +178,8 @@ def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> i
     if lost <= READING_TOLERANCE:
         return 0
     return tell_gate(
-        f"{target} reads back {lost:.2g} px off: too few digits for this RPC ('barpc fit' fits one that it holds), or "
-        "another RPC file beside it",
+        f"{target} reads back with an error of {lost:.2g} px: too few digits for this RPC ('barpc fit' fits one for it), "
+        "or another RPC file beside it",
         [],
     )
 
@@ -331,7 +331,7 @@ def _exit_code(readings: list[Reading], reasons: Sequence[str] = (), notes: Sequ
     for sentence in notes:
         remark(sentence)
     off = [reading for reading in readings if not reading.passed]
-    wrong = (f"{r.path}: {r.consumer} {r.note or f'reads it {r.max_error:.1e} px off'}." for r in off)
+    wrong = (f"{r.path}: {r.consumer} {r.note or f'reads it with an error of {r.max_error:.1e} px'}." for r in off)
     reasons = [*reasons, *wrong]
     return tell_gate("The hand-off needs review.", reasons) if reasons else 0
 

@@ -103,8 +103,8 @@ def verify_files(
         own = reading.consumer.partition(",")[0] in ("barpc", "gdal")  # which reads texts beside an image
         if own and not reading.max_error <= 2 * largest:
             raise OutputError(
-                f"{reading.path}: {reading.consumer} reads it {reading.max_error:.3g} px off ({reading.note}); "
-                "is the disk full, or another RPC file beside it?"
+                f"{reading.path}: {reading.consumer} reads it with an error of {reading.max_error:.3g} px "
+                f"({reading.note}); is the disk full, or another RPC file beside it?"
             )
     for reading in readings:
         written[reading.path.name][reading.consumer] = reading.note or reading.max_error
@@ -325,7 +325,7 @@ def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
         return Proved("camera", name, MISSING if not path.exists() else CHANGED, str(error))
     if off.max() <= stated + REOPENED:
         return Proved("camera", name, SAME)
-    far = f"reads {off.max():.3g} px off the certified camera, {stated:.1g} stated"
+    far = f"differs from the certified camera by {off.max():.3g} px, {stated:.1g} stated"
     return Proved("camera", name, CHANGED, far)
 
 

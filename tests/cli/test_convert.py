@@ -335,7 +335,7 @@ def test_a_window_under_a_name_of_nitf_is_one_and_what_its_digits_lose_is_said(n
     assert run("convert", str(image), str(target), "--window", "50", "60", "100", "80", "--json") == 3
     said = capsys.readouterr()
     assert 1e-6 < json.loads(said.out)["max_px"] < 2.0
-    assert "px off: too few digits for this RPC ('barpc fit'" in said.err
+    assert "px: too few digits for this RPC ('barpc fit'" in said.err
     with open_raster(target) as part, open_raster(image) as whole:
         assert part.driver == "NITF"
         np.testing.assert_array_equal(part.read(), whole.read()[:, 60:140, 50:150])
@@ -469,8 +469,8 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     assert said.out == f"{out / 'scene.vrt'}: gdal 2.0e-06 px\n{out / 'scene_RPC.TXT'}: rpcm no field\n"
     assert said.err.splitlines() == [
         "barpc: not tried: 3",
-        f"barpc: exit code 3: The hand-off needs review. {out / 'scene.vrt'}: gdal reads it 2.0e-06 px off. "
-        f"{out / 'scene_RPC.TXT'}: rpcm no field.",
+        f"barpc: exit code 3: The hand-off needs review. {out / 'scene.vrt'}: gdal reads it with an error of 2.0e-06 "
+        f"px. {out / 'scene_RPC.TXT'}: rpcm no field.",
     ]
     assert run("convert", str(image), *words) == 1  # the folder is not empty
     assert run("convert", str(image), *words, "--overwrite") == 3

@@ -247,7 +247,7 @@ def test_an_output_that_was_changed_is_named(run) -> None:
         ("camera", "view_00.RPB"): "missing",
     }
     said = barpc("verify", run)
-    assert "camera view_01_RPC.TXT: changed, reads 0.5 px off the certified camera" in said.out
+    assert "camera view_01_RPC.TXT: changed, differs from the certified camera by 0.5 px" in said.out
     assert "exit code 3" in said.err
 
 

@@ -83,7 +83,7 @@ def test_a_run_without_sums_is_refused_and_so_is_one_whose_sums_are_not_as_barpc
         with pytest.raises(InputError, match="SHA256SUMS: changed"):
             prove(tmp_path / "out")
     sums.unlink()
-    with pytest.raises(InputError, match=r"SHA256SUMS: missing, .* interrupted, or of release 0\.3"):
+    with pytest.raises(InputError, match=r"SHA256SUMS: missing: the run was interrupted, is of release 0\.3"):
         prove(tmp_path / "out")
 
 
@@ -290,12 +290,12 @@ def test_a_camera_may_be_off_by_what_is_stated_and_the_rounding_of_its_file(came
     (found,) = prove(tmp_path / "out")
     assert found.now == now
     if now == CHANGED:
-        assert found.note == "reads 0.36 px off the certified camera, 0.3 stated"
+        assert found.note == "differs from the certified camera by 0.36 px, 0.3 stated"
 
 
 def test_one_point_that_is_off_is_enough_in_both_directions(camera, tmp_path) -> None:
     camera.certified[2][4] -= 5.0
-    said = "reads 5 px off the certified camera, 1e-09 stated"
+    said = "differs from the certified camera by 5 px, 1e-09 stated"
     assert prove(tmp_path / "out") == [Proved("camera", "a_RPC.TXT", CHANGED, said)]
 
 
