@@ -178,7 +178,7 @@ def _read_back(rpc: RPC, target: str, row: Mapping[str, object], text: str) -> i
     if lost <= READING_TOLERANCE:
         return 0
     return tell_gate(
-        f"{target} reads back with an error of {lost:.2g} px: too few digits for this RPC ('barpc fit' fits one for it), "
+        f"{target} reads back with an error of {lost:.2g} px: too few digits for this RPC ('barpc fit' makes another), "
         "or another RPC file beside it",
         [],
     )
