@@ -268,7 +268,7 @@ def test_a_camera_tells_its_height_its_pace_and_for_how_long_it_is_known() -> No
     assert CASES["curved"].advice == ""
     times = np.linspace(*CASES["curved"].attitude.knots, 9)
     sampled = Curve.through(times, CASES["curved"].attitude(times)[0].T)
-    assert "which no RPC follows" in replace(CASES["curved"], attitude=sampled).advice
+    assert "which no RPC represents" in replace(CASES["curved"], attitude=sampled).advice
 
 
 def test_the_vertical_of_the_oracle_is_that_of_the_ellipsoid() -> None:

@@ -163,7 +163,7 @@ def test_an_rpc_holds_the_image(kind, model_of):
         ("<Type>RGAZIM</Type>", "<Type>OTHER</Type>", "OTHER, which the SICD standard does not project"),
         ("<ImageFormAlgo>PFA", "<ImageFormAlgo>OTHER", "RGAZIM by OTHER"),
         ("<SideOfTrack>R", "<SideOfTrack>up", "'up', expected R or L"),
-        ("<SideOfTrack>R", "<SideOfTrack>L", "not seen where it says"),
+        ("<SideOfTrack>R", "<SideOfTrack>L", "not projected to its stated pixel"),
         ("<SS>0.8", "<SS>-0.8", "Grid/Row/SS is -0.8"),
         ("<NumRows>700", "<NumRows>nan", "not finite"),
         ("<Row>340", "<Row>341.5x", "not a list of numbers"),
