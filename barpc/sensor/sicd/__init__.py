@@ -109,7 +109,7 @@ def open_sicd(path: Path) -> Monostatic:
     miss = float(np.abs(seen - model.origin[::-1]).max())
     if not miss <= _SCP_TOLERANCE:
         raise RpcFormatError(
-            f"{path}: its scene centre point is not projected to its stated pixel (error {miss:.3g} px); is the file damaged?"
+            f"{path}: its scene centre is not projected to its stated pixel (error {miss:.3g} px); is the file damaged?"
         )
     return model
 
