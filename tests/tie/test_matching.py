@@ -166,7 +166,7 @@ def test_after_a_blind_pass_the_search_is_where_its_matches_lie(search) -> None:
     rng = np.random.default_rng(2)
     for spread in (4.0, 12.0):
         along = rng.uniform(3 - spread, 3 + spread, 200)
-        found = search(Wrong(along, np.full(200, -5.0))).offset()
+        found = search(Wrong(along, np.full(200, -5.0))).offset
         assert found is not None
         places = rng.uniform(0, 999, (5, 2))
         where = found.at(places)
@@ -180,7 +180,7 @@ def test_the_correction_across_the_lines_is_one_by_the_place_in_the_first_view(s
     """Of a camera that is 300 px off along the lines, and across them by more the farther east."""
     places = np.random.default_rng(1).uniform(0, 999, (200, 2))  # those of `Wrong`
     along = np.random.default_rng(2).uniform(295, 305, 200)
-    found = search(Wrong(along, 0.004 * places[:, 0])).offset()
+    found = search(Wrong(along, 0.004 * places[:, 0])).offset
     assert found is not None
     np.testing.assert_allclose(found.at(places).across, places[:, 1] + 0.004 * places[:, 0], atol=0.05)
 
@@ -235,23 +235,23 @@ def test_a_peak_at_the_end_of_the_band_may_go_on_beyond_it(search, at: float, fo
 
 def test_passes_grow_wider_until_one_is_clear(search) -> None:
     clear = Listed(spread_out(70, 50))  # more than three tenths
-    assert search(clear).offset() is not None
+    assert search(clear).offset is not None
     assert clear.asked == [(20.0, 1500)]
     unclear = Listed(spread_out(130, 50))
-    found = search(unclear).offset()
+    found = search(unclear).offset
     assert [width for width, _ in unclear.asked] == [20.0, 80.0, 700.0]
     assert [probes for _, probes in unclear.asked] == [1500, 2000, 3000]
     assert found is not None
     assert found.half_width == 3.0
     none = Listed(spread_out(300, 5, width=700.0))
-    assert search(none).offset() is None
+    assert search(none).offset is None
     assert len(none.asked) == 3
 
 
 def test_the_most_significant_peak_decides_where_none_is_clear(search) -> None:
     """Forty matches near the line among ninety, and ninety farther out among two hundred and sixty."""
     across = np.r_[spread_out(90, 40, at=5.0), spread_out(260, 90, at=60.0, width=90.0)]
-    found = search(Listed(across)).offset()
+    found = search(Listed(across)).offset
     assert found is not None
     places = np.array([[500.0, 500.0]])
     np.testing.assert_allclose(found.at(places).across, [560.0], atol=0.5)

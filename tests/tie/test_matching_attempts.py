@@ -39,10 +39,10 @@ def attempts(monkeypatch, shares):
     def scripted(*reports: PairReport) -> list[TieOptions]:
         script = iter(reports)
 
-        def attempt(_views, _keypoints, _pair, options: TieOptions, _looked=None, share=None) -> Any:
+        def attempt(_views, _keypoints, _pair, options: TieOptions, _looked=None, share=0.0) -> Any:
             made.append(options)
             shares.append(share)
-            return NO_MATCHES, replace(next(script), matcher=options.matcher)
+            return NO_MATCHES, replace(next(script), matcher=options.matcher, loosened=share > 0.0)
 
         monkeypatch.setattr(matching, "_attempt", attempt)
         return made
@@ -78,7 +78,7 @@ def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, share
     found = match_pair((None, None), NOBODY, PAIR, TieOptions(**given))[1]  # type: ignore[arg-type]
     assert found == replace(report(120), loosened=True, beaten=("guided 99 of 100",))
     assert (made[1].ratio, shares[1], made[1].min_matches) == loosened
-    assert shares[0] is None  # the usual one
+    assert shares[0] == 0.0  # the usual one
     assert len(made) == 2
 
 

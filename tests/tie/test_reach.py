@@ -87,7 +87,7 @@ def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
     monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
     two = (*views(camera(0.0), camera(METRE)),)
     search = _PairSearch(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
-    assert search.offset() is None
+    assert search.offset is None
     assert made == passes
 
 
@@ -156,7 +156,7 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
     search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
-    coarse = search.offset()
+    coarse = search.offset
     assert coarse is not None
     whole = structural._GridSearch(*scene.views, 1, coarse).matches()
     sizes, of = [], PatchTile.surfaces

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -60,6 +60,12 @@ class Keypoints:
     def strongest(self, most: int) -> Keypoints:
         """Return so many keypoints, the strongest."""
         return self.select(np.argsort(-self.response, kind="stable")[:most])
+
+    boxes: ClassVar[tuple[Box, ...]] = ()  # of tiles: there are none in memory
+
+    def load(self, _: Sequence[Box] = ()) -> tuple[Keypoints, IntArray]:
+        """Return them and their numbers, as `KeypointFiles` does."""
+        return self, np.arange(len(self))
 
 
 def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,20 +60,16 @@ BAND_HALFWIDTH = 3.0
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
 _SIGNIFICANT = 6.0  # standard deviations
-_NEIGHBOURS_COUNTED, _SPARSE_FACTOR = (
-    3,
-    2.0,
-)  # so many matches lie about a point, usually; it has none near where they lie so many times as far
+_NEIGHBOURS_COUNTED, _SPARSE_FACTOR = 3, 2.0
+"""A point has no matches near where so many lie so many times as far from it as from another."""
 _NOWHERE = "no common offset"
 FALSE_SHARE = 0.01
 """Share of false matches that is accepted, as control bands estimate it."""
-_SECOND_ATTEMPT = (
-    0.95,
-    0.05,
-    2 / 3,
-)  # ratio and false share of the second attempt; its part of the matches that a pair needs
+_LOOSE_RATIO, _LOOSE_FALSE_SHARE, _LOOSE_NEEDED = 0.95, 0.05, 2 / 3
+"""Ratio and false share of the second attempt; its part of the matches that a pair needs."""
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
 _PROBES = 12  # pixels along a side at which the terrain is asked
+_BOTH = Pair((0, 1), 1.0, 0.0)  # two views, of which nothing else is asked
 
 
 Ends = tuple[View, View]
@@ -160,10 +156,7 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
     found, report = _attempts(views, keypoints, pair, options)
     if options.matcher != TIE_DEFAULTS.matcher or (report.status == "ok" and not stretched(views, *found.ends)):
         return found, report
-    a, b = (
-        points.strongest(SAMPLE).load()[0] if isinstance(points, KeypointFiles) else points.strongest(SAMPLE)
-        for points in keypoints
-    )
+    a, b = (points.strongest(SAMPLE).load()[0] for points in keypoints)
     placings = _placing(views[::-1], (b, a), pair, options), _placing(views, (a, b), pair, options)
     if placings == (None, None):
         return found, report
@@ -187,21 +180,18 @@ def _attempts(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -
         return first
     loose = replace(
         options,
-        ratio=max(options.ratio, _SECOND_ATTEMPT[0]),
-        min_matches=max(4, math.ceil(options.min_matches * _SECOND_ATTEMPT[2])),
+        ratio=max(options.ratio, _LOOSE_RATIO),
+        min_matches=max(4, math.ceil(options.min_matches * _LOOSE_NEEDED)),
     )
     tried, structural = [first], options.matcher == STRUCTURE
     if not (
         (structural and first[1].matches < loose.min_matches)  # thresholds do not say where it looks
         or (first[1].status.startswith(_NOWHERE) and options.ratio >= CLEAR_RATIO)
     ):  # nor do looser ones let more through where only clear matches count
-        found, report = _attempt(views, keypoints, pair, loose, looked, _SECOND_ATTEMPT[1])
-        tried.append((found, replace(report, loosened=True)))
+        tried.append(_attempt(views, keypoints, pair, loose, looked, _LOOSE_FALSE_SHARE))
     if structural and all(report.status != "ok" for _, report in tried):
-        found, report = _attempt(
-            views, keypoints, pair, replace(loose, matcher=FINE_STRUCTURE), None, _SECOND_ATTEMPT[1]
-        )
-        tried.append((found, replace(report, loosened=True)))
+        fine = replace(loose, matcher=FINE_STRUCTURE)
+        tried.append(_attempt(views, keypoints, pair, fine, looked, _LOOSE_FALSE_SHARE))
     return better(*tried)
 
 
@@ -229,15 +219,12 @@ def _wanted_matches(report: PairReport) -> int:
 def better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
     """Return the attempt with most verified matches, of those that count; the earlier one of equals."""
     best = max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
-    beaten = tuple(
-        text
-        for _, report in attempts
-        for text in (
-            *report.beaten,
-            *([] if report is best[1] else [f"{report.means} {report.verified} of {_wanted_matches(report)}"]),
-        )
-    )
-    return best[0], replace(best[1], beaten=beaten)
+    beaten: list[str] = []
+    for _, report in attempts:
+        beaten += report.beaten
+        if report is not best[1]:
+            beaten.append(f"{report.means} {report.verified} of {_wanted_matches(report)}")
+    return best[0], replace(best[1], beaten=tuple(beaten))
 
 
 def _attempt(
@@ -246,13 +233,15 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _PairSearch] | None = None,
-    false_share: float | None = None,
+    loosened: float = 0.0,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt."""
+    """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt.
+
+    `loosened`: the share of false matches that a second attempt accepts.
+    """
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
-    report = PairReport(
-        names, "ok", counts, angle=pair.angle, overlap=pair.overlap, matcher=options.matcher, reason=pair.reason
-    )
+    known: dict[str, Any] = {"angle": pair.angle, "overlap": pair.overlap, "reason": pair.reason}
+    report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=bool(loosened), **known)
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -261,44 +250,36 @@ def _attempt(
     before = looked.get(options.matcher)
     search = _PairSearch(views, loaded, options) if before is None else before.loosened(loaded, options)
     looked[options.matcher] = search
-    coarse = search.offset()
+    coarse = search.offset
     if coarse is None:
         return NO_MATCHES, replace(report, status=f"{_NOWHERE} within {search.reach:.4g} px")
-    tight = search.further(search.trusted(coarse, _SECOND_ATTEMPT[1])[0])
+    tight = search.further(search.trusted(coarse, _LOOSE_FALSE_SHARE)[0])
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    found, control = search.trusted(search.local(tight), false_share or FALSE_SHARE)
+    found, control = search.trusted(search.local(tight), loosened or FALSE_SHARE)
     errors = search.errors(found)
     keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
-    if _count_separate(found.xy[keep, 0], search.patch) < options.min_matches:
+    cells = np.floor(found.xy[keep, 0] / search.patch) if search.patch else found.xy[keep, 0]
+    if len(np.unique(cells, axis=0)) < options.min_matches:  # others share their patches
         return NO_MATCHES, replace(report, status="too few matches on common epipolar lines")
     spread, share = robust_spread(residual[keep]), report.verified / len(found)
     along, across = np.median(errors[keep], axis=0).tolist()
     report = replace(report, inlier_share=share, offset=(along, across), spread=spread)
-    if kind.detects and numbers is not None:
+    if kind.detects:
         index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
         found = replace(found, index=index)
     return replace(found.select(keep), sigma=max(spread, 0.05)), report
 
 
-def _count_separate(xy: Array, side: float) -> int:
-    """Count the points (M, 2) that stand far enough apart not to share their patches."""
-    return len(np.unique(np.floor(xy / side), axis=0)) if side else len(xy)
-
-
 def _overlap_keypoints(
     views: Ends, keypoints: Points, options: TieOptions
-) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray] | None]:
-    """Return the keypoints of the tiles that both views may see, and their numbers; None: as they stand."""
-    a, b = keypoints
-    if isinstance(a, Keypoints) or isinstance(b, Keypoints):
-        assert isinstance(a, Keypoints)
-        assert isinstance(b, Keypoints)
-        return (a, b), None
-    seen = shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options, boxes=(a.boxes, b.boxes))
-    first, second = a.load(seen[0]), b.load(seen[1])
+) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray]]:
+    """Return the keypoints of the tiles that both views may see, or all in memory, and their numbers."""
+    boxes = [points.boxes for points in keypoints]
+    seen = shared_tiles(views, [_BOTH], options, boxes=boxes) if any(boxes) else boxes
+    first, second = (points.load(some) for points, some in zip(keypoints, seen, strict=True))
     return (first[0], second[0]), (first[1], second[1])
 
 
@@ -307,9 +288,9 @@ def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], opt
     few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
-    search = _PairSearch(views, _overlap_keypoints(views, few, options)[0], replace(options, ratio=_SECOND_ATTEMPT[0]))
-    coarse = search.offset()
-    return 0 if coarse is None else len(search.trusted(coarse, _SECOND_ATTEMPT[1])[0])
+    search = _PairSearch(views, _overlap_keypoints(views, few, options)[0], replace(options, ratio=_LOOSE_RATIO))
+    coarse = search.offset
+    return 0 if coarse is None else len(search.trusted(coarse, _LOOSE_FALSE_SHARE)[0])
 
 
 def first_look(
@@ -392,11 +373,10 @@ class _PairSearch:
 
     def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
-        self._offset: list[Prediction | None] = []
         self._matcher = matcher_named(options.matcher)(options, keypoints)
         self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
-        self._windows = cache(lambda: shared_tiles(views, [Pair((0, 1), 1.0, 0.0)], options)[0])
+        self._windows = cache(lambda: shared_tiles(views, [_BOTH], options)[0])
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
@@ -410,7 +390,7 @@ class _PairSearch:
         if self._matcher.detects:
             other._matcher = matcher_named(options.matcher)(options, keypoints)
         if self._options.ratio < CLEAR_RATIO:  # nor which matches are clear, but for this
-            other._offset = []
+            vars(other).pop("offset", None)
         return other
 
     @property
@@ -448,14 +428,9 @@ class _PairSearch:
         count = good[-1] + 1 if len(good) else 0
         return found.select(np.arange(count)), float(share[count - 1]) if count else 0.0
 
+    @cached_property
     def offset(self) -> Prediction | None:
-        """Return where to search, once the cameras' error is found by blind passes of growing width."""
-        if not self._offset:
-            self._offset.append(self._passes())
-        return self._offset[0]
-
-    def _passes(self) -> Prediction | None:
-        """Return where to search by several blind passes.
+        """Where to search, by blind passes of growing width for the cameras' error.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -476,7 +451,7 @@ class _PairSearch:
         """
         for _ in range(RIVALS if self._matcher.detects and len(tight) >= FEW else 0):
             peak = self._beside(tight)
-            more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _SECOND_ATTEMPT[1])[0]
+            more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _LOOSE_FALSE_SHARE)[0]
             both = tight.and_others(more)
             if len(both) == len(tight):
                 break

@@ -1,4 +1,4 @@
-"""Sub-pixel registration: every observation of a track is registered to ONE reference patch, and verified.
+"""Sub-pixel registration: every observation of a track is registered to one reference patch, and verified.
 
 The reference is the patch around the keypoint in the view most like the others, at a whole pixel, so that it needs no
 interpolation and defines the point exactly: errors do not chain from view to view. The patch of another view is
@@ -31,9 +31,8 @@ PATCH = 21
 """Side of the patches that are registered [px], odd."""
 _INNER = 0.7  # part of a patch that counts most: its Gaussian weight's sigma; the patch of second tries and the check
 _SUBPIXEL_SAMPLES = 4  # samples a pixel and axis
-_SAMPLER_STEPS = (
-    cv2.INTER_TAB_SIZE * _SUBPIXEL_SAMPLES
-)  # a pixel and axis: positions that the sampler tells apart, and steps end at
+_SAMPLER_STEPS = cv2.INTER_TAB_SIZE * _SUBPIXEL_SAMPLES
+"""Positions a pixel and axis that the sampler tells apart; iterations end at a step between two of them."""
 _TAPS = 6  # samples on either side in the interpolation
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
 _LEAST_END_SIGMA = 0.02  # px, of an observation: a rendered one that is matched best
@@ -85,9 +84,8 @@ def register_places(
     return every
 
 
-ReadWindow = tuple[
-    FloatImage, BoolArray, Array
-]  # pixels, which are valid, place of the image's origin (2,) or (N, 2) [px]
+ReadWindow = tuple[FloatImage, BoolArray, Array]
+"""Pixels, the mask of valid ones, and the place of the image's origin (2,) or (N, 2) [px]."""
 
 
 def _sparse(xy: Array, margin: int) -> bool:
@@ -304,9 +302,8 @@ class _Template:
         active = np.arange(len(centre))
         jacobian, inverse = solver
         for _ in range(NEWTON_STEPS):
-            sampled = (
-                np.rint(centre[active] * _SAMPLER_STEPS) / _SAMPLER_STEPS
-            )  # else the sampler would round, and we not know
+            # else the sampler would round, and we not know
+            sampled = np.rint(centre[active] * _SAMPLER_STEPS) / _SAMPLER_STEPS
             patches = self._normalized(self._sample(fine, sampled, linear[active]))[0]
             right = (jacobian @ (self._root * patches)[:, :, None]).astype(np.float64)
             solution = (inverse @ right)[:, :, 0]
