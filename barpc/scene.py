@@ -153,6 +153,15 @@ class Tracks(Frozen):
         _, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.view[keep], point, self.xy[keep], self.sigma[keep])
 
+    def row_pairs(self) -> tuple[IntArray, IntArray]:
+        """Return the rows (n,), (n,) of all pairs of observations of a track, that of the lower view first."""
+        found, step = [np.empty((2, 0), np.int64)], 1
+        while step < len(self) and len(rows := np.flatnonzero(self.point[step:] == self.point[:-step])):
+            found.append(np.stack([rows, rows + step]))
+            step += 1
+        first, second = np.concatenate(found, axis=1)
+        return first, second
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundPoints(Frozen):

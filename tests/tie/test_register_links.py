@@ -137,7 +137,7 @@ def test_of_four_views_the_link_that_contradicts_two_neighbours_is_torn_alone() 
     assert np.flatnonzero(torn).tolist() == [30]
 
 
-def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_than_others() -> None:
+def test_what_is_verified_is_at_its_altitude_and_no_less_certain_than_others_on_its_line_or_not() -> None:
     links = links_of(60, 3)
     altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 2)
     xy = np.empty((120, 2))
@@ -153,11 +153,11 @@ def test_what_is_verified_is_on_its_line_at_its_altitude_and_no_less_certain_tha
     few[::3] = False
     np.testing.assert_array_equal(links.verified(found, few), few)
     off = PatchRegistration(xy.copy(), found.correlation, found.sigma.copy(), found.ok)
-    off.xy[20] += 0.15 * aside  # off its line
+    off.xy[20] += 0.15 * aside  # off its line: a camera's error or a match's, as the adjustment judges
     off.xy[51] += 3.0 * np.array([aside[1], -aside[0]])  # along it: at another altitude than its neighbour
     off.sigma[80], off.sigma[90] = 0.21, 0.19  # of the median 0.1 twice is tolerated
     left = links.verified(off, every)
-    assert np.flatnonzero(~left).tolist() == [20, 50, 51, 80]
+    assert np.flatnonzero(~left).tolist() == [50, 51, 80]
 
 
 def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_points() -> None:

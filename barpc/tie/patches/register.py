@@ -129,8 +129,13 @@ def _task_parts(origin: Array, links: IntArray, tile: int) -> list[IntArray]:
         return [links[rows] for rows in _merge_groups(_by_tile(origin, tile), CHUNK)]
     order = np.lexsort((origin[:, 0], origin[:, 1] // SPAN))
     bands = np.split(order, np.flatnonzero(np.diff(origin[order, 1] // SPAN)) + 1)
-    pieces = [band[at : at + SPAN] for band in bands for at in range(0, len(band), SPAN)]
+    pieces = [piece for band in bands for piece in _chunks(band)]
     return [links[rows] for rows in _merge_groups(pieces, SPAN)]
+
+
+def _chunks(rows: IntArray) -> list[IntArray]:
+    """Return rows in parts of `SPAN` at most."""
+    return [rows[first : first + SPAN] for first in range(0, len(rows), SPAN)]
 
 
 def _by_tile(xy: Array, tile: int) -> list[IntArray]:
@@ -141,12 +146,9 @@ def _by_tile(xy: Array, tile: int) -> list[IntArray]:
 def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
     """Return the groups that follow each other as one, as far as they hold so many together."""
     parts: list[list[IntArray]] = []
-    count = most
     for group in groups:
-        count += len(group)
-        if count > most:
+        if not parts or sum(map(len, parts[-1])) + len(group) > most:
             parts.append([])
-            count = len(group)
         parts[-1].append(group)
     return [np.concatenate(part) for part in parts]
 
@@ -196,10 +198,6 @@ def register_patches(
     return best
 
 
-def _chunks(rows: IntArray) -> list[IntArray]:
-    return [rows[first : first + SPAN] for first in range(0, len(rows), SPAN)]
-
-
 def _at(mask: BoolArray, xy: Array) -> BoolArray:
     col, row = np.rint(np.nan_to_num(xy, nan=-1.0)).astype(np.int64).T
     inside = (col >= 0) & (row >= 0) & (col < mask.shape[1]) & (row < mask.shape[0])
@@ -208,8 +206,7 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
 
 
 def _upsampled(image: FloatImage) -> FloatImage:
-    """Resample with more samples a side by a windowed sinc; the sample `_SUBPIXEL_SAMPLES` (row, col) is the pixel
-    (row, col).
+    """Upsample by a windowed sinc; the sample `_SUBPIXEL_SAMPLES` (row, col) is the pixel (row, col).
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
@@ -293,8 +290,7 @@ class _Template:
     def _iterate(
         self, fine: FloatImage, solver: tuple[FloatImage, Array], centre: Array, linear: Array, settled: float
     ) -> tuple[Array, Array, Array]:
-        """Return the centres after the iterations, the length of each one's last step [px], and the
-        correlation there.
+        """Return the centres after the iterations, their last steps' lengths [px], and the correlations.
 
         The gain between patches of variance 1, where nothing else is left to fit, is their correlation.
         """
@@ -345,8 +341,8 @@ def refine(
     Views of `structural` pairs are compared on channels of oriented gradients, all others on grey values.
 
     `spreads`, `PairReport.spread` of the pairs of views, tell which view of a track makes the best reference. Its
-    observation is given at a whole pixel, the others as registered, without what did not correlate or left its
-    epipolar line. Each observation carries half the variance of its registration.
+    observation is given at a whole pixel, the others as registered, without those that do not correlate. Each carries
+    half the variance of its registration.
     """
     if not len(tracks):
         return tracks
@@ -416,7 +412,11 @@ class _Registrations:
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
-        """Return the observations near their epipolar line, as certain as others, at one altitude with their track."""
+        """Return the observations that are as certain as others, at one altitude with their track.
+
+        Those off their epipolar line stay: whether the match or the camera is wrong, the adjustment judges, and what it
+        holds out is not to agree by selection.
+        """
         verified = np.zeros(len(self), dtype=bool)
         altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
@@ -424,8 +424,8 @@ class _Registrations:
             if len(group):
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
+                verified[group] = True
                 errors, reach[group] = self.errors(found, group)
-                verified[group] = coherent(self.origin[group], errors[:, 1], oriented.SIGMA)[0]
                 altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
         return verified & ~self._torn(verified, altitude, reach)
 
@@ -489,16 +489,11 @@ def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_vie
     key = np.array([min(pair) * num_views + max(pair) for pair in spreads] or [-1], dtype=np.int64)
     spread = np.array(list(spreads.values()) or [0.0])[np.argsort(key)]
     key = np.sort(key)
-    starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
-    length = np.diff(starts)[tracks.point]
-    left = np.repeat(np.arange(len(tracks)), length)
-    step = np.arange(len(left)) - np.repeat(np.cumsum(length) - length, length)
-    right = starts[tracks.point[left]] + step
-    low = np.minimum(tracks.view[left], tracks.view[right])
-    wanted = low * num_views + np.maximum(tracks.view[left], tracks.view[right])
+    first, second = tracks.row_pairs()
+    wanted = tracks.view[first] * num_views + tracks.view[second]
     place = np.searchsorted(key, wanted).clip(0, len(key) - 1)
-    unlike = np.where(key[place] == wanted, spread[place], np.where(left == right, 0.0, 2.0 * spread.max()))
-    cost = np.bincount(left, weights=unlike, minlength=len(tracks))
+    unlike = np.where(key[place] == wanted, spread[place], 2.0 * spread.max())
+    cost = np.bincount(np.append(first, second), weights=np.append(unlike, unlike), minlength=len(tracks))
     order = np.lexsort((cost, tracks.point))
-    first: IntArray = order[starts[:-1]]
-    return first
+    best: IntArray = order[np.searchsorted(tracks.point, np.arange(tracks.num_points))]
+    return best
