@@ -21,7 +21,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
-from barpc.tie.matchers.matching import FINE_STRUCTURE
+from barpc.tie.matchers.report import FINE_STRUCTURE
 
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""

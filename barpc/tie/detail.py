@@ -1,4 +1,4 @@
-"""Where images show detail that their partners see: what tie points are to be expected there."""
+"""Expected density of tie points, by detail that partners see, and gaps in it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from barpc.tie.matchers.features import KeypointFiles
 
 PARTS_PER_SIDE = 64
 """Equal parts of an image's columns, and of its rows, in which keypoints are counted."""
-_CHANCE_PER_PAIR = 1e-6 / (
-    PARTS_PER_SIDE * (PARTS_PER_SIDE - 1) / 2
-)  # of a stretch, so that one of all in a million axes is found by chance
+_CHANCE_PER_PAIR = 1e-6 / (PARTS_PER_SIDE * (PARTS_PER_SIDE - 1) / 2)
+"""Of each stretch of parts: of a million axes one is found by chance."""
 Seen = tuple[Array, Array, tuple[int, int]]
 """Matches of a view (M, 2) with a partner (M, 2) [px], and the partner's size."""
 

@@ -43,6 +43,18 @@ class Stretch:
     low: float
     high: float
 
+    @staticmethod
+    def of(values: Pixels) -> Stretch | None:
+        """Return the stretch of the middle 99 % of some 100,000 of the values (N,); None where nothing varies."""
+        return Stretch.between(values[:: 1 + len(values) // 100_000], (0.5, 99.5))
+
+    @staticmethod
+    def between(values: Pixels, percent: tuple[float, float], least: float = 0.0) -> Stretch | None:
+        """Return the stretch between two percentiles of values (N,); None where they differ by `least` or less."""
+        low, high = np.percentile(values, percent) if len(values) else (0.0, 0.0)
+        varies = high / 2 - low / 2 > least * max(abs(low), abs(high)) / 2  # halves: a difference may have no number
+        return Stretch(float(low), float(high)) if varies else None
+
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
         """Return an 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
@@ -71,12 +83,10 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
     if pixels.dtype == np.float32:
         return pixels.astype(np.float32, copy=False)
     known = pixels[valid]
-    low, high = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5]) if len(known) else (0.0, 0.0)
-    if len(known) and not high > low:
-        low, high = known.min(), known.max()
-    if not high > low:
+    stretch = Stretch.of(known) or Stretch.between(known, (0.0, 100.0))
+    if stretch is None:
         return np.zeros(pixels.shape, np.float32)
-    return np.where(valid, _contrast_stretched(pixels, float(low), float(high)), np.float32(0.0))
+    return np.where(valid, _contrast_stretched(pixels, stretch.low, stretch.high), np.float32(0.0))
 
 
 def read_pixels(
@@ -215,12 +225,8 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int,
                 box = int(col), int(row), side_x, side_y
                 pixels, valid = _block_means(read, box, pixel, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
-    values = np.concatenate(found)
-    low, high = np.percentile(values, [0.5, 99.5]) if len(values) else (0.0, 0.0)
-    step = np.finfo(kind).eps if kind.kind == "f" else 0.0
-    if not high / 2 - low / 2 > _NEGLIGIBLE * step * max(abs(low), abs(high)) / 2:
-        return None
-    return Stretch(float(low), float(high))
+    step = float(np.finfo(kind).eps) if kind.kind == "f" else 0.0
+    return Stretch.between(np.concatenate(found), (0.5, 99.5), _NEGLIGIBLE * step)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from barpc.base.statistics import MAD, SURELY, robust_spread
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.matchers.structural import GRID_POINTS
+from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import INVALID_MARGIN, Patch, Sheet, correlation, of_image, of_reference, picture_share
 from barpc.tie.patches.oriented import HALF, PatchTile
@@ -298,10 +299,8 @@ class _ReferenceWork:
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
         apart = self.step * max(HALF // 2, round((max(areas) / GRID_POINTS[-1]) ** 0.5 / self.step))
         every = np.concatenate(local)
-        low, high = (
-            np.floor((every.min(axis=0) - VOTE_RADIUS) / apart),
-            np.ceil((every.max(axis=0) + VOTE_RADIUS) / apart),
-        )
+        low = np.floor((every.min(axis=0) - VOTE_RADIUS) / apart)
+        high = np.ceil((every.max(axis=0) + VOTE_RADIUS) / apart)
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
         places = origin + np.stack(grid, axis=-1).reshape(-1, 2) / metres
         places = places[np.any([sheet.shows(places) for sheet in self.sheets], axis=0)]
@@ -316,10 +315,9 @@ class _ReferenceWork:
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(((at >= edge) & (at <= np.array(view.size) - 1.0 - edge)).all(axis=1))
         pad = HALF + 3 * reach + 2 * INVALID_MARGIN  # where decoys end
-        cell = np.floor(places[inside] * metres / self.step / SPAN).astype(np.int64)
-        _, group = np.unique(cell, axis=0, return_inverse=True)
         tiles = []
-        for points in (inside[group.ravel() == g] for g in range(int(group.max(initial=-1)) + 1)):
+        for rows in grouped(*np.floor(places[inside] * metres / self.step / SPAN).T):
+            points = inside[rows]
             first = np.array([places[points, 0].min(), places[points, 1].max()])
             scale = metres_per_unit(np.append(first, 0.0))[:2]
             px = (places[points] - first) * scale / self.step * [1.0, -1.0] + pad
@@ -358,8 +356,7 @@ class _ReferenceWork:
 def _affine(
     local: Array, shift: Array, passed: BoolArray, step: float
 ) -> tuple[Array, BoolArray, tuple[float, float]] | None:
-    """Return an affine (n, 2) through most of the shifts (n, 2), those near it, their standard deviations
-    along both axes.
+    """Return an affine (n, 2) through most of the shifts (n, 2), its inliers, their sigmas along both axes.
 
     The search starts where most shifts lie together, within `SURELY` px. None where too few agree.
     """

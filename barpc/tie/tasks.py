@@ -1,4 +1,4 @@
-"""How the tasks of a stage are handed to whoever works on them, and where results lie that travel by reference."""
+"""Execution of the tasks of a stage, and the store of results that travel by reference."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ def ordered(
     stage: str,
     progress: Progress | None = None,
 ) -> list[Any]:
-    """Run `function(*task)` on an executor and return the results in order; the rest is cancelled when one
-    fails.
+    """Run `function(*task)` on an executor; return the results in order. A failure cancels the rest.
 
     Parameters
     ----------

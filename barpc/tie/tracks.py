@@ -6,7 +6,6 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,20 +21,9 @@ from barpc.tie.detail import Seen, seen_detail
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.matchers.given import GivenMatches, beside_given, verify_given
 from barpc.tie.matchers.matcher import Matches
-from barpc.tie.matchers.matching import (
-    FINE_STRUCTURE,
-    MATCHERS,
-    STRUCTURE,
-    GroundAltitudes,
-    PairReport,
-    ample,
-    enough,
-    first_look,
-    match_pairs,
-    matcher_named,
-    quick_score,
-)
-from barpc.tie.matchers.placings import misplaced, stretched
+from barpc.tie.matchers.matching import MATCHERS, GroundAltitudes, first_look, match_pairs, matcher_named, quick_score
+from barpc.tie.matchers.placings import stretched
+from barpc.tie.matchers.report import PairReport, ample, enough, require_matches
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import (
@@ -48,7 +36,6 @@ from barpc.tie.pairing.overlaps import (
     best_pairs,
     further_pairs,
     possible_pairs,
-    require_connected,
     scored_pair,
     several_dates,
 )
@@ -128,7 +115,7 @@ def _registered_tracks(
     spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
     sizes = [view.size for view in looks.views]
     linked = thin(linked, sizes, most)
-    structural = [ends for ends, _, report in tried if report.matcher in (STRUCTURE, FINE_STRUCTURE)]
+    structural = [ends for ends, _, report in tried if report.structural]
     theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN_PAIR}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
@@ -276,7 +263,7 @@ class _Trials:
         own = self._looked_closer([looks.pair(pair) for pair in pairs], GroundAltitudes(self._scope.terrain))
         changed = False
         for pair, (ends, count), (found, report) in zip(pairs, registered.items(), own, strict=True):
-            structural = [ends] * (report.matcher in (STRUCTURE, FINE_STRUCTURE))
+            structural = [ends] * report.structural
             linked = thin(link([ends], [found]), [view.size for view in looks.views], options.points_per_image)
             tracks = refine(looks.views, linked, {}, options, structural=structural, work=self._work)
             if tracks.num_points >= max(count + 1, options.min_matches):
@@ -397,36 +384,6 @@ def tracks_inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> T
     return tracks.select(kept[tracks.point])
 
 
-def require_matches(
-    views: Sequence[View], pairs: Sequence[Pair], reports: Sequence[PairReport], joined: Sequence[int] = ()
-) -> None:
-    """Raise TiePointError where two views do not match, DisconnectedError where more fall into groups.
-
-    Views that are `joined` are one group without matches.
-    """
-    failed = [report for report in reports if report.status != "ok"]
-    links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
-    placings = {pair.views: report.placings for pair, report in zip(pairs, reports, strict=True)}
-    said = misplaced(views, links, placings)
-    listed = "; ".join(
-        f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
-        f"{r.verified} of {r.matches} matches verified)"
-        for r in failed[:4]
-    )
-    bare = [r for r in failed if r.status == "too few keypoints"]
-    blank = sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n})
-    loosen = "loosen ratio, search or min_matches ([tie] of a file given with --options)"
-    advice = f"look at the images (clouds? dates? band?), or {loosen}"
-    if blank:
-        names = ", ".join(blank[:4])
-        advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
-    why = "; ".join(f"{view.path}: {said[view.name]}" for view in views if view.name in said) or f"{listed}: {advice}"
-    if len(views) == 2 and failed:
-        raise TiePointError(f"too few tie points: {why}")
-    links += pairwise(joined)
-    require_connected(views, links, f"no tie points between them: {why}", said)
-
-
 def require_tracks(
     views: Sequence[View],
     tracks: Tracks,
@@ -444,8 +401,7 @@ def require_tracks(
 
 
 def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks:
-    """Link matches of pairs of views into tracks by shared points; a track that meets a view twice is thrown
-    away.
+    """Link matches of pairs into tracks by shared points; tracks with two points of a view are rejected.
 
     The order of the pairs does not matter: tracks are ordered by their first observation. An observation's sigma is
     that of the best match it took part in.
@@ -524,11 +480,8 @@ def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
     """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
-    found, step, num = [np.empty(0, np.int64)], 1, int(tracks.view.max(initial=0)) + 1
-    while step < len(tracks) and (same := tracks.point[step:] == tracks.point[:-step]).any():
-        found.append(tracks.view[:-step][same] * num + tracks.view[step:][same])
-        step += 1
-    keys, counts = np.unique(np.concatenate(found), return_counts=True)
+    (first, second), num = tracks.row_pairs(), int(tracks.view.max(initial=0)) + 1
+    keys, counts = np.unique(tracks.view[first] * num + tracks.view[second], return_counts=True)
     return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}
 
 

@@ -17,7 +17,7 @@ from barpc.scene import connected_groups
 from barpc.tie import Scope, TieOptions, find_tracks, select_pairs, tracks
 from barpc.tie.matchers.features import KeypointFiles
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import PairReport
+from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.overlaps import (
     Pair,
     best_pairs,

@@ -14,7 +14,8 @@ from barpc.tie import TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import MATCHERS, PairReport, _latest, _PairSearch, better, enough
+from barpc.tie.matchers.matching import MATCHERS, _latest, _PairSearch
+from barpc.tie.matchers.report import PairReport, better, enough
 from barpc.tie.pairing.epipolar import (
     EpipolarSegments,
 )

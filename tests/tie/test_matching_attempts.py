@@ -15,7 +15,8 @@ from barpc.tie import Matches, TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import GroundAltitudes, PairReport, match_pair, match_pairs
+from barpc.tie.matchers.matching import GroundAltitudes, match_pair, match_pairs
+from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tracks import _merge_registered, _unlike, _with_unregistered, link
 

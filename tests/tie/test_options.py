@@ -15,7 +15,8 @@ from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import TieOptions, detect, find_tracks, link, select_pairs
 from barpc.tie.matchers.features import KeypointDensity, Keypoints, detect_tile
-from barpc.tie.matchers.matching import PairReport, match_pair
+from barpc.tie.matchers.matching import match_pair
+from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.epipolar import (
     common_range,
     epipolar_segments,

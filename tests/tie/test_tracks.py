@@ -11,7 +11,7 @@ import pytest
 from barpc.scene import Tracks
 from barpc.tie import Matches, TieOptions, common_tracks, select_pairs, thin
 from barpc.tie import link as link_pairs
-from barpc.tie.matchers.matching import PairReport
+from barpc.tie.matchers.report import PairReport
 from barpc.tie.tracks import require_tracks
 from tests.tie.test_pairs import METRE, camera, views
 

@@ -34,9 +34,8 @@ _HOLDS = {2: 4.5e-3, 4: 1.2e-3}  # keypoints a px that real images hold, looked 
 _PART = 0.1
 """Verified matches of a pair that make a closer look needless, as a part of the points wanted of an image, at least
 `MANY`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
-_MIN_KEYPOINT_RATIO = (
-    4.0  # keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5
-)
+_MIN_KEYPOINT_RATIO = 4.0
+"""Keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class Keypoints:
     boxes: ClassVar[tuple[Box, ...]] = ()  # of tiles: there are none in memory
 
     def load(self, _: Sequence[Box] = ()) -> tuple[Keypoints, IntArray]:
-        """Return them and their numbers, as `KeypointFiles` does."""
+        """Return all keypoints and their numbers; the interface of `KeypointFiles`."""
         return self, np.arange(len(self))
 
 
@@ -98,8 +97,7 @@ class Sift:
 
 
 def _an_octave_up(keypoint: Any) -> Any:
-    """Return the keypoint, to be described in the picture of half the size: a quarter of the samples, and as
-    distinct.
+    """Return the keypoint with its octave raised by one: described by a quarter of the samples, and as distinct.
 
     OpenCV packs the octave (signed) and its picture, 1 to 3, into a byte each; picture 3 is the next octave's 0.
     """

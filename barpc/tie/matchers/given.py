@@ -1,4 +1,4 @@
-"""Matches of others: verified as our own are, and used as given where patches cannot be registered."""
+"""Third-party matches: verified as our own, and used as given where patches cannot be registered."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from barpc.base.statistics import CHANCE
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import Ends, PairReport, better, match_pair
+from barpc.tie.matchers.matching import Ends, match_pair
+from barpc.tie.matchers.report import PairReport, better
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine
 from barpc.tie.pairing.overlaps import GIVEN_PAIR, Pair
 from barpc.tie.tasks import Work

@@ -1,4 +1,4 @@
-"""What a matcher is given, and what it gives back.
+"""Interface of matchers: their input, a prediction, and their output, matches.
 
 A matcher is a class of one file and one row in `barpc.tie.matchers.matching.MATCHERS`: `match(a, b, prediction)` looks
 for points of view A in view B. A view has a path to read pixels from and the camera; the prediction says where
@@ -55,8 +55,7 @@ class Prediction:
         return self.judge(xy[:, 0], xy[:, 1])[0]
 
     def judge(self, first: Array, second: Array) -> tuple[BoolArray, Array]:
-        """Return the places (M, 2), (M, 2) that lie in the bands, and their distance from the middles (M,), 1
-        at the edge.
+        """Return the mask of places (M, 2), (M, 2) in the bands, and distances from the middles (M,), 1 at the edge.
 
         False matches lie anywhere in a band: where nothing else tells how alike two places look, this does.
         """
@@ -176,8 +175,7 @@ def hooked(name: str) -> type[Matcher] | Hook:
 
 
 def hook_files(name: str) -> list[Path]:
-    """Return the files of `module:name`: its module, those beside it that it imports, and those that it
-    declares.
+    """Return the files of `module:name`: its module, imports from the same folder, and declared files.
 
     `name.files`, paths from where the module lies, are files that decide what it finds, such as weights. None for a
     matcher of the table, or a module without a file.

@@ -1,8 +1,8 @@
 """Matching two views along the epipolar segments that their cameras predict, with any matcher.
 
 A blind pass finds how wrong the cameras are relative to each other; a tight pass searches a narrow band about the
-corrected segments; a local pass looks again at the altitudes of the neighbours; a robust affine fit, window by window,
-throws out what does not lie on the lines. The same searches in bands that are shifted aside find only false matches:
+corrected segments; a local pass looks again at the altitudes of the neighbours; matches that disagree with their
+neighbours across the lines are rejected. The same searches in bands that are shifted aside find only false matches:
 they say how unlike two places may look for a wanted share of them.
 """
 
@@ -22,10 +22,19 @@ from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
-from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, ample_matches, join_keypoints
+from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
-from barpc.tie.matchers.placings import Placing, Placings, likeliest_placing, stretched
+from barpc.tie.matchers.placings import Placing, likeliest_placing, stretched
+from barpc.tie.matchers.report import (
+    FINE_STRUCTURE,
+    STRUCTURE,
+    SUFFICIENT_SHARE,
+    PairReport,
+    better,
+    enough,
+    worth_more,
+)
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
@@ -39,10 +48,6 @@ from barpc.tie.pairing.epipolar import (
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
 from barpc.tie.tasks import HERE, Work
 
-STRUCTURE = "structure"
-"""What tries again where another matcher finds few."""
-FINE_STRUCTURE = "fine-structure"
-"""And where that finds nothing."""
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
 """Name -> matcher."""
 
@@ -52,9 +57,6 @@ def matcher_named(name: str) -> type[Matcher] | Hook:
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
-SUFFICIENT_SHARE = 0.3
-"""A pair of fewer than `MANY` is not tried again where they are this share of the keypoints in its common area, and
-`FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
 BAND_HALFWIDTH = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
@@ -75,36 +77,6 @@ _BOTH = Pair((0, 1), 1.0, 0.0)  # two views, of which nothing else is asked
 Ends = tuple[View, View]
 Points = tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles]
 """Of both views; empty for a matcher that wants none."""
-
-
-@dataclass(frozen=True)
-class PairReport:
-    """Result of matching a pair of views."""
-
-    names: tuple[str, str]
-    status: str  # "ok", or what went wrong
-    keypoints: tuple[int, int]  # of the two views; 0 for a matcher that wants none
-    matches: int = 0  # after the tight pass
-    verified: int = 0  # of them, after the verification
-    inlier_share: float = 0.0  # verified / matches
-    control_share: float = 0.0  # of the verified matches: what chance alone would give
-    offset: tuple[float, float] = (float("nan"), float("nan"))
-    """Median distance along and across the epipolar line from the prediction at the middle altitude [px]."""
-    spread: float = float("nan")  # robust, across the epipolar line after the affine fit [px]
-    angle: float = float("nan")  # of convergence [deg]
-    overlap: float = float("nan")  # common area over that of the smaller footprint
-    matcher: str = "guided"  # that found the matches
-    loosened: bool = False  # whether with loosened thresholds, in a second attempt
-    reason: str = ""  # why the pair was tried
-    beaten: tuple[str, ...] = ()
-    """Attempts that found fewer: matcher, whether loosened, verified matches of those wanted, as "guided 12 of 100"."""
-    placings: Placings = (None, None)
-    unregistered: int = 0  # of its tracks stand where keypoints were found: their patches could not be registered
-
-    @property
-    def means(self) -> str:
-        """Method that found the matches, whether with loosened thresholds, and whether keypoints tie the pair."""
-        return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +119,7 @@ _UNKNOWN_GROUND = GroundAltitudes()
 
 
 def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -> tuple[Matches, PairReport]:
-    """Match two views; keypoints are empty for a matcher that wants none. Without matches the report gives
-    the reason.
+    """Match two views; a matcher without a detector takes empty keypoints. The report gives reasons of failure.
 
     Where few or none are found, loosened thresholds are tried, and what finds more counts; where none are, or matches
     of another size than the cameras say, it is asked whether a picture lies otherwise than its camera says.
@@ -193,38 +164,6 @@ def _attempts(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) -
         fine = replace(loose, matcher=FINE_STRUCTURE)
         tried.append(_attempt(views, keypoints, pair, fine, looked, _LOOSE_FALSE_SHARE))
     return better(*tried)
-
-
-def ample(report: PairReport, options: TieOptions) -> bool:
-    """Return whether a first look found enough matches to spare a closer one."""
-    return report.status == "ok" and report.verified >= ample_matches(options)
-
-
-def enough(report: PairReport) -> bool:
-    """Return whether a pair has enough matches not to be tried again."""
-    return report.status == "ok" and report.verified >= _wanted_matches(report)
-
-
-def _worth_more(report: PairReport) -> bool:
-    """Return whether another matcher may find what one by keypoints did not."""
-    return not any(report.placings) and "keypoints" not in report.status
-
-
-def _wanted_matches(report: PairReport) -> int:
-    """Return the number of matches that a pair should have: fewer where little is in common."""
-    common = report.overlap * min(report.keypoints)
-    return math.ceil(min(MANY, max(FEW, SUFFICIENT_SHARE * common))) if common > 0 else MANY
-
-
-def better(*attempts: tuple[Matches, PairReport]) -> tuple[Matches, PairReport]:
-    """Return the attempt with most verified matches, of those that count; the earlier one of equals."""
-    best = max(attempts, key=lambda attempt: attempt[1].verified if attempt[1].status == "ok" else -1)
-    beaten: list[str] = []
-    for _, report in attempts:
-        beaten += report.beaten
-        if report is not best[1]:
-            beaten.append(f"{report.means} {report.verified} of {_wanted_matches(report)}")
-    return best[0], replace(best[1], beaten=tuple(beaten))
 
 
 def _attempt(
@@ -324,7 +263,7 @@ def match_pairs(
     named = options.matcher != TIE_DEFAULTS.matcher
     if named and (options.matcher != STRUCTURE or ground.terrain is None):  # a name is what is wanted
         return found
-    thin = [k for k, (_, report) in enumerate(found) if not enough(report) and _worth_more(report)]
+    thin = [k for k, (_, report) in enumerate(found) if not enough(report) and worth_more(report)]
     good = [(task[0], one[0]) for task, one in zip(tasks, found, strict=True) if thin and enough(one[1])]
     known = GroundAltitudes(ground.terrain, (*ground.ties, *good)).altitudes() if thin else None
     none, other = join_keypoints([]), replace(options, matcher=STRUCTURE)

@@ -1,4 +1,4 @@
-"""How the picture of a file lies in the frame that its camera is for: mirrored, turned, at another size, or a crop.
+"""Placings of a picture in its camera's frame: mirrored, turned, at another size, or a crop.
 
 Keypoints tell without any camera how one picture is turned and scaled against another: each match by its own
 orientation and size, mirrored or not. What most of them say is tried as matching is, its keypoints laid as they would

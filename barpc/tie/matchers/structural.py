@@ -47,8 +47,7 @@ class GradientStructure:
         self._known: dict[Callable[[Array], EpipolarSegments], Matches] = {}
 
     def match(self, a: View, b: View, prediction: Prediction) -> Matches:
-        """Match a grid of points: those whose best place, in the band and in decoys to both sides, lies in
-        the band.
+        """Match a grid of points: those whose best place lies in the band, and not in decoys to both sides.
 
         All bands of a prediction, moved aside or not, are looked at at once; the next calls ask of what was found.
         """

@@ -1,4 +1,4 @@
-"""Where the cameras say that a point of one image lies in another: along a segment, up to a small error."""
+"""Epipolar segments: the predicted places of a point of one image in another, up to a small error."""
 
 from __future__ import annotations
 
@@ -150,8 +150,7 @@ def gradient(xy: Array, values: Array) -> Array:
 
 
 def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
-    """Return the values (N,) [px] at positions (N, 2) [px] that neighbours share, and their distances from the
-    median of these (N,).
+    """Return the mask of values (N,) [px] at positions (N, 2) [px] that neighbours share, and values less medians.
 
     An image may jump at a row or a column, so that no function of position holds all of it: a value that agrees with
     enough of the `FEW` nearest is none that came by chance. It does within `SURELY` robust standard deviations, or

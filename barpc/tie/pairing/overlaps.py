@@ -1,4 +1,4 @@
-"""Which views can be matched, footprints that overlap under a useful angle, and which pairs are tried.
+"""Candidate pairs, footprints that overlap under a useful angle, and the choice among them.
 
 Without dates, overlap and angle decide, and pairs that fail are replaced as long as views are not connected. Two dates
 may share no grey value: where the views are of several, pairs are compared by a few keypoints first
@@ -291,8 +291,7 @@ def _order(pair: Pair) -> tuple[int, int, float, Link]:
 
 
 def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bool = False) -> list[Pair]:
-    """Choose the best partners of every view, and pairs that connect all views, `twice` by two paths,
-    ascending.
+    """Choose the best partners of every view and pairs that connect all, `twice` by two paths; ascending.
 
     Pairs of one date take half of a view's partners at first, then what others leave. Pairs that are given are kept.
     """
@@ -343,8 +342,7 @@ def _connecting_pairs(left: Sequence[Pair], num_views: int, links: Sequence[Link
 def further_pairs(
     pairs: Sequence[Pair], num_views: int, links: Sequence[Link], tries: int, twice: bool = False
 ) -> list[Pair]:
-    """Return the best pairs not tried yet, to add `tries` paths between views that no path ties, or (`twice`)
-    only one.
+    """Return the best untried pairs, to add `tries` paths between views tied by no path, or (`twice`) by one.
 
     Pairs that have nothing in common are only worth it where there is no path at all.
     """
@@ -370,8 +368,7 @@ def _component_root(tree: list[int], node: int) -> int:
 
 
 def forests(links: Sequence[Link], num: int, count: int) -> list[int]:
-    """Return the numbers of the links, the best first, of `count` spanning forests: each link goes to the
-    first in which it joins two trees.
+    """Return the indices of the links, best first, of `count` spanning forests: each in the first that it extends.
 
     Together they keep what paths there are between two nodes, up to `count` (Nagamochi and Ibaraki 1992).
     """

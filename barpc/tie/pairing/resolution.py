@@ -112,8 +112,7 @@ def _scale(view: View) -> Array:
 def _reduction_factors(
     scales: tuple[Array, Array], most: tuple[PixelFactors, PixelFactors]
 ) -> tuple[PixelFactors, PixelFactors]:
-    """Return the columns and rows of two images, of scales (2, 2), that a pixel of their looks holds, `most`
-    of them each.
+    """Return the columns and rows, at most `most`, that a pixel of the looks of two images of scales (2, 2) holds.
 
     The whole number nearest to the other's pixel over its own, along either axis: below a ratio of 1.5 images are
     compared as they are, above it by pixels that differ by a third at most. Registration takes that for distortion.

@@ -219,8 +219,7 @@ def picture(
     shape: tuple[int, int],
     readers: OpenReaders | None = None,
 ) -> tuple[FloatImage, BoolArray]:
-    """Resample a raster to a grid (H, W) whose nodes (m, n, 2) lie at its col, row [px]; return also the
-    valid pixels.
+    """Resample a raster to a grid (H, W) with nodes (m, n, 2) at its col, row [px]; return also valid pixels.
 
     Where it is finer than the grid, it is averaged first. What lies between nodes of which one is NaN is not valid.
     """

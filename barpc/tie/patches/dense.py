@@ -16,9 +16,8 @@ from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
-COLUMNS_PER_PIXEL = (
-    2  # columns of the frame a pixel: of a Pleiades triplet heights differ by 0.62 m (NMAD), of one by 0.83 m
-)
+COLUMNS_PER_PIXEL = 2
+"""Columns of the frame a pixel: heights of a Pleiades triplet differ by 0.62 m (NMAD), with one by 0.83 m."""
 WINDOW = 7
 """Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
 _SGBM = {
@@ -32,10 +31,7 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_NOISE_VARIANCE, _SLOPE_VARIANCE = (
-    0.741,
-    0.305,
-)  # of white noise of variance 1, in the frame: its variance, and that of its slope
+_NOISE_VARIANCE, _SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise of variance 1 and of its slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +56,7 @@ class EpipolarFrame:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Dense matches: places (n, 2) in both images [px], starting altitude [m], standard deviation along the
-    line [px].
+    """Dense matches: places (n, 2) in both images [px], start altitudes [m], standard deviations along lines [px].
 
     `share`: of the pixels that both images show so many were matched.
     """
@@ -194,13 +189,10 @@ def _resampled(
     box: Box = int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
     raw, valid = read_pixels(path, box, band, size)
     pixels = levelled(raw, valid)
-    known = pixels[valid]
-    if not len(known):
+    stretch = Stretch.of(pixels[valid])
+    if stretch is None:
         return None
-    dark, bright = np.percentile(known[:: 1 + len(known) // 100_000], [0.5, 99.5])
-    if not bright > dark:
-        return None
-    picture = Stretch(float(dark), float(bright)).apply(pixels, valid)
+    picture = stretch.apply(pixels, valid)
     # the affine map of the box's own pixels; positions are rounded to 1/32 px, 0.016 px at most
     to_frame = np.column_stack([one[:, :2], one[:, 2] + one[:, :2] @ low])
     cv2.setNumThreads(1)  # the work is spread by processes
@@ -224,8 +216,7 @@ def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: i
 def _refined_disparity(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
 ) -> tuple[FloatImage, FloatImage]:
-    """Return disparities [columns] after a step of least squares matching from SGBM's, and their standard deviation
-    [px].
+    """Refine SGBM's disparities [columns] by a step of least squares matching; return also sigmas [px].
 
     SGBM locks to whole columns and lags on slopes; the step does not. A window's grey values are a gain, an offset and
     a shift along the line of the other's; noise is what these leave. Noise is in the slopes, too, and is taken out of
