@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import shift
 
 from barpc.base.options import TieOptions
 from barpc.rasters.raster import open_raster
@@ -14,6 +15,7 @@ from barpc.tie import common_tracks, find_tracks
 from barpc.tie.matchers.given import verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import _PairSearch
+from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tasks import HERE
 from benchmarks.planted import Plant
@@ -56,6 +58,34 @@ def test_ties_stand_behind_an_edge_as_they_do_before_it(scene: Rendered, plant: 
     before = scene.place(0, 1, usual)[:, plant.axis] > plant.start
     for side in (True, False):  # both sides keep what they had, but for a band about the edge
         assert (beyond == side).sum() > 0.6 * (before == side).sum()
+
+
+def test_single_places_that_lie_off_their_lines_reach_whoever_judges_them(scene: Rendered, tmp_path) -> None:
+    """Patches of an image, far from each other, lie 0.6 px off: no neighbour shares that, and their ties are right."""
+    here, there = common_tracks(scene.tied.tracks, 0, 1)
+    axis = epipolar_segments(*scene.views, here).axis
+    by = 0.6 * np.array([-axis[1], axis[0]])
+    far: list[np.ndarray] = []
+    for place in there[((there > 30) & (there < 270)).all(axis=1)]:
+        if all(np.abs(place - other).max() > 60 for other in far):
+            far.append(place)
+    with open_raster(scene.views[1].path) as dataset:
+        pixels = dataset.read(1)
+    for col, row in np.rint(far).astype(int):
+        near = np.s_[row - 25 : row + 26, col - 25 : col + 26]
+        moved = shift(pixels[near].astype(np.float64), by[::-1], order=3, mode="nearest")[7:-7, 7:-7]
+        pixels[row - 18 : row + 19, col - 18 : col + 19] = np.clip(np.rint(moved), 0, np.iinfo(pixels.dtype).max)
+    path = write_image(tmp_path / "off.tif", pixels)
+    two, few = [scene.views[0], replace(scene.views[1], path=str(path))], TieOptions(points_per_image=300)
+    first, second = common_tracks(find_tracks(two, few).tracks, 0, 1)
+    off = second - scene.place(0, 1, first)
+    inside = np.array([np.abs(second - place).max(axis=1) < 8 for place in far])
+    assert len(far) >= 8
+    found = [np.median(off[one], axis=0) for one in inside if one.any()]
+    assert len(found) >= 0.5 * len(far)  # of points as sparse as that few patches hold one
+    assert np.abs(np.nanmedian(found, axis=0) - by).max() < 0.1
+    beside = ~(np.array([np.abs(second - place).max(axis=1) < 32 for place in far]).any(axis=0))
+    assert np.nanmedian(np.hypot(*off[beside].T)) < 0.1
 
 
 def given(scene: Rendered, jump: tuple[float, float], wrong: float, count: int = 400) -> tuple[Matches, np.ndarray]:
