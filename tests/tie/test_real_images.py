@@ -66,7 +66,7 @@ def test_the_spread_on_steep_ground_under_twenty_degrees_holds_too(ventoux, vent
     assert robust_spread(residual) <= 0.12
     off = np.abs(residual) > 3 * robust_spread(residual)  # a match's fault or a camera's, which the adjustment judges
     assert np.std(residual[~off]) <= 0.12
-    assert off.mean() <= 0.04
+    assert 0.0 < off.mean() <= 0.05
     assert ventoux_ties.tracks.num_points >= 250
 
 
