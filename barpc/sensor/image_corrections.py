@@ -263,6 +263,67 @@ class Splined(Displaced):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class ColumnSpline(Frozen):
+    """A displacement that goes with the column alone: what a detector line does in every image that it takes.
+
+    Parameters
+    ----------
+    width : int, columns of its images
+    coeffs : (M, 2), coefficients of uniform cubic B-splines from edge to edge of the image, (col, row) [px]; M >= 4
+    edges : (C,), columns at which another detector begins [px], ascending
+    steps : (C, 2), what is added from each edge on, (col, row) [px]
+    """
+
+    width: int
+    coeffs: Array
+    edges: Array = field(default_factory=lambda: np.zeros(0))
+    steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        coeffs, edges = self._array("coeffs", (None, 2), RpcError), self._array("edges", (None,), RpcError)
+        self._array("steps", (len(edges), 2), RpcError)
+        if self.width < 2 or len(coeffs) < 4 or (np.diff(edges) <= 0).any():
+            raise RpcError("columns: two of them and four coefficients are needed at least, and edges ascend")
+
+    def at(self, col: Array) -> Array:
+        """Return the displacement (..., 2) [px] of points seen in columns (...) [px]; NaN at NaN."""
+        out = self._along(col, rate=False)
+        if len(self.edges):
+            begun = np.concatenate([np.zeros((1, 2)), np.cumsum(self.steps, axis=0)])
+            out += begun[np.searchsorted(self.edges, col, side="right").clip(0, len(self.edges))]
+        return np.where(np.isfinite(col)[..., None], out, np.nan)
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model without it has at (..., 2) [px] are seen."""
+        return fixed_point(lambda seen: image + self.at(seen[..., 0]), image)
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2): the column moves the spline, and the spline the column."""
+        seen = self.apply(image)
+        rate = self._along(seen[..., 0], rate=True) * (2.0 / self.width)
+        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
+        slope[..., 0] += rate / (1.0 - rate[..., :1])
+        return seen, slope
+
+    def undo(self, image: Array) -> Array:
+        """Return where a model without it has points that are seen at (..., 2) [px]."""
+        return image - self.at(image[..., 0])
+
+    def _along(self, col: Array, rate: bool) -> Array:
+        u = (np.asarray(col, dtype=np.float64) + 0.5) * (2.0 / self.width) - 1.0
+        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
+        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
+        return np.asarray(out).reshape(*u.shape, 2)
+
+
+@dataclass(frozen=True)
+class Calibrated(Displaced):
+    """`sensor` with its image points displaced by what its detector line does; itself a `SensorModel`."""
+
+    correction: ColumnSpline  # what is added to its image points
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class CorrectionGrid(Frozen):
     """Displacements (dcol, drow) over an image, linear between the nodes and constant beyond them.
 

@@ -1,0 +1,426 @@
+"""What one sensor does in every image, from the tie points of many finished blocks.
+
+The detector line of a pushbroom stands in the same columns of all its images: x = P(X) + c(col), where c is a spline
+of the column with steps where another detector begins. One block does not tell c along its epipolar lines; blocks of
+other directions do. Every view has nuisances, 1, col, row, col row and row^2 of either coordinate: what rotations,
+drifts and orbits do. So c is known beside a constant and a slope, which a camera's correction holds, and has neither.
+
+Points are eliminated, then nuisances: of every block the normal equations of c are left, and what is asked afterwards,
+of blocks left out or of those before and after a day, is a sum of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground_jacobian
+from barpc.base.statistics import BACKFITTING, ROUNDING, STEPS, SURE, robust_spread
+from barpc.scene import IntArray, Tracks, View
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import Several
+from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bsplines
+
+SPLINES = 28  # of 25 knots: lenses and focal planes bend over a twentieth of the line, or more slowly
+_OPEN = 3.0  # px: standard deviation of a coefficient before anything is known, far above any optics that is sold
+_STEP = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
+_BENDS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: standard deviations of third differences that are compared
+_CANDIDATES = 128  # places of a step that are looked at first; each turn looks at `_FINER` times as many around it
+_FINER = 12
+_MOST_STEPS = 40  # taken one by one; focal planes have up to some thirty detectors
+_TERMS = 5  # nuisances of a coordinate of a view
+_LOOSE = 100.0  # px: standard deviation of nuisances, of which a block leaves some open
+_FINEST = 2e-3  # px: no tie points are better, whatever they say of each other
+# standard deviations up to which tie points count alike: were they weighted by size, what contradicts the curve so far
+# would count less, and a turn would keep a third of its error
+_CUT = 3.0
+COLUMNS = 400  # at which a curve is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class SensorTies:
+    """Tie points of a finished block, seen by one sensor, linearised at its cameras without corrections in the image.
+
+    Parameters
+    ----------
+    name, date : str, the block; its first day (ISO 8601), empty where nobody says
+    width : int, columns of every image
+    view, point : (K,), indices
+    xy : (K, 2), where a point is seen, col, row [px]
+    place : (K, 2), where its camera has it, from -1 to 1 over the image: what is weakly known takes the noise of places
+        for information
+    residual : (K, 2), projected - observed [px]
+    by_point : (K, 2, 3), derivative of the projection by the point, ECEF [px/m]
+    """
+
+    name: str
+    date: str
+    width: int
+    view: IntArray
+    point: IntArray
+    xy: Array
+    place: Array
+    residual: Array
+    by_point: Array
+
+    @classmethod
+    def of(
+        cls, name: str, views: Sequence[View], tracks: Tracks, sensors: Sequence[SensorModel], ground: Array
+    ) -> SensorTies:
+        """Linearise a block at cameras without corrections in the image, and at the tracks' ground points (P, 3) [deg].
+
+        InputError where the images' widths differ, or less than two views of a tie point have a place.
+        """
+        widths = {view.size[0] for view in views}
+        if len(widths) > 1:
+            raise InputError(f"{name}: images of {', '.join(map(str, sorted(widths)))} columns are not of one line")
+        places = ground[tracks.point]
+        image, by_ground = Several(sensors, tracks.view).project_jacobian(places)
+        known = np.isfinite(image).all(axis=1) & np.isfinite(by_ground).all(axis=(1, 2))
+        kept = known & (np.bincount(tracks.point[known], minlength=tracks.num_points)[tracks.point] >= 2)
+        if not kept.any():
+            raise InputError(f"{name}: no tie point has a place in two images")
+        view, xy = tracks.view[kept], tracks.xy[kept]
+        by_point = by_ground[kept] @ np.linalg.inv(ecef_from_ground_jacobian(places[kept]))
+        place = (2.0 * image[kept] + 1.0) / np.array([view.size for view in views])[view] - 1.0
+        dates = sorted(view.date for view in views if view.date)
+        used, point = (np.unique(part, return_inverse=True)[1] for part in (view, tracks.point[kept]))
+        first = dates[0] if dates else ""
+        return cls(name, first, widths.pop(), used, point, xy, place, image[kept] - xy, by_point)
+
+
+class _Eliminated:
+    """A block, weighted by (K,) [1/px], with points and nuisances eliminated from what is asked of it."""
+
+    def __init__(self, ties: SensorTies, residual: Array, weight: Array) -> None:
+        count, self.num_points, self.num_views = len(ties.view), ties.point.max() + 1, ties.view.max() + 1
+        by_point = ties.by_point * weight[:, None, None]
+        square = np.einsum("kij,kil->kjl", by_point, by_point).reshape(count, 9)
+        sums = np.stack([np.bincount(ties.point, part, self.num_points) for part in square.T], axis=1)
+        matrix = sums.reshape(-1, 3, 3)
+        matrix += ROUNDING * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        lower = np.linalg.cholesky(matrix)[ties.point]
+        points = np.linalg.solve(lower, np.swapaxes(by_point, 1, 2))
+        self._points = _rows(np.swapaxes(points, 1, 2), 3 * ties.point[:, None] + np.arange(3), 3 * self.num_points)
+        col, row = ties.place.T
+        terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
+        self._weight = weight
+        self._nuisances = self.both(terms, 2 * _TERMS * ties.view[:, None] + np.arange(_TERMS), _TERMS)
+        self._residual = (residual * weight[:, None]).ravel()
+        loose = sp.eye_array(self._nuisances.shape[1]) / _LOOSE**2
+        how = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
+        self._solve = splu((self.product(self._nuisances) + loose).tocsc(), **how).solve
+        self._half = self.gradient(self._nuisances)
+
+    def both(self, values: Array, place: IntArray, apart: int) -> sp.csr_array:
+        """Return the derivatives (2 K, n), weighted, of both coordinates: values (K, m) at `place`, then `apart`."""
+        columns = np.stack([place, place + apart], axis=1)
+        size = int(place.max()) + apart + 1
+        return _rows(np.repeat((values * self._weight[:, None])[:, None], 2, axis=1), columns, size)
+
+    def product(self, one: sp.csr_array, other: sp.csr_array | None = None) -> sp.csr_array:
+        """Return the normal matrix of two sets of unknowns with the points eliminated."""
+        other = one if other is None else other
+        return one.T @ other - (self._points.T @ one).T @ (self._points.T @ other)
+
+    def gradient(self, one: sp.csr_array) -> Array:
+        """Return the derivative of half the cost by unknowns, the points eliminated."""
+        return np.asarray(one.T @ self._off_points(self._residual))
+
+    def _off_points(self, residual: Array) -> Array:
+        return np.asarray(residual - self._points @ (self._points.T @ residual))
+
+    def left(self) -> Array:
+        """Return the residuals (K, 2) [px] that points and nuisances leave."""
+        moved = self._residual - self._nuisances @ self._solve(self._half)
+        return self._off_points(moved).reshape(-1, 2) / self._weight[:, None]
+
+    def told(self, unknowns: sp.csr_array) -> Told:
+        """Return what the block tells of unknowns."""
+        cross = self.product(self._nuisances, unknowns).toarray()
+        solved = self._solve(np.column_stack([cross, self._half]))
+        off = self._off_points(self._residual)
+        return Told(
+            self.product(unknowns).toarray() - cross.T @ solved[:, :-1],
+            self.gradient(unknowns) - cross.T @ solved[:, -1],
+            float(off @ off - self._half @ solved[:, -1]),
+            float(self._residual.size - 3 * self.num_points - 2 * _TERMS * self.num_views),
+        )
+
+
+def _rows(values: Array, columns: IntArray, size: int) -> sp.csr_array:
+    """Return a sparse matrix (2 K, size) of values (K, 2, m) at columns (K, m) or (K, 2, m)."""
+    columns = np.broadcast_to(columns if columns.ndim == 3 else columns[:, None], values.shape)
+    bounds = np.arange(0, values.size + 1, values.shape[2])
+    return sp.csr_array((values.ravel(), columns.ravel(), bounds), shape=(2 * len(values), size))
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Normal equations of a sensor's curve, (n, n) and (n,); its cost without one, and degrees of freedom."""
+
+    matrix: Array
+    gradient: Array
+    cost: float
+    freedom: float
+
+    @staticmethod
+    def total(several: Sequence[Told]) -> Told:
+        """Return what several blocks tell."""
+        parts = zip(*((one.matrix, one.gradient, one.cost, one.freedom) for one in several), strict=True)
+        return Told(*(sum(part) for part in parts))
+
+    def times(self, factor: float) -> Told:
+        """Return the same with another variance of the noise."""
+        return replace(self, matrix=self.matrix * factor, gradient=self.gradient * factor, cost=self.cost * factor)
+
+    def solved(self, prior: Array) -> tuple[Array, Array, float]:
+        """Return the unknowns (n,), their covariance (n, n), and how probable that makes the data [nats]."""
+        factor = la.cho_factor(self.matrix + prior)
+        found = -la.cho_solve(factor, self.gradient)
+        lost = np.log(np.diag(factor[0])).sum() - 0.5 * np.linalg.slogdet(prior)[1]
+        return found, la.cho_solve(factor, np.eye(len(found))), float(-0.5 * self.gradient @ found - lost)
+
+    def gain(self, unknowns: Array) -> float:
+        """Return what unknowns (n,) take off the cost."""
+        return float(-(2.0 * self.gradient + self.matrix @ unknowns) @ unknowns)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Layout of a sensor's curve: splines of a coordinate, and steps at columns `edges` (C,), then of the other one."""
+
+    width: int
+    edges: Array
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns of a coordinate."""
+        return SPLINES + len(self.edges)
+
+    def told(self, block: _Eliminated, col: Array) -> Told:
+        """Return what a block tells, whose points are seen in columns (K,)."""
+        first, pieces = bspline_pieces(self.along(col), SPLINES)
+        detector = SPLINES + np.searchsorted(self.edges, col, side="right")
+        place = np.column_stack([first[:, None] + np.arange(4), detector])
+        found = block.told(_padded(block.both(np.column_stack([pieces.T, np.ones(len(col))]), place, self.size + 1),
+                                   2 * (self.size + 1)))  # fmt: skip
+        # of detectors each, to steps from each edge on
+        steps = np.tri(len(self.edges) + 1, len(self.edges), -1)
+        change = la.block_diag(*2 * [la.block_diag(np.eye(SPLINES), steps)])
+        return replace(found, matrix=change.T @ found.matrix @ change, gradient=change.T @ found.gradient)
+
+    def along(self, col: Array) -> Array:
+        """Return columns [px] from -1 to 1."""
+        return np.asarray((2.0 * col + 1.0) / self.width - 1.0)
+
+    def basis(self, col: Array) -> Array:
+        """Return the curve (n, size) by one unit of each unknown of a coordinate, at columns (n,)."""
+        steps = (col[:, None] >= self.edges).astype(np.float64)
+        return np.concatenate([bsplines(self.along(col), SPLINES).T, steps], axis=1)
+
+    def prior(self, bend: float) -> Array:
+        """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
+        rough = np.diff(np.eye(SPLINES), n=3, axis=0) / bend
+        smooth = rough.T @ rough + np.eye(SPLINES) / _OPEN**2
+        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / _STEP**2)])
+
+    @cached_property
+    def columns(self) -> Array:
+        """Columns at which the curve is looked at (`COLUMNS`,), evenly spread."""
+        return (np.arange(COLUMNS) + 0.5) * self.width / COLUMNS - 0.5
+
+    @cached_property
+    def bent(self) -> Array:
+        """(n, n) What takes a constant and a slope off the unknowns: splines make both exactly."""
+        lines = np.stack([np.ones(SPLINES), (np.arange(SPLINES) - 1.0) * 2.0 / (SPLINES - 3) - 1.0], axis=1)
+        straight = np.stack([np.ones(COLUMNS), self.along(self.columns)], axis=1)
+        one = np.eye(self.size)
+        one[:SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
+        return np.asarray(la.block_diag(one, one))
+
+    def sizes(self, unknowns: Array) -> Array:
+        """Return the root mean squares (2,) over the columns [px] of a curve (n,), or said by a covariance (n, n)."""
+        basis = self.basis(self.columns)
+        parts = slice(0, self.size), slice(self.size, None)
+        if unknowns.ndim == 1:
+            return np.array([np.sqrt(np.mean((basis @ unknowns[part]) ** 2)) for part in parts])
+        blocks = (unknowns[part, part] for part in parts)
+        return np.sqrt([np.einsum("ni,ij,nj->n", basis, block, basis).mean() for block in blocks])
+
+    def spline(self, unknowns: Array) -> ColumnSpline:
+        """Return the correction with unknowns (n,)."""
+        col, row = unknowns.reshape(2, -1)
+        both = np.stack([col, row], axis=1)
+        return ColumnSpline(self.width, both[:SPLINES], self.edges, both[SPLINES:])
+
+
+def _padded(matrix: sp.csr_array, size: int) -> sp.csr_array:
+    matrix.resize(matrix.shape[0], size)
+    return matrix
+
+
+def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
+    """Return a block beside a curve that is known so far, its tie points weighted by what is left of them."""
+    residual = ties.residual if curve is None else ties.residual + curve.at(ties.xy[:, 0])
+    count = np.bincount(ties.point)[ties.point]
+    free = (2.0 * count - 3.0) / (2.0 * count)  # of a track's coordinates three go into its point
+    left, weight = residual - np.median(residual, axis=0), np.ones(len(count))
+    for _ in range(BACKFITTING):
+        off = np.linalg.norm(left, axis=1) / np.sqrt(2.0 * free)
+        spread = max(robust_spread(off), 1e-6)
+        weight = np.minimum(1.0, _CUT * spread / np.maximum(off, 1e-9)) ** 2
+        left = _Eliminated(ties, residual, weight).left()
+    noise = np.sqrt((weight**2 * (left**2).sum(axis=1)).sum() / (weight**2 * 2.0 * free).sum())
+    return _Eliminated(ties, ties.residual, weight / max(noise, _FINEST))
+
+
+# --- what many blocks tell --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A sensor's curve, and how far blocks agree on it.
+
+    Parameters
+    ----------
+    curve : Curve, its layout
+    unknowns, covariance : (n,), (n, n), without a constant and a slope
+    gain : (R,), what the curve of the other blocks takes off each block's cost, in variances of its noise
+    rms : (float, float), of blocks' residuals a degree of freedom over their noise, without and with that curve
+    scatter : float, variance of blocks against each other over what their noise says
+    change : (int, float), first of the blocks, in the order given, after which the curve may be another one, and how
+        much more probable that is than that it stays [nats]
+    """
+
+    curve: Curve
+    unknowns: Array
+    covariance: Array
+    gain: Array
+    rms: tuple[float, float]
+    scatter: float
+    change: tuple[int, float]
+
+    @property
+    def spline(self) -> ColumnSpline:
+        """The correction."""
+        return self.curve.spline(self.unknowns)
+
+
+def learn(blocks: Sequence[SensorTies]) -> Learnt:
+    """Learn the curve of a sensor from blocks in the order of time.
+
+    Raises
+    ------
+    InputError
+        Less than three blocks, or of images of other widths.
+    """
+    widths = {block.width for block in blocks}
+    if len(blocks) < 3 or len(widths) > 1:
+        raise InputError(f"{len(blocks)} blocks of images of {len(widths)} widths: three of one are needed at least")
+    width = float(widths.pop())
+    spacing, around = width / _CANDIDATES, np.zeros(0)
+    spline, bend = None, float(_BENDS[len(_BENDS) // 2])
+    places = np.arange(1, _CANDIDATES) * spacing
+    for turn in range(STEPS):
+        candidates = Curve(int(width), np.unique(np.round(places)) - 0.5)
+        weights = [weighted(block, spline) for block in blocks]
+        total = Told.total([candidates.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)])
+        chosen, bend = _best(total, candidates)
+        curve = Curve(int(width), np.sort(candidates.edges[chosen]))
+        told = [curve.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)]
+        spline = curve.spline(Told.total(told).solved(curve.prior(bend))[0])
+        if turn + 1 < STEPS:
+            around = np.arange(-1.5 * _FINER, 1.5 * _FINER + 1) * max(spacing / _FINER, 1.0)
+            places = (curve.edges[:, None] + 0.5 + around).clip(1.0, width - 1.0).ravel()
+            spacing = max(spacing / _FINER, 1.0)
+    return _judged(curve, told, curve.prior(bend))
+
+
+def _best(total: Told, curve: Curve) -> tuple[list[int], float]:
+    """Return which steps to take, and the size of third differences, that make the data most probable."""
+    found = [_forward(total, curve, float(bend)) for bend in _BENDS]
+    best = max(range(len(found)), key=lambda i: found[i][1])
+    return found[best][0], float(_BENDS[best])
+
+
+def _forward(total: Told, curve: Curve, bend: float) -> tuple[list[int], float]:
+    """Return the steps that are taken one by one while each makes the data clearly more probable, and how probable."""
+    size, count = curve.size, len(curve.edges)
+    smooth = np.r_[0:SPLINES, size : size + SPLINES]
+    steps = np.r_[SPLINES:size, size + SPLINES : 2 * size]
+    prior = curve.prior(bend)[np.ix_(smooth, smooth)]
+    alone = Told(total.matrix[np.ix_(smooth, smooth)], total.gradient[smooth], 0.0, 0.0)
+    (found, _, evidence), cross = alone.solved(prior), total.matrix[np.ix_(smooth, steps)]
+    matrix = total.matrix[np.ix_(steps, steps)] - cross.T @ la.solve(alone.matrix + prior, cross, assume_a="pos")
+    gradient, chosen, pairs = total.gradient[steps] + cross.T @ found, list[int](), np.arange(count)
+    while count and len(chosen) < _MOST_STEPS:
+        own = np.stack([pairs, pairs + count], axis=1)
+        blocks = matrix[own[:, :, None], own[:, None, :]] + np.eye(2) / _STEP**2
+        pull = gradient[own]
+        gains = 0.5 * np.einsum("ni,ni->n", pull, np.linalg.solve(blocks, pull[..., None])[..., 0])
+        gains -= 0.5 * np.linalg.slogdet(blocks * _STEP**2)[1] + np.log(count)
+        best = int(np.argmax(gains))
+        if not gains[best] > SURE:
+            break
+        chosen.append(best)
+        evidence += float(gains[best])
+        down = np.linalg.solve(blocks[best], matrix[own[best]])
+        gradient = gradient - down.T @ pull[best]
+        matrix = matrix - matrix[:, own[best]] @ down
+    return chosen, evidence
+
+
+def _judged(curve: Curve, told: Sequence[Told], prior: Array) -> Learnt:
+    """Return the curve with what blocks say of each other."""
+    total = Told.total(told)
+    at, halves = _split(told, prior)
+    scatter = _scatter(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
+    told = [one.times(1.0 / scatter) for one in told]
+    total = Told.total(told)
+    found, covariance, evidence = total.solved(prior)
+    sides = [Told.total(part).solved(prior)[2] for part in (told[:at], told[at:])]
+    change = at, sum(sides) - evidence - float(np.log(len(told)))
+    others = [Told.total([*told[:i], *told[i + 1 :]]).solved(prior)[0] for i in range(len(told))]
+    gain = np.array([one.gain(other) for one, other in zip(told, others, strict=True)])
+    freedom = sum(one.freedom for one in told)
+    rms = tuple(float(np.sqrt(max(scatter * cost, 0.0) / freedom)) for cost in (total.cost, total.cost - gain.sum()))
+    bent = curve.bent
+    return Learnt(curve, bent @ found, bent @ covariance @ bent.T, gain, (rms[0], rms[1]), scatter, change)
+
+
+def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]]:
+    """Return where blocks are best told into those before and after, and the curves of both."""
+    best = (-np.inf, 1, (np.zeros(0), np.zeros(0)))
+    for at in range(1, len(told)):
+        (first, _, one), (second, _, other) = (Told.total(part).solved(prior) for part in (told[:at], told[at:]))
+        best = max(best, (one + other, at, (first, second)), key=lambda row: row[0])
+    return best[1:]
+
+
+def _scatter(told: Sequence[Told], curves: Sequence[Array], total: Told, prior: Array) -> float:
+    """Return the variance of blocks' gradients at a curve over that of their noise; what a view shares is in it."""
+    covariance, seen, expected = total.solved(prior)[1], 0.0, 0.0
+    for one, curve in zip(told, curves, strict=True):
+        factor = la.cho_factor(one.matrix + prior)
+        pull = one.gradient + one.matrix @ curve
+        seen += float(pull @ la.cho_solve(factor, pull))
+        expected += float(np.trace(la.cho_solve(factor, one.matrix - one.matrix @ covariance @ one.matrix)))
+    return max(seen / max(expected, 1.0), ROUNDING)
+
+
+def amplitude(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
+    """Return how much of a curve the tie points of a block show, 1: all of it, and its standard deviation."""
+    block = weighted(ties, spline)
+    shown = spline.at(ties.xy[:, 0])
+    rows = (shown * block._weight[:, None]).reshape(-1, 1)
+    one = block.told(sp.csr_array(rows))
+    information = max(float(one.matrix[0, 0]), ROUNDING)
+    return float(-one.gradient[0] / information), float(information**-0.5)

@@ -1,0 +1,227 @@
+"""What scenes of one sensor tell of its detector line, and what that does to heights of scenes that it never saw.
+
+Scenes are simulated: three or four pushbroom images of one place from looks and scans of any direction, orbits and
+attitudes off by metres and microradians, drifts, tie points of 0.1 px over relief of any size. The detector line bends
+(`KINDS`: low polynomials; random waves and kinks), has eight chips, and every line takes 1e-4 longer than stated. Each
+scene is adjusted as by `barpc adjust`, the curve is learnt from all (`barpc calibrate`, but for files), and new pairs,
+along one track and crossing, are adjusted without and with it.
+
+px: the RMS of curve found less truth, beside a constant and a slope, columns within 5 px of a step left out; said: what
+it says of itself over that. bent: RMS of heights of a pair beside their plane and twist [m], before and after.
+
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py                    # 50 scenes
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py --scenes 12 --kind waves --tails
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba import Adjustment, adjust_tracks
+from barpc.ba.calibration import Learnt, SensorTies, learn
+from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
+from barpc.fit import fit_rpc
+from barpc.scene import Tracks, View
+from barpc.sensor.corrected import Corrected, Correction
+from barpc.sensor.geometry import camera_center
+from barpc.simulate import Look, fly
+
+SIZE, GSD = (20000, 12000), 0.5
+LINE_RATE = 1e-4
+Curve = Callable[[Array], Array]
+"""Columns (n,) -> what a detector line does there (n, 2) [px]."""
+
+
+def _polynomials(u: Array, rng: np.random.Generator) -> Array:
+    legendre = np.polynomial.legendre.legval(u, rng.normal(0, 1, (6, 2)) * np.array([0, 0, 0.3, 0.2, 0.15, 0.1])[:, None])
+    return np.asarray(legendre.T)
+
+
+def _waves(u: Array, rng: np.random.Generator) -> Array:
+    """Return random waves, to an eighth of the line, and three kinks."""
+    out = np.zeros((len(u), 2))
+    for k in range(1, 9):
+        phase, size = rng.uniform(0, 2 * np.pi, 2), rng.normal(0, 0.3, 2) / k
+        out += size * np.sin(np.pi * k * u[:, None] + phase)
+    for at in rng.uniform(-0.9, 0.9, 3):
+        out += rng.normal(0, 0.3, 2) * np.abs(u[:, None] - at)
+    return out
+
+
+KINDS = {"polynomials": _polynomials, "waves": _waves}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A detector line: its curve, and where its chips begin."""
+
+    curve: Curve
+    edges: Array
+
+    @classmethod
+    def made(cls, kind: str, seed: int, chips: int = 8, size: tuple[int, int] = SIZE) -> Sensor:
+        """Return a sensor whose chips are 0.1 to 0.5 px off each other, in any direction."""
+        rng = np.random.default_rng(seed)
+        edges = size[0] * (np.arange(1, chips) + rng.uniform(-0.2, 0.2, chips - 1)) / chips
+        turn, length = rng.uniform(0, 2 * np.pi, chips - 1), rng.uniform(0.1, 0.5, chips - 1)
+        steps = np.stack([np.cos(turn), np.sin(turn)], axis=1) * length[:, None]
+        begun = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        shape = rng.integers(1 << 31)
+
+        def curve(col: Array) -> Array:
+            u = (2.0 * col + 1.0) / size[0] - 1.0
+            return KINDS[kind](u, np.random.default_rng(shape)) + begun[np.searchsorted(edges, col, side="right")]
+
+        return cls(curve, edges)
+
+    def seen(self, image: Array, size: tuple[int, int]) -> Array:
+        """Return where points that a perfect line has at (n, 2) [px] are seen."""
+        image = image + LINE_RATE * np.stack([np.zeros(len(image)), image[:, 1] - size[1] / 2], axis=1)
+        out = image
+        for _ in range(20):
+            out = image + self.curve(out[:, 0])
+        return out
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Images of a place as they are delivered, their tie points, and the ground of these."""
+
+    views: tuple[View, ...]
+    tracks: Tracks
+    ground: Array
+    cameras: tuple[Corrected, ...]  # exact, but for the detector line
+
+
+def any_looks(count: int, rng: np.random.Generator) -> list[Look]:
+    """Return looks from any side, scanning in any direction."""
+    return [
+        Look(rng.uniform(5, 25), rng.uniform(0, 360), heading=192 if rng.random() < 0.5 else 348, scan=rng.uniform(0, 360))
+        for _ in range(count)
+    ]  # fmt: skip
+
+
+def in_track(rng: np.random.Generator) -> list[Look]:
+    """Return a stereo pair of one pass, whose images stand a tenth of the swath beside each other."""
+    side = rng.uniform(2, 8, 2) * [1, -1]
+    return [Look(14.0, (192 + a + s) % 360) for a, s in zip((0, 180), side, strict=True)]
+
+
+def crossing(rng: np.random.Generator) -> list[Look]:
+    """Return a pair that scans across each other."""
+    turn = rng.uniform(60, 120)
+    return [Look(14.0, 12.0, scan=192.0), Look(14.0, 192.0, scan=(192.0 + turn) % 360)]
+
+
+def scene(
+    looks: list[Look],
+    sensor: Sensor,
+    rng: np.random.Generator,
+    tracks: int = 900,
+    tails: bool = False,
+    size: tuple[int, int] = SIZE,
+) -> Scene:
+    """Return a scene: off by 10 urad, 1 m and a drift of 2 urad; with `tails` noise is Student's of 2.5."""
+    target = np.array([rng.uniform(-60, 60), rng.uniform(-50, 50), 300.0])
+    relief = rng.choice([20.0, 200.0, 1500.0])
+    alts = (300.0 - relief, 300.0 + relief)
+    views, cameras = [], []
+    for i, look in enumerate(looks):
+        place = target + np.array([*rng.uniform(-0.1, 0.1, 2) * np.array(size) * GSD, 0.0]) / metres_per_unit(target)
+        rpc = fit_rpc(fly(place, look, size, GSD), size, (alts[0] - 50, alts[1] + 50), strict=False).rpc
+        views.append(View(f"v{i}", "", size, rpc, (alts[0] - 50, alts[1] + 50), "2020-01-01"))
+        centre = camera_center(rpc, size, alts, "line").ecef
+        drift = rng.normal(0, 2e-6, (1, 3))
+        turned = Correction(rng.normal(0, 1e-5, 3), rng.normal(0, 1, 3), centre, drift, size[1] / 2, size[1] / 2)
+        cameras.append(Corrected(rpc, turned))
+    reach = 0.7 * max(size) * GSD
+    ground = target + np.column_stack([rng.uniform(-reach, reach, (12 * tracks, 2)), np.zeros(12 * tracks)]) / (
+        metres_per_unit(target)
+    )
+    ground[:, 2] = rng.uniform(*alts, len(ground))
+    rows: list[list[Array]] = [[], [], []]
+    for v, camera in enumerate(cameras):
+        image = sensor.seen(camera.project(ground), size)
+        inside = np.flatnonzero(((image >= 0) & (image <= np.array(size) - 1)).all(axis=1))
+        for part, one in zip(rows, (np.full(len(inside), v), inside, image[inside]), strict=True):
+            part.append(one)
+    view, point, xy = (np.concatenate(part) for part in rows)
+    count = np.bincount(point, minlength=len(ground))
+    used = np.flatnonzero(count >= 2)[:tracks]
+    keep = np.isin(point, used)
+    view, point, xy = view[keep], np.searchsorted(used, point[keep]), xy[keep]
+    order = np.lexsort((view, point))
+    noise = rng.standard_t(2.5, xy.shape) if tails else rng.normal(0, 1, xy.shape)
+    wrong = rng.random(len(xy)) < 0.02
+    xy = xy + 0.1 * noise + wrong[:, None] * rng.uniform(-30, 30, xy.shape)
+    return Scene(tuple(views), Tracks(view[order], point[order], xy[order], np.full(len(xy), 0.1)), ground[used], tuple(cameras))
+
+
+def finished(made: Scene, name: str) -> tuple[Adjustment, SensorTies]:
+    """Return a scene adjusted, and what it tells."""
+    found = adjust_tracks(made.views, made.tracks)
+    return found, SensorTies.of(name, made.views, made.tracks, found.bases, ground_from_ecef(found.points))
+
+
+def off(found: Learnt, sensor: Sensor, width: int = SIZE[0]) -> tuple[Array, Array]:
+    """Return the errors (2,) of the two coordinates [px], and what they are said to be."""
+    cols = np.arange(5.0, width - 5.0, 3.0)
+    cols = cols[np.abs(cols[:, None] - sensor.edges).min(axis=1, initial=np.inf) > 5.0]
+    wrong = found.spline.at(cols) - sensor.curve(cols)
+    wrong -= np.polynomial.polynomial.polyval(cols, np.polynomial.polynomial.polyfit(cols, wrong, 1)).T
+    return np.sqrt((wrong**2).mean(axis=0)), found.curve.sizes(found.covariance)
+
+
+def bent(made: Scene, found: Adjustment) -> float:
+    """Return how far heights are bent [m]."""
+    ground = ground_from_ecef(found.points)
+    known = np.isfinite(ground).all(axis=1)
+    east, north = ((made.ground - made.ground.mean(axis=0)) * metres_per_unit(made.ground.mean(axis=0)))[known, :2].T / 5e3
+    height = ground[known, 2] - made.ground[known, 2]
+    # what cameras' drifts do: a plane, a twist, a bend along either axis
+    rows = np.stack([np.ones_like(east), east, north, east * north, east**2, north**2], axis=1)
+    inlier = np.abs(height - np.median(height)) < 10
+    left = height - rows @ np.linalg.lstsq(rows[inlier], height[inlier], rcond=None)[0]
+    u = np.stack([east, north], axis=1)[inlier]
+    # noise of single points is no bend: means of neighbours
+    near = np.linalg.norm(u[:, None] - u[None], axis=2) < 0.1
+    smooth = (near @ left[inlier]) / near.sum(axis=1)
+    noise = np.sqrt(np.mean(left[inlier] ** 2 / near.sum(axis=1)))
+    del noise
+    return float(np.sqrt(np.mean(smooth**2)))
+
+
+def main() -> None:
+    """Print the table."""
+    warnings.simplefilter("ignore")
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--scenes", type=int, default=50)
+    parser.add_argument("--tracks", type=int, default=900)
+    parser.add_argument("--kind", choices=list(KINDS), default="polynomials")
+    parser.add_argument("--tails", action="store_true", help="noise with heavy tails")
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+    rng, sensor = np.random.default_rng(given.seed), Sensor.made(given.kind, given.seed)
+    start, blocks = time.process_time(), []
+    for i in range(given.scenes):
+        made = scene(any_looks(rng.integers(3, 5), rng), sensor, rng, given.tracks, given.tails)
+        blocks.append(finished(made, f"scene {i}")[1])
+    made_in = time.process_time() - start
+    start = time.process_time()
+    found = learn(blocks)
+    seconds = time.process_time() - start
+    (wrong, said), size = off(found, sensor), np.sqrt((sensor.curve(np.arange(0.0, SIZE[0], 10)) ** 2).mean(axis=0))
+    print(f"{given.scenes} scenes ({made_in:.1f} CPU s to adjust), curve of {size[0]:.3f} / {size[1]:.3f} px: to "
+          f"{wrong[0]:.4f} / {wrong[1]:.4f} px, over said {wrong[0] / said[0]:.2f} / {wrong[1] / said[1]:.2f}, "
+          f"{len(found.curve.edges)} steps, scatter {found.scatter:.2f}, {seconds:.2f} CPU s")  # fmt: skip
+    print(f"held out: {found.rms[0]:.4f} -> {found.rms[1]:.4f} px, {np.sum(found.gain > 0)} of {given.scenes} met better")
+
+
+if __name__ == "__main__":
+    main()
