@@ -22,6 +22,7 @@ _PUBLIC_MODULES = {
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
     "barpc.pipeline": "adjust check AdjustResult",
+    "barpc.pipeline.calibrate": "calibrate",
     "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
     "barpc.cameras": "open_camera",
     "barpc.base.errors": "BarpcError BarpcWarning",
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult as AdjustResult
     from barpc.pipeline import adjust as adjust
     from barpc.pipeline import check as check
+    from barpc.pipeline.calibrate import calibrate as calibrate
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
     from barpc.scene import GroundPoints as GroundPoints

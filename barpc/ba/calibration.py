@@ -111,24 +111,31 @@ class _Eliminated:
         self._points = _rows(np.swapaxes(points, 1, 2), 3 * ties.point[:, None] + np.arange(3), 3 * self.num_points)
         col, row = ties.place.T
         terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
-        self._weight = weight
-        self._nuisances = self.both(terms, 2 * _TERMS * ties.view[:, None] + np.arange(_TERMS), _TERMS)
+        self.weight = weight
+        self._nuisances = self.both(terms, 2 * _TERMS * ties.view[:, None] + np.arange(_TERMS), _TERMS, self.num_views)
         self._residual = (residual * weight[:, None]).ravel()
         loose = sp.eye_array(self._nuisances.shape[1]) / _LOOSE**2
-        how = {"permc_spec": "MMD_AT_PLUS_A", "options": {"SymmetricMode": True}}
-        self._solve = splu((self.product(self._nuisances) + loose).tocsc(), **how).solve
+        normal = (self.product(self._nuisances) + loose).tocsc()
+        self._solve = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
         self._half = self.gradient(self._nuisances)
 
-    def both(self, values: Array, place: IntArray, apart: int) -> sp.csr_array:
-        """Return the derivatives (2 K, n), weighted, of both coordinates: values (K, m) at `place`, then `apart`."""
+    @property
+    def noise(self) -> float:
+        """Standard deviation of its best tie points [px]."""
+        return float(1.0 / self.weight.max())
+
+    def both(self, values: Array, place: IntArray, apart: int, times: int = 1) -> sp.csr_array:
+        """Return the derivatives (2 K, 2 `apart` `times`), weighted, of both coordinates by unknowns: of the columns
+        values (K, m) at `place`, of the rows `apart` behind.
+        """
         columns = np.stack([place, place + apart], axis=1)
-        size = int(place.max()) + apart + 1
-        return _rows(np.repeat((values * self._weight[:, None])[:, None], 2, axis=1), columns, size)
+        return _rows(np.repeat((values * self.weight[:, None])[:, None], 2, axis=1), columns, 2 * apart * times)
 
     def product(self, one: sp.csr_array, other: sp.csr_array | None = None) -> sp.csr_array:
         """Return the normal matrix of two sets of unknowns with the points eliminated."""
         other = one if other is None else other
-        return one.T @ other - (self._points.T @ one).T @ (self._points.T @ other)
+        found: sp.csr_array = one.T @ other - (self._points.T @ one).T @ (self._points.T @ other)
+        return found
 
     def gradient(self, one: sp.csr_array) -> Array:
         """Return the derivative of half the cost by unknowns, the points eliminated."""
@@ -140,7 +147,7 @@ class _Eliminated:
     def left(self) -> Array:
         """Return the residuals (K, 2) [px] that points and nuisances leave."""
         moved = self._residual - self._nuisances @ self._solve(self._half)
-        return self._off_points(moved).reshape(-1, 2) / self._weight[:, None]
+        return self._off_points(moved).reshape(-1, 2) / self.weight[:, None]
 
     def told(self, unknowns: sp.csr_array) -> Told:
         """Return what the block tells of unknowns."""
@@ -210,8 +217,7 @@ class Curve:
         first, pieces = bspline_pieces(self.along(col), SPLINES)
         detector = SPLINES + np.searchsorted(self.edges, col, side="right")
         place = np.column_stack([first[:, None] + np.arange(4), detector])
-        found = block.told(_padded(block.both(np.column_stack([pieces.T, np.ones(len(col))]), place, self.size + 1),
-                                   2 * (self.size + 1)))  # fmt: skip
+        found = block.told(block.both(np.column_stack([pieces.T, np.ones(len(col))]), place, self.size + 1))
         # of detectors each, to steps from each edge on
         steps = np.tri(len(self.edges) + 1, len(self.edges), -1)
         change = la.block_diag(*2 * [la.block_diag(np.eye(SPLINES), steps)])
@@ -262,11 +268,6 @@ class Curve:
         return ColumnSpline(self.width, both[:SPLINES], self.edges, both[SPLINES:])
 
 
-def _padded(matrix: sp.csr_array, size: int) -> sp.csr_array:
-    matrix.resize(matrix.shape[0], size)
-    return matrix
-
-
 def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
     """Return a block beside a curve that is known so far, its tie points weighted by what is left of them."""
     residual = ties.residual if curve is None else ties.residual + curve.at(ties.xy[:, 0])
@@ -282,6 +283,17 @@ def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
     return _Eliminated(ties, ties.residual, weight / max(noise, _FINEST))
 
 
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The curve of a sensor, its covariance (n, n) [px^2], and the file it came from, with the hash of that."""
+
+    sensor: str
+    spline: ColumnSpline
+    covariance: Array
+    path: str
+    sha256: str
+
+
 # --- what many blocks tell --------------------------------------------------------------------------------
 
 
@@ -295,6 +307,7 @@ class Learnt:
     unknowns, covariance : (n,), (n, n), without a constant and a slope
     gain : (R,), what the curve of the other blocks takes off each block's cost, in variances of its noise
     rms : (float, float), of blocks' residuals a degree of freedom over their noise, without and with that curve
+    noise_px : float, the median of the blocks' noise [px]
     scatter : float, variance of blocks against each other over what their noise says
     change : (int, float), first of the blocks, in the order given, after which the curve may be another one, and how
         much more probable that is than that it stays [nats]
@@ -305,6 +318,7 @@ class Learnt:
     covariance: Array
     gain: Array
     rms: tuple[float, float]
+    noise_px: float
     scatter: float
     change: tuple[int, float]
 
@@ -341,7 +355,8 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
             around = np.arange(-1.5 * _FINER, 1.5 * _FINER + 1) * max(spacing / _FINER, 1.0)
             places = (curve.edges[:, None] + 0.5 + around).clip(1.0, width - 1.0).ravel()
             spacing = max(spacing / _FINER, 1.0)
-    return _judged(curve, told, curve.prior(bend))
+    noise = float(np.median([one.noise for one in weights]))
+    return _judged(curve, told, curve.prior(bend), noise)
 
 
 def _best(total: Told, curve: Curve) -> tuple[list[int], float]:
@@ -378,7 +393,7 @@ def _forward(total: Told, curve: Curve, bend: float) -> tuple[list[int], float]:
     return chosen, evidence
 
 
-def _judged(curve: Curve, told: Sequence[Told], prior: Array) -> Learnt:
+def _judged(curve: Curve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
     """Return the curve with what blocks say of each other."""
     total = Told.total(told)
     at, halves = _split(told, prior)
@@ -393,7 +408,7 @@ def _judged(curve: Curve, told: Sequence[Told], prior: Array) -> Learnt:
     freedom = sum(one.freedom for one in told)
     rms = tuple(float(np.sqrt(max(scatter * cost, 0.0) / freedom)) for cost in (total.cost, total.cost - gain.sum()))
     bent = curve.bent
-    return Learnt(curve, bent @ found, bent @ covariance @ bent.T, gain, (rms[0], rms[1]), scatter, change)
+    return Learnt(curve, bent @ found, bent @ covariance @ bent.T, gain, (rms[0], rms[1]), noise, scatter, change)
 
 
 def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]]:
@@ -420,7 +435,7 @@ def amplitude(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
     """Return how much of a curve the tie points of a block show, 1: all of it, and its standard deviation."""
     block = weighted(ties, spline)
     shown = spline.at(ties.xy[:, 0])
-    rows = (shown * block._weight[:, None]).reshape(-1, 1)
+    rows = (shown * block.weight[:, None]).reshape(-1, 1)
     one = block.told(sp.csr_array(rows))
     information = max(float(one.matrix[0, 0]), ROUNDING)
     return float(-one.gradient[0] / information), float(information**-0.5)

@@ -494,6 +494,12 @@ class RunOptions(Options):
         False,
         "With `add_to`: also write changed cameras of that run.",
     )
+    calibration: tuple[str, ...] = option(
+        (),
+        """What a sensor does in every image, of `barpc calibrate`, for the images of that sensor. Without: SENSOR.cal
+        beside an image that states its sensor.""",
+        unit="file",
+    )
     dem: tuple[str, ...] = option(
         (),
         """Terrain heights: they constrain the scene's height and, as far as its relief allows, its position. Of

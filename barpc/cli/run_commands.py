@@ -130,6 +130,40 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
     return tell_gate("the run has changed:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
 
 
+@click.command("calibrate")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
+@click.option("-o", "--out", required=True, metavar="FILE", help="The calibration to write: SENSOR.cal.")
+@click.option("--sensor", metavar="NAME", help="Its name, where images state none, or several.")
+@click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
+@click.pass_obj
+def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
+    r"""Learn from finished runs what one sensor does in every image: distortion by column, and steps of detectors.
+
+    Their tie points are read, nothing is matched again. `barpc adjust --calibration FILE` takes it off the images of
+    that sensor; beside them, called SENSOR.cal, the file is found. One line and exit code 1 where the runs tell no
+    distortion that is the same in all: it changes with time, directions do not suffice, or runs that were left out are
+    not met better.
+
+    \b
+    Examples:
+      barpc calibrate archive/*/adjusted -o WV02_P.cal
+      barpc calibrate run1 run2 run3 run4 -o camera.cal --sensor camera
+    """
+    from barpc.pipeline.calibrate import calibrate as learn
+
+    found = learn(runs, out, sensor, overwrite=overwrite)
+    if wants_json():
+        echo(json.dumps(found, indent=1))
+    elif not obj["quiet"]:
+        (col, row), (of_col, of_row) = found["size_px"], found["sigma_px"]
+        better = sum(run["gain"] > 0 for run in found["runs"])
+        tell(f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, known to {of_col:.4f} and "
+             f"{of_row:.4f} px; {len(found['edges'])} steps; {better} of {len(runs)} runs left out in turn are met "
+             "better")  # fmt: skip
+        tell(out)
+    return 0
+
+
 # --- a surface --------------------------------------------------------------------------------------------
 
 

@@ -28,7 +28,7 @@ from barpc.fit.points import (
 )
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
-from barpc.sensor.image_corrections import Splined
+from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
@@ -86,11 +86,11 @@ def fit_rpc(
 
     try:
         fit = _best_method(attempt, options, vendor, False, exact=True)
-        if isinstance(model, Splined):
+        if isinstance(model, Splined | Calibrated):
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
-        _accepted(fit, options, strict and not isinstance(model, Splined))
+        _accepted(fit, options, strict and not isinstance(model, Splined | Calibrated))
         return _localised(
             fit, lambda rpc, method: localisation_problem(rpc, *given(method)), seen, options, strict, exact=True
         )

@@ -35,7 +35,8 @@ from barpc.pointio.names import unique_names
 from barpc.report import Run
 from barpc.report.outcome import Added
 from barpc.report.runfiles import table_path
-from barpc.scene import BoolArray, Tracks, View
+from barpc.scene import BoolArray, Camera, Tracks, View
+from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprints
 from barpc.tie.pairing.overlaps import Footprints, overlapping_pairs, reach_of
 from barpc.workspace import Homes, portable
@@ -58,6 +59,7 @@ class Known:
     bytes: int
     sha256: str
     camera_sha256: str  # of the file that holds its camera; empty: no file
+    calibration: str = ""  # SHA-256 of the calibration that it was adjusted with; empty: none
 
     @property
     def spec(self) -> str:
@@ -84,7 +86,7 @@ class Earlier:
             raise InputError(f"{block}: missing, and later runs start from it: run the adjustment again")
         if not table.exists():
             raise InputError(f"{table}: missing, as of a run of another release: run the adjustment again")
-        _refuse_edited(folder, (table, block))
+        refuse_edited(folder, (table, block))
         prior = BlockPrior.load(block)
         try:
             rows = parse_json(read_text(table, GEOJSON), GEOJSON.values)["images"]
@@ -136,6 +138,13 @@ class Earlier:
                     f"{view.path}: is not the image used by {self.folder} (it was changed since); give the "
                     "new one under another name"
                 )
+            used = run.calibrated.get(view.name)
+            if image is not None and image.calibration != ("" if used is None else used.sha256):
+                now = "none is given" if used is None else f"now it is {used.path}"
+                raise InputError(
+                    f"{view.path}: {self.folder} was made with {'another' if image.calibration else 'no'} calibration, "
+                    f"{now}: give the same, or adjust all images together"
+                )
             if image is not None and _sha(inputs, str(source.path.absolute())) != image.camera_sha256:
                 raise InputError(
                     f"{source.path}: is not the camera of {view.path} used by {self.folder} (it was changed "
@@ -155,7 +164,8 @@ def _sha(inputs: Mapping[str, Input], path: str) -> str:
     return inputs[path].sha256 if path in inputs else ""
 
 
-def _refuse_edited(folder: Path, files: Sequence[Path]) -> None:
+def refuse_edited(folder: Path, files: Sequence[Path]) -> None:
+    """Raise InputError where files of a run folder are not what the run wrote."""
     if not os.path.lexists(folder / manifest.SUMS):
         raise InputError(f"{folder / manifest.SUMS}: missing, as of a run that was interrupted: run it again")
     sums = {name: sha for layer in manifest.read(folder)[1] for name, sha in layer.files.items()}
@@ -172,7 +182,7 @@ def _parse_known(row: Mapping[str, Any], homes: Homes) -> Known:
     if not (np.isfinite(ring).all() and len(row["size"]) == 2 and min(row["size"]) > 0):
         raise ValueError(f"{row['name']}: no outline, or no size")
     outline = tuple((lon, lat) for lon, lat in ring.tolist())
-    texts = (str(row[key]) for key in ("sha256", "camera_sha256"))
+    texts = (str(row.get(key, "")) for key in ("sha256", "camera_sha256", "calibration"))
     size = (int(row["size"][0]), int(row["size"][1]))
     path = homes.located(str(row["path"]))
     return Known(str(row["name"]), path, choices, size, float(row["altitude"]), outline, int(row["bytes"]), *texts)
@@ -293,7 +303,7 @@ def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], 
     for image in given:
         choices[str(image_path(image, hosts))] = None if isinstance(image, View) else split_spec(image, hosts)[1]
     before = {} if run.earlier is None else {image.name: image for image in run.earlier.images}
-    rings = footprints(run.adjustment.sensors, [view.size for view in run.views], run.altitude)[:, ::4]
+    rings = footprints(run.cameras, [view.size for view in run.views], run.altitude)[:, ::4]
     rows = {name: _row(image, folder) for name, image in before.items()}
     for view, ring, source in zip(run.views, rings, run.sources, strict=True):
         was, ring = before.get(view.name), np.round(ring, 8)
@@ -301,9 +311,9 @@ def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], 
         known, camera = inputs.get(view.path), _sha(inputs, str(source.path.absolute()))
         outline = tuple((lon, lat) for lon, lat in ring.tolist()) if np.isfinite(ring).all() else ()
         size, sha = (0, "") if known is None else (known.size, known.sha256)
-        rows[view.name] = _row(
-            Known(view.name, view.path, of_file, view.size, float(run.altitude), outline, size, sha, camera), folder
-        )
+        used = run.calibrated[view.name].sha256 if view.name in run.calibrated else ""
+        place = (float(run.altitude), outline)
+        rows[view.name] = _row(Known(view.name, view.path, of_file, view.size, *place, size, sha, camera, used), folder)
     text = ",\n".join(json.dumps(rows[name]) for name in block.names)
     return f'{{"images": [\n{text}\n]}}\n'
 
@@ -326,18 +336,25 @@ def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
     return Added(name, len(earlier.images), met, beyond, ranked[0], floor, written)
 
 
-def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> tuple[list[View], Any]:
-    """Return the images that move beside those `done`, as delivered, and their corrected cameras."""
+def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> Corrected:
+    """Return the images that move beside those `done`, as `corrected_views` does."""
     assert run.added is not None
     earlier: Earlier = run.earlier
     wanted = [earlier.images[earlier.number[name]] for name, _ in run.added.beyond if name not in done]
     there = [image for image in wanted if _is_there(image, earlier.folder)]
-    if not there:
-        return [], []
-    loaded = load_views([image.spec for image in there], min_views=1, distinct=False, hosts=hosts)
-    names = {image.path: image.name for image in there}
+    return corrected_views(there, grown, hosts) if there else ([], (), ())
+
+
+Corrected = tuple[list[View], Sequence[SensorModel], Sequence[Camera]]
+
+
+def corrected_views(images: Sequence[Known], block: BlockPrior, hosts: Sequence[str] = ()) -> Corrected:
+    """Return images of a run as delivered, their corrected cameras by its block, and where the delivered came from."""
+    loaded = load_views([image.spec for image in images], min_views=1, distinct=False, hosts=hosts)
+    names = {image.path: image.name for image in images}
     views = [replace(view, name=names[view.path]) for view in loaded.views]
-    rows = np.array([earlier.number[view.name] for view in views])
-    waves = grown.waves(tuple(view.name for view in views))
-    unknowns = make_unknowns(views, grown.model, grown.drift, grown.center[rows], waves)
-    return views, unknowns.corrected(grown.params[rows], views)
+    number = {name: i for i, name in enumerate(block.names)}
+    rows = np.array([number[view.name] for view in views])
+    waves = block.waves(tuple(view.name for view in views))
+    unknowns = make_unknowns(views, block.model, block.drift, block.center[rows], waves)
+    return views, unknowns.corrected(block.params[rows], views), loaded.sources

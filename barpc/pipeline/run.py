@@ -26,6 +26,7 @@ from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
+from barpc.pipeline.calibrate import calibrated, calibrations_of, refuse_strange
 from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
@@ -56,7 +57,7 @@ from barpc.report.records import json_form
 from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.rpcio import plain_source
-from barpc.scene import BoolArray, Tracks, View
+from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
@@ -218,7 +219,9 @@ def _with_block(
         return run
     run = replace(run, added=added(run, run.earlier, block, options.adjust.noise_floor))
     if options.update and options.stop_after == "all":
-        views, sensors = movers(run, block, {view.name for view in run.views}, options.allow_remote)
+        views, sensors, sources = movers(run, block, {view.name for view in run.views}, options.allow_remote)
+        used = calibrations_of(options.calibration, views, sources, some=True)
+        sensors = calibrated(sensors, [used.get(view.name) for view in views])
         assert run.adjustment is not None
         fits = _fits(views, sensors, run.adjustment, options, work)
         with guarded(inputs.values()):
@@ -313,6 +316,7 @@ def _with_views(
         workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     run = Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier)
+    run = replace(run, calibrated=calibrations_of(options.calibration, run.views, run.sources))
     if earlier is None or options.update:
         return run
     given = {str(image_path(image, options.allow_remote)) for image in images}
@@ -398,20 +402,29 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
     altimetry = load_altimetry(options.altimetry, run.views, options.heights)
     adjustment = adjust_tracks(
         run.views,
-        run.tracks,
+        replace(run.tracks, xy=run.undistorted(run.tracks.view, run.tracks.xy)),
         _with_rounding(run, options.adjust),
-        gcps,
+        None if gcps is None else replace(gcps, xy=run.undistorted(gcps.view, gcps.xy)),
         dem,
         centers=np.array([center.ecef for center in centers]),
         prior=None if run.earlier is None else run.earlier.prior,
         known=None if run.earlier is None else np.ones(len(run.tracks), dtype=bool),  # at best some are new
-        reference=None if run.reference is None else run.reference.control,
+        reference=_undistorted_reference(run),
         altimetry=altimetry,
         keep_largest=options.keep_going,
     )
+    refuse_strange(run, adjustment)
     datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]
     datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
+
+
+def _undistorted_reference(run: Run) -> Reference | None:
+    control = None if run.reference is None else run.reference.control
+    if control is None or not run.calibrated:
+        return control
+    points = control.points
+    return replace(control, points=replace(points, xy=run.undistorted(points.view, points.xy)))
 
 
 def _with_rounding(run: Run, options: AdjustOptions) -> AdjustOptions:
@@ -488,7 +501,7 @@ def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple
 def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
-    return replace(run, fits=tuple(_fits(run.views, run.adjustment.sensors, run.adjustment, options, work)))
+    return replace(run, fits=tuple(_fits(run.views, run.cameras, run.adjustment, options, work)))
 
 
 def _fits(
@@ -537,7 +550,7 @@ def fit_group(
 def _written(run: Run, options: RunOptions, workspace: Workspace, work: Work) -> Run:
     """Write the refitted RPCs, and open them again."""
     assert run.adjustment is not None
-    every = zip(run.views, run.fits, run.adjustment.sensors, strict=True)
+    every = zip(run.views, run.fits, run.cameras, strict=True)
     fitted = [one for one in every if one[0].name not in run.unwritten]
     written = write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
     beyond = write_grids(workspace, fitted, options, work.executor, work.progress)

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
+from barpc.ba.calibration import Calibration
 from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
 from barpc.base.statistics import CRITICAL
@@ -19,6 +20,7 @@ from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
+from barpc.sensor.image_corrections import Calibrated
 from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.report import FINE_STRUCTURE
@@ -97,6 +99,7 @@ class Run:
     earlier: Any = None  # the finished run that images are added to, as the pipeline has it
     unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
     added: Added | None = None
+    calibrated: Mapping[str, Calibration] = field(default_factory=dict)  # view -> what its sensor does in every image
 
     @property
     def known(self) -> frozenset[str]:
@@ -114,7 +117,24 @@ class Run:
         """The refitted cameras; P_BA where they were not refitted; None for a check."""
         if self.fits:
             return tuple(fit.rpc for fit in self.fits)
-        return None if self.adjustment is None else self.adjustment.sensors
+        return None if self.adjustment is None else self.cameras
+
+    @cached_property
+    def cameras(self) -> tuple[SensorModel, ...]:
+        """P_BA of every view, behind its sensor's calibration where it has one."""
+        assert self.adjustment is not None
+        pairs = zip(self.views, self.adjustment.sensors, strict=True)
+        used = self.calibrated
+        return tuple(Calibrated(one, used[v.name].spline) if v.name in used else one for v, one in pairs)
+
+    def undistorted(self, view: IntArray, xy: Array) -> Array:
+        """Return where cameras without a calibration have what is seen at xy (K, 2) [px] in views (K,)."""
+        out = xy.copy()
+        for v, one in enumerate(self.views):
+            if one.name in self.calibrated:
+                rows = view == v
+                out[rows] = self.calibrated[one.name].spline.undo(xy[rows])
+        return out
 
     def _rows(self, name: str, none: bool = False) -> BoolArray:
         """Return a mask of the observations (K,) from the adjustment; without one all of them alike."""

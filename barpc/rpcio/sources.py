@@ -434,6 +434,29 @@ def date_taken(image: PathOrUrl, camera: PathOrUrl, tags: Mapping[str, str]) -> 
     return stated or next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")
 
 
+_SENSOR = {
+    word: re.compile(
+        rb"(?<![a-z_])(?:" + keys + rb")\"?\s{0,9}[>=:]\s{0,9}\"?([A-Za-z0-9][\w .-]{0,39}?)\"?\s{0,9}[;<,\n\r}]",
+        re.IGNORECASE,
+    )
+    for word, keys in {
+        "sensor": rb"satid|mission|satellite_id",
+        "number": rb"mission_index",
+        "band": rb"bandid|band_id|spectral_processing|instrument",
+    }.items()
+}
+
+
+def sensor_of(image: PathOrUrl, camera: PathOrUrl) -> str:
+    """Return the sensor and band that the files of `light_of` state (WV02_P, PHR1B_PAN); empty if none does."""
+    texts, found = list(_texts(image, camera)), []
+    for pattern in _SENSOR.values():
+        matches = (pattern.search(text) for text in texts)
+        found.append(next((match[1].decode() for match in matches if match), ""))
+    name, number, band = found
+    return re.sub(r"[^\w-]+", "-", name + number + ("_" + band if band else "")) if name else ""
+
+
 def _day(text: str) -> str:
     """Return a day, if it is one of a time with satellites; else empty."""
     try:

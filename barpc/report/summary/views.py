@@ -363,7 +363,7 @@ def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
     behind, seen = Several(inner, np.arange(num)).behind, list[tuple[Array, ...]]()
     if behind is not None:
         seen = list(zip(*behind.project_ecef(ecef_from_ground(middle)), behind.sensor.project(middle), strict=True))
-    ends = [(model, view.size, view.alt_range) for model, view in zip(found.sensors, run.views, strict=True)]
+    ends = [(model, view.size, view.alt_range) for model, view in zip(run.cameras, run.views, strict=True)]
     grids = ground_grids(ends, (3, 2)) if run.written else None
     return [
         {

@@ -1,0 +1,324 @@
+"""`calibrate`: what finished runs tell of a sensor, in a file; and such files for a run of its images."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from barpc import __version__
+from barpc.ba import Adjustment
+from barpc.ba.calibration import SPLINES, Calibration, Learnt, SensorTies, amplitude, learn
+from barpc.base import manifest
+from barpc.base.atomic import refuse_existing, write_text
+from barpc.base.errors import InputError, RpcError, listed, plain
+from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
+from barpc.base.identity import fingerprint
+from barpc.base.remote import is_url
+from barpc.base.safe_io import CALIBRATION, read_json
+from barpc.base.statistics import CRITICAL, SURE
+from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
+from barpc.report import Run
+from barpc.report.runfiles import read_summary, read_tables, table_path
+from barpc.rpcio.sources import sensor_of
+from barpc.scene import BoolArray, Camera, Tracks, View
+from barpc.sensor import SensorModel
+from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
+
+logger = logging.getLogger(__name__)
+
+SCHEMA = "barpc calibration 1"
+SUFFIX = ".cal"
+_FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
+_MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
+_LARGEST = 1e3  # px: no curve is larger
+_FLAT = 30.0  # deg: rows that run within so much of each other are of one direction
+
+
+@dataclass(frozen=True, eq=False)
+class _FinishedRun:
+    """What a finished run tells of a sensor; the directions of its images' rows, clockwise from north [deg]."""
+
+    folder: Path
+    ties: SensorTies
+    directions: Array
+    images: int
+
+
+def calibrate(
+    runs: Sequence[str | Path], out: str | Path, sensor: str | None = None, *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Learn what one sensor does in every image from finished runs, and write it to a file that `adjust` applies.
+
+    Parameters
+    ----------
+    runs : sequence of path, three finished runs or more, whose images still are where they were
+    out : path, the file to write (JSON)
+    sensor : str, optional
+        Its name. Images that state another one take no part; without, all images must state the same.
+    overwrite : bool, replace the file
+
+    Returns
+    -------
+    dict, what the file holds
+
+    Raises
+    ------
+    InputError
+        Runs that cannot be used, or that tell no curve: it changes with time, directions do not suffice, or runs that
+        were left out are not met better. Nothing is written then.
+    """
+    out = Path(out)
+    refuse_existing(out, overwrite)
+    if len(runs) < _FEWEST_RUNS:
+        raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
+    opened = [(Path(folder), *_images_of(Path(folder))) for folder in runs]
+    name = _one_sensor([stated for *_, stated in opened], sensor)
+    found = [_finished_run(*one, name) for one in opened]
+    roots = [manifest.read(one.folder)[0] for one in found]
+    if len(set(roots)) < len(roots):
+        raise InputError(f"{next(one.folder for one, r in zip(found, roots, strict=True) if roots.count(r) > 1)}: "
+                         "is given twice")  # fmt: skip
+    _one_width(found)
+    order = sorted(range(len(found)), key=lambda i: (found[i].ties.date, roots[i]))
+    found, roots = [found[i] for i in order], [roots[i] for i in order]
+    learnt = learn([one.ties for one in found])
+    _refuse_unsure(name, learnt, found)
+    content = _content(name, learnt, found, roots)
+    write_text(out, json.dumps(content, indent=1) + "\n", overwrite=overwrite)
+    return content
+
+
+_Opened = tuple[Earlier, list[View], Sequence[SensorModel], list[str]]
+
+
+def _images_of(folder: Path) -> _Opened:
+    """Return a run, its images with their corrected cameras, and the sensors that they state."""
+    earlier, summary = Earlier.open(folder), read_summary(folder)
+    refuse_edited(folder, [table_path(folder, name) for name in ("observations.csv", "residuals.csv")])
+    names = {view.name for view in summary.views}
+    images = [image for image in earlier.images if image.name in names]
+    gone = [image for image in images if image.choices is None or not (is_url(image.path) or Path(image.path).exists())]
+    if gone:
+        raise InputError(f"{gone[0].path}: an image of {folder} that cannot be opened any more; put it back")
+    views, sensors, sources = corrected_views(images, earlier.prior)
+    return earlier, views, sensors, [_stated(view, source) for view, source in zip(views, sources, strict=True)]
+
+
+def _stated(view: View, source: Camera) -> str:
+    return "" if is_url(view.path) else sensor_of(Path(view.path), source.path)
+
+
+def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
+    """Return the sensor that is meant; InputError where it is not one."""
+    names = sorted({name for run in stated for name in run})
+    if given is not None:
+        if given not in names and any(names):
+            raise InputError(f"--sensor {given}: the images state {listed([name or 'none' for name in names])}")
+        return given
+    if len(names) != 1 or not names[0]:
+        said = (
+            "no image states its sensor" if names == [""] else f"the images are of {listed([n or '?' for n in names])}"
+        )
+        raise InputError(f"{said}: name the one that is meant (--sensor NAME)")
+    return names[0]
+
+
+def _finished_run(
+    folder: Path, earlier: Earlier, views: list[View], sensors: Sequence[SensorModel], stated: list[str], name: str
+) -> _FinishedRun:
+    tables = read_tables(read_summary(folder), folder)
+    own = [view.name for view, said in zip(views, stated, strict=True) if said in ("", name)]
+    number = {view.name: i for i, view in enumerate(views)}
+    used = [i for i, view in enumerate(views) if view.name in own]
+    place = np.array([used.index(number[v.name]) if v.name in own else -1 for v in tables.summary.views])
+    table = tables.observations
+    keep: BoolArray = (place[table.view] >= 0) & np.isin(table.track, tables.tracks)
+    if len(used) < 2 or not keep.any():
+        raise InputError(f"{folder}: {len(used)} images of {name} with {keep.sum()} observations: nothing is told")
+    order = np.argsort(tables.tracks)
+    point = order[np.searchsorted(tables.tracks[order], table.track[keep])]
+    tracks = Tracks(place[table.view[keep]], point, table.xy[keep], np.ones(keep.sum()))
+    chosen = [views[i] for i in used]
+    behind = [one.sensor if isinstance(one, Splined) else one for one in (sensors[i] for i in used)]
+    ties = SensorTies.of(str(folder), chosen, tracks, behind, tables.points[:, :3])
+    return _FinishedRun(
+        folder, ties, np.array([_row_direction(v, s) for v, s in zip(chosen, behind, strict=True)]), len(used)
+    )
+
+
+def _row_direction(view: View, sensor: SensorModel) -> float:
+    """Return where rows advance over the ground, clockwise from north [deg]."""
+    middle = (view.size[0] - 1) / 2
+    first, last = sensor.localize(np.array([[middle, 0.0], [middle, view.size[1] - 1.0]]), np.full(2, view.altitude))
+    east, north = ((last - first) * metres_per_unit(first))[:2]
+    return float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+def _one_width(found: Sequence[_FinishedRun]) -> None:
+    first = found[0]
+    for one in found[1:]:
+        if one.ties.width != first.ties.width:
+            raise InputError(f"{one.folder}: images of {one.ties.width} columns, those of {first.folder} have "
+                             f"{first.ties.width}: a calibration is of whole lines without binning")  # fmt: skip
+
+
+def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> None:
+    """Raise InputError where the curve is none of the sensor's in all of its images."""
+    at, nats = learnt.change
+    if nats > SURE:
+        day = found[at].ties.date or f"of {found[at].folder}"
+        raise InputError(f"{name}: its distortion changes, most probably before {day}: calibrate the runs before and "
+                         "those from then on apart")  # fmt: skip
+    size, sigma = (float(np.linalg.norm(learnt.curve.sizes(one))) for one in (learnt.unknowns, learnt.covariance))
+    if sigma > _MUST_KNOW * size and sigma > learnt.noise_px / np.sqrt(len(found)):
+        double = np.exp(2j * np.radians(np.concatenate([one.directions for one in found])))
+        mean = float(np.degrees(np.angle(double.mean())) / 2 % 180.0)
+        flat = abs(double.mean()) > np.cos(np.radians(_FLAT))
+        more = (
+            f"whose rows run across those of these, near {(mean + 90) % 180:.0f} degrees of north" if flat else "more"
+        )
+        raise InputError(f"{name}: a distortion of {size:.3f} px is known to {sigma:.3f} px by these runs only: runs "
+                         f"{more} are needed")  # fmt: skip
+    better = int((learnt.gain > 0).sum())
+    if not (learnt.gain.sum() > 2.0 * SURE and 2 * better > len(found)):
+        raise InputError(f"{name}: of {len(found)} runs left out in turn {better} are met better by the distortion "
+                         "that the others show: it is none that these images share")  # fmt: skip
+
+
+def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Sequence[str]) -> dict[str, Any]:
+    spline = learnt.spline
+    rows = np.tril_indices(len(learnt.unknowns))
+    dates = [one.ties.date for one in found if one.ties.date]
+    return {
+        "schema": SCHEMA,
+        "barpc": __version__,
+        "sensor": name,
+        "columns": spline.width,
+        "coefficients_px": np.round(spline.coeffs, 7).tolist(),
+        "edges": spline.edges.tolist(),
+        "steps_px": np.round(spline.steps, 7).tolist(),
+        "size_px": np.round(learnt.curve.sizes(learnt.unknowns), 5).tolist(),
+        "sigma_px": np.round(learnt.curve.sizes(learnt.covariance), 5).tolist(),
+        "held_out_noise": np.round(learnt.rms, 4).tolist(),
+        "dates": [dates[0], dates[-1]] if dates else [],
+        "runs": [
+            {"name": one.folder.resolve().name, "root": root, "date": one.ties.date, "images": one.images,
+             "gain": round(float(gain), 1)}
+            for one, root, gain in zip(found, roots, learnt.gain, strict=True)
+        ],
+        "covariance_px2": [float(f"{value:.5g}") for value in learnt.covariance[rows]],
+    }  # fmt: skip
+
+
+# --- applied ----------------------------------------------------------------------------------------------
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a file of `calibrate`; InputError where it is none, or damaged."""
+    found = read_json(path, CALIBRATION)
+    schema = found.get("schema") if isinstance(found, dict) else None
+    if schema != SCHEMA:
+        raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({SCHEMA})")
+    try:
+        edges, steps = np.array(found["edges"], dtype=np.float64), np.array(found["steps_px"], dtype=np.float64)
+        coeffs, width = np.array(found["coefficients_px"], dtype=np.float64), found["columns"]
+        if type(width) is not int or not isinstance(found["sensor"], str) or coeffs.shape != (SPLINES, 2):
+            raise ValueError("its columns, sensor or coefficients are none")
+        spline = ColumnSpline(width, coeffs, edges, steps.reshape(-1, 2))
+        size = 2 * (SPLINES + len(edges))
+        rows, covariance = np.tril_indices(size), np.zeros((size, size))
+        covariance[rows] = np.array(found["covariance_px2"], dtype=np.float64)
+        covariance += np.tril(covariance, -1).T
+        if not (np.abs(spline.coeffs) < _LARGEST).all() or not (np.abs(spline.steps) < _LARGEST).all():
+            raise ValueError("a distortion that is absurdly large")
+        if not (np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
+            raise ValueError("its covariance is none")
+    except (ValueError, TypeError, KeyError, AttributeError, RpcError) as error:
+        raise InputError(f"{path}: damaged ({plain(error)}); make it again (barpc calibrate)") from error
+    return Calibration(found["sensor"], spline, covariance, str(path), fingerprint(path).sha256)
+
+
+def calibrations_of(
+    paths: Sequence[str], views: Sequence[View], sources: Sequence[Camera], *, some: bool = False
+) -> dict[str, Calibration]:
+    """Return the calibration of each view that has one, by its name: given for its sensor, or beside its image.
+
+    An image that states no sensor takes the one that is given alone. `some`: the views may be some of a run's only.
+
+    Raises
+    ------
+    InputError
+        A file that is none, for no image, or for images of another number of columns; two for one sensor.
+    """
+    given = [read_calibration(path) for path in paths]
+    for i, one in enumerate(given):
+        if one.sensor in {other.sensor for other in given[:i]}:
+            raise InputError(f"{one.path}: another calibration of {one.sensor} is given; give one")
+    by_sensor, found = {one.sensor: one for one in given}, dict[str, Calibration]()
+    for view, source in zip(views, sources, strict=True):
+        if (used := _own(view, _stated(view, source), by_sensor)) is None:
+            continue
+        if used.spline.width != view.size[0]:
+            raise InputError(f"{used.path}: of {used.spline.width} columns, {view.path} has {view.size[0]}: it is "
+                             "of whole lines without binning; leave it out, or calibrate such images")  # fmt: skip
+        found[view.name] = used
+    for one in () if some else given:
+        if one not in found.values():
+            raise InputError(f"{one.path}: is of {one.sensor}, and no image given is")
+    return found
+
+
+def calibrated(sensors: Sequence[SensorModel], used: Sequence[Calibration | None]) -> list[SensorModel]:
+    """Return cameras behind their calibrations, of those that have one."""
+    return [s if one is None else Calibrated(s, one.spline) for s, one in zip(sensors, used, strict=True)]
+
+
+def _own(view: View, sensor: str, given: Mapping[str, Calibration]) -> Calibration | None:
+    if not sensor:
+        return next(iter(given.values())) if len(given) == 1 else None
+    if sensor in given or is_url(view.path):
+        return given.get(sensor)
+    beside = Path(view.path).parent / f"{sensor}{SUFFIX}"
+    if not beside.is_file():
+        return None
+    found = read_calibration(beside)
+    if found.sensor != sensor:
+        raise InputError(f"{beside}: is of {found.sensor}, not of {sensor} as its name says: rename it")
+    return found
+
+
+def refuse_strange(run: Run, adjustment: Adjustment) -> None:
+    """Raise InputError where the tie points of a run contradict a calibration that it was adjusted with."""
+    for used, ties in _ties_by_calibration(run, adjustment):
+        shown, sigma = amplitude(ties, used.spline)
+        logger.info("%s: tie points show %.2f +- %.2f of it", used.path, shown, sigma)
+        if shown < 0.5 and 1.0 - shown > CRITICAL * sigma:
+            raise InputError(
+                f"{used.path}: is not of these images: their tie points show {shown:.2f} +- {sigma:.2f} of its "
+                "distortion (another sensor, or columns in the other order?); leave it out"
+            )
+
+
+def _ties_by_calibration(run: Run, adjustment: Adjustment) -> Iterator[tuple[Calibration, SensorTies]]:
+    ground = ground_from_ecef(adjustment.points)
+    for used in {one.sha256: one for one in run.calibrated.values()}.values():
+        of = np.array([run.calibrated.get(view.name) is not None and run.calibrated[view.name].sha256 == used.sha256
+                       for view in run.views])  # fmt: skip
+        index, tracks = np.cumsum(of) - 1, run.tracks
+        rows = of[tracks.view] & np.isfinite(ground[tracks.point]).all(axis=1)
+        if np.bincount(tracks.point[rows], minlength=1).max() < 2:
+            continue
+        part = Tracks(index[tracks.view[rows]], tracks.point[rows], tracks.xy[rows], tracks.sigma[rows])
+        chosen = np.flatnonzero(of)
+        yield (
+            used,
+            SensorTies.of(
+                used.path, [run.views[i] for i in chosen], part, [adjustment.bases[i] for i in chosen], ground
+            ),
+        )
