@@ -12,6 +12,7 @@ import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import ForeignCamera, Parts, Solver, find_apart, without_moving
+from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
 from barpc.ba.constraints.incremental import BlockPrior
@@ -53,6 +54,7 @@ def adjust_tracks(
     known: BoolArray | None = None,
     keep_largest: bool = False,
     hold_out: bool = True,
+    common: CommonErrors | None = None,
 ) -> Adjustment:
     """Correct the cameras of a block so that its tie points agree.
 
@@ -74,6 +76,7 @@ def adjust_tracks(
     altimetry : Altimetry or None, heights that no image coordinates go with
     keep_largest, hold_out : bool
         Go on with the largest group of connected views; keep a tenth of the tracks out, to measure the result on.
+    common : CommonErrors or None, errors that images have in common, of what was taken off `tracks` before
 
     Returns
     -------
@@ -102,11 +105,13 @@ def adjust_tracks(
     def solve(inner: Block, outer: Block, options: AdjustOptions) -> Solution:
         return solve_block(inner, outer, options, dem, centers, prior)
 
-    found = _solved_adjustment(parts, options, solve, altimetry)
-    return replace(found, earlier=prior, seconds=time.process_time() - start)
+    found = _solved_adjustment(parts, options, solve, altimetry, common)
+    return replace(found, earlier=prior, common=common, seconds=time.process_time() - start)
 
 
-def _solved_adjustment(parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None) -> Adjustment:
+def _solved_adjustment(
+    parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None, common: CommonErrors | None
+) -> Adjustment:
     """Return the block solved by the model that the data choose, held by heights too where there are some."""
     given = parts.inner, parts.outer
     try:
@@ -116,7 +121,7 @@ def _solved_adjustment(parts: Parts, options: AdjustOptions, solve: Solver, alti
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
         found.heights.warn()
         _warn(found.outcome)
-        whole = replace(_adjustment(found, parts, options, in_space), altimetry=heights)
+        whole = replace(_adjustment(found, parts, options, in_space, common), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
@@ -252,10 +257,15 @@ def _is_calm(found: Solution, block: Block, floor: float) -> bool:
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
 
 
-def _adjustment(found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None) -> Adjustment:
+def _adjustment(
+    found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, common: CommonErrors | None
+) -> Adjustment:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     block, outcome, final = parts.inner, found.outcome, found.final
     covariance = outcome.minimum.covariance(found.problem.free)
+    if common is not None:
+        state = final.params, final.points, outcome.weight
+        covariance = replace(covariance, shared=common.by_unknowns(outcome.problem, state, covariance))
     method = covariance.factor.method
     cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
     points, before, after = _points_and_residuals(found, parts)

@@ -20,9 +20,11 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
+from barpc.ba.solving.covariance import Covariance
+from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground_jacobian
-from barpc.base.statistics import BACKFITTING, ROUNDING, STEPS, SURE, robust_spread
+from barpc.base.statistics import BACKFITTING, ROUNDING, SLIGHT, STEPS, SURE, robust_spread
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several
@@ -292,6 +294,42 @@ class Calibration:
     covariance: Array
     path: str
     sha256: str
+
+    @cached_property
+    def modes(self) -> tuple[ColumnSpline, ...]:
+        """Independent errors of the curve, each by one standard deviation, the largest first."""
+        size, vectors = la.eigh(self.covariance)
+        kept = np.flatnonzero(size > SLIGHT * size.sum())[::-1]
+        curve = Curve(self.spline.width, self.spline.edges)
+        return tuple(curve.spline(vectors[:, i] * np.sqrt(size[i])) for i in kept)
+
+
+@dataclass(frozen=True, eq=False)
+class CommonErrors:
+    """Errors that images of a sensor have in common: those of its calibration."""
+
+    of_view: tuple[Calibration | None, ...]
+
+    def moved(self, view: IntArray, col: Array) -> Array:
+        """Return how far (k, K, 2) [px] each error by its standard deviation moves what is seen in columns (K,)."""
+        found = []
+        for used in {one.sha256: one for one in self.of_view if one is not None}.values():
+            rows = np.array([one is not None and one.sha256 == used.sha256 for one in self.of_view])[view]
+            found += [np.where(rows[:, None], mode.at(col), 0.0) for mode in used.modes]
+        return np.array(found).reshape(-1, len(col), 2)
+
+    def by_unknowns(self, problem: Problem, state: tuple[Array, Array, Array], covariance: Covariance) -> Array:
+        """Return what unknowns (N q, k) do with each error by its standard deviation, at the end of an adjustment.
+
+        `state`: unknowns (N, q), points (P, 3) [m] and weights (K,) [1/px].
+        """
+
+        def gradient(xy: Array) -> Array:
+            return replace(problem, xy=xy, _room=[]).reduce(*state).gradient
+
+        start, moved = gradient(problem.xy), self.moved(problem.structure.view, problem.xy[0])
+        pulls = [gradient(problem.xy + one.T) - start for one in moved]
+        return -covariance.solve(np.array(pulls).reshape(-1, len(start)).T)
 
 
 # --- what many blocks tell --------------------------------------------------------------------------------

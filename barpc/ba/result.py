@@ -9,6 +9,7 @@ import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.apart import ForeignCamera
+from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.gauge import GaugeReport
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.constraints.incremental import BlockPrior
@@ -121,6 +122,8 @@ class Adjustment:
         East, north, up [m] of the adjusted GCPs minus their given place.
     seconds : float
         CPU time.
+    common : CommonErrors or None
+        Errors that images have in common, which are in the covariance.
     earlier : BlockPrior or None
         What an earlier block knew of those of its views that are among these.
     options : AdjustOptions
@@ -170,6 +173,7 @@ class Adjustment:
     apart: ForeignCamera | None = None
     altimetry: AltimetryTest | None = None
     earlier: BlockPrior | None = field(default=None, repr=False)
+    common: CommonErrors | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"
@@ -261,12 +265,32 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     points = adjustment.points[seen[:: len(seen) // MANY + 1]]
     n, pair = len(points), (min(first, second), max(first, second))
     cameras, params = adjustment.cameras, adjustment.params
-    by_camera = height_by_unknowns(cameras, params, pair, points).reshape(n, -1)
-    covariance = adjustment.covariance.joint(np.array(pair))
+    by_camera, pull = _height_derivatives(cameras, params, pair, points)
+    by_camera, covariance = by_camera.reshape(n, -1), adjustment.covariance.joint(np.array(pair))
+    if adjustment.common is not None:
+        by_camera, covariance = _with_common(adjustment, pair, points, (by_camera, pull, covariance))
     relative = by_camera - by_camera.mean(axis=0)
     return PairHeights(
         (first, second), _rms_uncertainty(by_camera, covariance), _rms_uncertainty(relative, covariance), n
     )
+
+
+def _with_common(
+    adjustment: Adjustment, pair: tuple[int, int], points: Array, known: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    """Return the derivative of heights by unknowns and by errors in common, and the covariance of both together."""
+    common, shared, (by_camera, pull, covariance) = adjustment.common, adjustment.covariance.shared, known
+    assert common is not None
+    assert shared is not None
+    ground, direct = ground_from_ecef(points), np.zeros((shared.shape[1], len(points)))
+    for at, view in enumerate(pair):
+        col = adjustment.sensors[view].project(ground)[:, 0]
+        direct += (common.moved(np.full(len(col), view), col) * pull[:, at]).sum(axis=2)
+    moves = shared.reshape(len(adjustment.names), -1, shared.shape[1])[list(pair)].reshape(-1, shared.shape[1])
+    both = np.concatenate([moves, np.eye(shared.shape[1])])
+    whole = both @ both.T
+    whole[: len(moves), : len(moves)] = covariance
+    return np.concatenate([by_camera, direct.T], axis=1), whole
 
 
 def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
@@ -278,6 +302,11 @@ def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], p
     pair : (int, int), the views, ascending
     points : (n, 3), ECEF [m]
     """
+    return _height_derivatives(cameras, params, pair, points)[0]
+
+
+def _height_derivatives(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> tuple[Array, Array]:
+    """Return the same, and the derivative (n, 2, 2) by where either view sees the points."""
     n, num, ground = len(points), len(cameras.sensors), ground_from_ecef(points)
     cameras = cameras.seeing(np.concatenate([cameras.sensors[view].project(ground) for view in pair]).T)
     bounds = np.searchsorted(np.repeat(pair, n), np.arange(num + 1))
@@ -289,8 +318,7 @@ def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], p
     normal = np.swapaxes(stacked, 1, 2) @ stacked
     weights = np.linalg.solve(normal, up[..., None])[..., 0]
     pull = np.einsum("nvca,na->nvc", by_point, weights)
-    found: Array = -np.einsum("nvc,nvcq->nvq", pull, by_unknown)
-    return found
+    return -np.einsum("nvc,nvcq->nvq", pull, by_unknown), pull
 
 
 def _rms_uncertainty(rows: Array, covariance: Array) -> float:

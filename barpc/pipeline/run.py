@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
+from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
@@ -412,6 +413,7 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
         reference=_undistorted_reference(run),
         altimetry=altimetry,
         keep_largest=options.keep_going,
+        common=CommonErrors(tuple(run.calibrated.get(v.name) for v in run.views)) if run.calibrated else None,
     )
     refuse_strange(run, adjustment)
     datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]

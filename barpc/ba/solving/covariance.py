@@ -24,6 +24,8 @@ class Covariance:
     reduced: Reduced  # the problem linearised at its solution
     factor: Factor  # of the reduced matrix, free unknowns only
     free: BoolArray  # (N q,) unknowns that are not fixed
+    # (N q, k) what unknowns do with errors that images have in common, beside the noise, by their standard deviations
+    shared: Array | None = None
 
     @property
     def num_unknowns(self) -> int:
@@ -34,7 +36,7 @@ class Covariance:
         """Return S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
         out = np.zeros(rows.shape)
         out[self.free] = self.factor.solve(np.ascontiguousarray(rows[self.free]))
-        return out
+        return out if self.shared is None else out + self.shared @ (self.shared.T @ rows)
 
     @property
     def is_large(self) -> bool:
@@ -45,12 +47,12 @@ class Covariance:
         """Return the variances (N, q) of all unknowns; zero for fixed ones."""
         if self.factor.inverse is None:
             return self.full.diagonal().reshape(-1, self.num_unknowns)
-        return np.asarray(self._near.diagonal.diagonal(axis1=1, axis2=2))
+        return np.asarray(self.of_views().diagonal(axis1=1, axis2=2))
 
     def of_views(self) -> Array:
         """Return the covariances (N, q, q) of every view's unknowns."""
         if self.factor.inverse is not None:
-            return self._near.diagonal
+            return self._near.diagonal if self.shared is None else self._near.diagonal + self._of_shared()
         q, every = self.num_unknowns, np.arange(len(self.free) // self.num_unknowns)
         return np.asarray(self.full.reshape(-1, q, len(every), q)[every, :, every])
 
@@ -84,11 +86,18 @@ class Covariance:
     def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
         """Return the covariance (q, q) of view i with view j: where they share points, all such are known at once."""
         if self.factor.inverse is not None and not of_full:
+            more = 0.0 if self.shared is None else self._of_shared(i) @ self._of_shared(j).T
             if i == j:
-                return np.asarray(self._near.diagonal[i])
+                return np.asarray(self._near.diagonal[i] + more)
             if (at := self._near.pair(min(i, j), max(i, j))) is not None:
-                return np.asarray(self._near.pairs[at] if i < j else self._near.pairs[at].T)
+                return np.asarray((self._near.pairs[at] if i < j else self._near.pairs[at].T) + more)
         return self._columns(self._places(np.array([j])), of_full)[self._places(np.array([i]))]
+
+    def _of_shared(self, view: int | None = None) -> Array:
+        """Return the rows (q, k) of a view in what errors in common do; of none the covariances (N, q, q) by these."""
+        assert self.shared is not None
+        rows = self.shared.reshape(-1, self.num_unknowns, self.shared.shape[1])
+        return np.asarray(rows @ np.swapaxes(rows, 1, 2) if view is None else rows[view])
 
     @cached_property
     def _near(self) -> Blocks:
@@ -114,7 +123,7 @@ class Covariance:
         out = np.zeros((len(self.free), len(self.free)))
         if self.factor.whole_inverse is not None:
             out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
-            return out
+            return out if self.shared is None else out + self.shared @ self.shared.T
         every = np.arange(len(self.free))
         for part in parts(len(every), max(KEPT // len(every), 1)):
             out[:, part] = self._columns(every[part], False)

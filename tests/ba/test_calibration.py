@@ -1,0 +1,169 @@
+"""What blocks tell of a detector line: against a dense solution, truth of other models, and time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.calibration import (
+    Calibration,
+    CommonErrors,
+    Curve,
+    Learnt,
+    SensorTies,
+    _Eliminated,
+    amplitude,
+    learn,
+)
+from barpc.base.errors import InputError
+from barpc.sensor.image_corrections import Calibrated, ColumnSpline
+from barpc.simulate import simulate_block
+from benchmarks.calibrate import Scene, Sensor, any_looks, off, scene
+
+SIZE = (6000, 4000)
+
+
+def ties(made: Scene, name: str = "") -> SensorTies:
+    """What a scene tells whose cameras are known but for the detector line."""
+    return SensorTies.of(name, made.views, made.tracks, made.cameras, made.ground)
+
+
+def scenes(count: int, sensor: Sensor, seed: int, **given: object) -> list[SensorTies]:
+    rng = np.random.default_rng(seed)
+    return [ties(scene(any_looks(3, rng), sensor, rng, 700, size=SIZE, **given)) for _ in range(count)]  # type: ignore[arg-type]
+
+
+def test_points_and_nuisances_are_eliminated_as_a_dense_solution_does() -> None:
+    rng = np.random.default_rng(1)
+    made = ties(scene(any_looks(3, rng), Sensor.made("waves", 1, size=SIZE), rng, 60, size=SIZE))
+    count, points, views = len(made.view), int(made.point.max()) + 1, int(made.view.max()) + 1
+    weight, curve = rng.uniform(5, 10, count), Curve(SIZE[0], np.array([1500.5, 4200.5]))
+    told = curve.told(_Eliminated(made, made.residual, weight), made.xy[:, 0])
+    col, row = made.place.T
+    terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
+    others, own = np.zeros((2 * count, 3 * points + 10 * views)), np.zeros((2 * count, 2 * curve.size))
+    basis = curve.basis(made.xy[:, 0])
+    for k in range(count):
+        for i in range(2):
+            at = 3 * made.point[k], 3 * points + 10 * made.view[k] + 5 * i
+            others[2 * k + i, at[0] : at[0] + 3] = made.by_point[k, i] * weight[k]
+            others[2 * k + i, at[1] : at[1] + 5] = terms[k] * weight[k]
+            own[2 * k + i, i * curve.size : (i + 1) * curve.size] = basis[k] * weight[k]
+    residual, loose = (made.residual * weight[:, None]).ravel(), np.zeros(others.shape[1])
+    loose[3 * points :] = 1e-4
+    inverse = la.inv(others.T @ others + np.diag(loose + 1e-12))
+    cross = others.T @ own
+    matrix = own.T @ own - cross.T @ inverse @ cross
+    gradient = own.T @ residual - cross.T @ inverse @ (others.T @ residual)
+    np.testing.assert_allclose(told.matrix, matrix, atol=1e-3 * np.abs(matrix).max())
+    np.testing.assert_allclose(told.gradient, gradient, atol=1e-3 * np.abs(gradient).max())
+
+
+def test_the_curve_is_a_camera_there_and_back() -> None:
+    rng = np.random.default_rng(2)
+    spline = ColumnSpline(1000, rng.normal(0, 0.5, (28, 2)))
+    view = simulate_block(1, 0, num_checks=0, size=(1000, 800)).views[0]
+    camera, image = Calibrated(view.sensor, spline), rng.uniform(0, 800, (50, 2))
+    ground = camera.localize(image, np.full(50, 200.0))
+    np.testing.assert_allclose(camera.project(ground), image, atol=1e-6)
+    seen, slope = camera.project_jacobian(ground)
+    step = np.array([2e-7, -1e-7, 0.01])
+    moved = camera.project(ground + step) - camera.project(ground - step)
+    np.testing.assert_allclose(slope @ (2 * step), moved, atol=1e-4 * np.abs(moved).max())
+    np.testing.assert_allclose(seen, image, atol=1e-6)
+    edged = replace(spline, edges=np.array([300.5]), steps=np.array([[0.3, -0.2]]))
+    np.testing.assert_allclose(edged.at(np.array([301.0])) - spline.at(np.array([301.0])), [[0.3, -0.2]])
+    np.testing.assert_array_equal(edged.at(np.array([300.0])), spline.at(np.array([300.0])))
+
+
+@pytest.fixture(scope="module")
+def sensor() -> Sensor:
+    return Sensor.made("polynomials", 4, chips=4, size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def found(sensor: Sensor) -> Learnt:
+    return learn(scenes(10, sensor, 7))
+
+
+@pytest.mark.slow
+def test_curve_steps_and_what_is_said_of_them_are_right(found: Learnt, sensor: Sensor) -> None:
+    wrong, said = off(found, sensor, SIZE[0])
+    assert np.linalg.norm(wrong) < 0.03
+    assert 0.3 < np.linalg.norm(wrong) / np.linalg.norm(said) < 2.5
+    near = np.abs(found.curve.edges[:, None] - sensor.edges).min(axis=1)
+    assert len(near) >= 2
+    assert near.max() < 5.0
+    assert (found.gain > 0).all()
+    assert 0.5 < found.scatter < 2.0
+    assert found.change[1] < 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["polynomials", "waves"])
+def test_heavy_tails_and_curves_of_another_model_are_met(kind: str) -> None:
+    line = Sensor.made(kind, 8, chips=3, size=SIZE)
+    wrong, said = off(learn(scenes(10, line, 3, tails=True)), line, SIZE[0])
+    truth = line.curve(np.arange(0.0, SIZE[0], 10.0))
+    assert np.linalg.norm(wrong) < 0.15 * np.linalg.norm(truth.std(axis=0))
+    assert np.linalg.norm(wrong) < 4.0 * np.linalg.norm(said)  # kinks and chips of 0.1 px are smoother than they are
+
+
+@pytest.mark.slow
+def test_a_curve_that_changes_is_dated(sensor: Sensor) -> None:
+    other = Sensor(lambda col: sensor.curve(col) + 0.2 * np.cos(col[:, None] / 700.0), sensor.edges)
+    at, nats = learn([*scenes(5, sensor, 1), *scenes(4, other, 2)]).change
+    assert at == 5
+    assert nats > 20.0
+
+
+@pytest.mark.slow
+def test_a_block_shows_its_own_curve_whole_and_none_of_another(found: Learnt, sensor: Sensor) -> None:
+    mirrored = Sensor(lambda col: -sensor.curve(SIZE[0] - 1.0 - col), sensor.edges)
+    for seed in range(3):
+        rng = np.random.default_rng(seed + 50)
+        looks = any_looks(3, rng)
+        shown, sigma = amplitude(ties(scene(looks, sensor, rng, 700, size=SIZE)), found.spline)
+        assert abs(shown - 1.0) < 5.0 * sigma + 0.1
+        shown, sigma = amplitude(ties(scene(looks, mirrored, rng, 700, size=SIZE)), found.spline)
+        assert shown < 0.5
+        assert 1.0 - shown > 4.0 * sigma
+
+
+def test_blocks_of_other_widths_and_too_few_are_refused() -> None:
+    rng = np.random.default_rng(3)
+    made = ties(scene(any_looks(2, rng), Sensor.made("waves", 1, size=SIZE), rng, 30, size=SIZE))
+    with pytest.raises(InputError, match="2 blocks"):
+        learn([made, made])
+    with pytest.raises(InputError, match="of 2 widths"):
+        learn([made, made, replace(made, width=50)])
+
+
+def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:
+    """Tie points that one of the errors moved by its standard deviation, adjusted anew."""
+    block = simulate_block(3, 300, seed=2, size=(2000, 2000), noise=0.05)
+    rng = np.random.default_rng(5)
+    curve = ColumnSpline(2000, rng.normal(0, 0.1, (28, 2)))
+    size = 2 * 28
+    root = rng.normal(0, 0.05, (size, 2))
+    used = Calibration("", curve, root @ root.T, "", "a")
+    options = AdjustOptions(loss="linear", learn_priors=False, estimate_noise=False, jitter="off", drift=1, noise_floor=0.0,
+                            model="rotation+translation")  # fmt: skip
+    common = CommonErrors((used, None, used))
+    first = adjust_tracks(block.views, block.tracks, options, common=common, hold_out=False)
+    plain = adjust_tracks(block.views, block.tracks, options, hold_out=False)
+    shared = first.covariance.shared
+    assert shared is not None
+    assert shared.shape[1] == 2
+    moved = common.moved(block.tracks.view, block.tracks.xy[:, 0])
+    for k in range(2):
+        tracks = replace(block.tracks, xy=block.tracks.xy + moved[k])
+        change = (adjust_tracks(block.views, tracks, options, hold_out=False).params - plain.params).ravel()
+        np.testing.assert_allclose(change, shared[:, k], atol=0.03 * np.abs(shared[:, k]).max())
+    np.testing.assert_allclose(first.covariance.full, plain.covariance.full + shared @ shared.T)
+    np.testing.assert_allclose(first.covariance.view(0, 2), first.covariance.full[:9, 18:27], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(first.covariance.variances().ravel(), np.diag(first.covariance.full), rtol=1e-6)
