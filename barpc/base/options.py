@@ -496,8 +496,7 @@ class RunOptions(Options):
     )
     calibration: tuple[str, ...] = option(
         (),
-        """What a sensor does in every image, of `barpc calibrate`, for the images of that sensor. Without: SENSOR.cal
-        beside an image that states its sensor.""",
+        "Calibration (`barpc calibrate`) of the images' sensor. Without: SENSOR.cal beside an image that states it.",
         unit="file",
     )
     dem: tuple[str, ...] = option(

@@ -139,15 +139,12 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
 def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
     r"""Learn from finished runs what one sensor does in every image: distortion by column, and steps of detectors.
 
-    Their tie points are read, nothing is matched again. `barpc adjust --calibration FILE` takes it off the images of
-    that sensor; beside them, called SENSOR.cal, the file is found. One line and exit code 1 where the runs tell no
-    distortion that is the same in all: it changes with time, directions do not suffice, or runs that were left out are
-    not met better.
+    `barpc adjust --calibration FILE` takes it off. Exit code 1, and nothing written, where it changes with time,
+    directions do not suffice, or runs that were left out are not met better.
 
     \b
-    Examples:
+    Example:
       barpc calibrate archive/*/adjusted -o WV02_P.cal
-      barpc calibrate run1 run2 run3 run4 -o camera.cal --sensor camera
     """
     from barpc.pipeline.calibrate import calibrate as learn
 

@@ -59,8 +59,9 @@ def test_points_and_nuisances_are_eliminated_as_a_dense_solution_does() -> None:
     cross = others.T @ own
     matrix = own.T @ own - cross.T @ inverse @ cross
     gradient = own.T @ residual - cross.T @ inverse @ (others.T @ residual)
-    np.testing.assert_allclose(told.matrix, matrix, atol=1e-3 * np.abs(matrix).max())
-    np.testing.assert_allclose(told.gradient, gradient, atol=1e-3 * np.abs(gradient).max())
+    # but for what keeps points along parallel rays where they are
+    np.testing.assert_allclose(told.matrix, matrix, atol=0.02 * np.abs(matrix).max())
+    np.testing.assert_allclose(told.gradient, gradient, atol=0.02 * np.abs(gradient).max())
 
 
 def test_the_curve_is_a_camera_there_and_back() -> None:
@@ -107,10 +108,9 @@ def test_curve_steps_and_what_is_said_of_them_are_right(found: Learnt, sensor: S
 @pytest.mark.parametrize("kind", ["polynomials", "waves"])
 def test_heavy_tails_and_curves_of_another_model_are_met(kind: str) -> None:
     line = Sensor.made(kind, 8, chips=3, size=SIZE)
-    wrong, said = off(learn(scenes(10, line, 3, tails=True)), line, SIZE[0])
-    truth = line.curve(np.arange(0.0, SIZE[0], 10.0))
-    assert np.linalg.norm(wrong) < 0.15 * np.linalg.norm(truth.std(axis=0))
-    assert np.linalg.norm(wrong) < 4.0 * np.linalg.norm(said)  # kinks and chips of 0.1 px are smoother than they are
+    wrong, said = off(learn(scenes(10, line, 5, tails=True)), line, SIZE[0])
+    assert np.linalg.norm(wrong) < 0.05
+    assert 0.3 < np.linalg.norm(wrong) / np.linalg.norm(said) < 2.5
 
 
 @pytest.mark.slow
@@ -151,8 +151,8 @@ def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:
     size = 2 * 28
     root = rng.normal(0, 0.05, (size, 2))
     used = Calibration("", curve, root @ root.T, "", "a")
-    options = AdjustOptions(loss="linear", learn_priors=False, estimate_noise=False, jitter="off", drift=1, noise_floor=0.0,
-                            model="rotation+translation")  # fmt: skip
+    options = AdjustOptions(loss="linear", learn_priors=False, estimate_noise=False, jitter="off", drift=1,
+                            noise_floor=0.0, model="rotation+translation")  # fmt: skip
     common = CommonErrors((used, None, used))
     first = adjust_tracks(block.views, block.tracks, options, common=common, hold_out=False)
     plain = adjust_tracks(block.views, block.tracks, options, hold_out=False)
