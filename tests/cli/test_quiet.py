@@ -48,7 +48,8 @@ def words(verb: str, given: tuple[str, ...], places: dict[str, object]) -> list[
 
 
 def test_every_verb_does_or_answers_something():
-    assert {verb.split()[0] for verb in (*DONE, *ASKED)} == set(COMMANDS)
+    # `calibrate` needs three runs of one sensor: tests/pipeline/test_calibrate.py
+    assert {verb.split()[0] for verb in (*DONE, *ASKED)} == set(COMMANDS) - {"calibrate"}
 
 
 @pytest.mark.parametrize("verb", [pytest.param(verb, marks=[pytest.mark.slow] * (verb in SLOW)) for verb in DONE])

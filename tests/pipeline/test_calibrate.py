@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+from click.testing import CliRunner, Result
 
 import barpc
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.cameras import open_camera
+from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
 from barpc.pipeline.calibrate import read_calibration
+from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio.carried import put_tag
 from barpc.sensor.rpc import RPC
@@ -122,6 +125,8 @@ def test_a_run_with_a_calibration_writes_it_and_is_calibrated_again_to_the_same(
     shutil.copy(calibration, tmp_path / "new" / "SIM1_PAN.cal")  # beside the images it is found
     beside = run(paths, "beside")
     assert set(beside.run.calibrated) == {"v0", "v1", "v2"}
+    assert {one.now for one in prove(tmp_path / "new/beside")} <= set(PASSED_STATES)
+    assert any(one["path"].endswith("SIM1_PAN.cal") for one in beside.summary["inputs"])
     np.testing.assert_array_equal(beside.adjustment.params, with_it.adjustment.params)
     both = [
         barpc.calibrate([*archive, tmp_path / "new" / name], tmp_path / f"{name}.cal") for name in ("plain", "with")
@@ -154,6 +159,24 @@ def test_what_is_not_of_the_images_is_refused(calibration: Path, line: Sensor, t
         other.write_text(json.dumps({**text, **change}))
         with pytest.raises(InputError, match=words):
             run(paths, "wrong", calibration=(str(other),))
+
+
+@pytest.mark.slow
+def test_the_verb_says_what_it_found_or_why_it_did_not(archive: list[Path], tmp_path: Path) -> None:
+    def said(*words: object) -> Result:
+        return CliRunner().invoke(cli, ["calibrate", *map(str, words)], standalone_mode=False, obj={"quiet": False})
+
+    first = said(*archive, "-o", tmp_path / "a.cal")
+    assert first.return_value == 0
+    assert f"{RUNS} of {RUNS} runs left out in turn are met better" in first.output
+    again = said(*archive, "-o", tmp_path / "a.cal")
+    assert isinstance(again.exception, OutputError)
+    few = said(*archive[:2], "-o", tmp_path / "b.cal")
+    assert isinstance(few.exception, InputError)
+    assert not (tmp_path / "b.cal").exists()
+    one, other = tmp_path / "a.cal", tmp_path / "c.cal"
+    assert said(*archive[::-1], "-o", other).return_value == 0  # whatever the order
+    assert one.read_bytes() == other.read_bytes()
 
 
 @pytest.mark.slow
