@@ -30,20 +30,22 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several
 from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bsplines
 
-SPLINES = 28  # of 25 knots: lenses and focal planes bend over a twentieth of the line, or more slowly
-_OPEN = 3.0  # px: standard deviation of a coefficient before anything is known, far above any optics that is sold
-_STEP = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
-_BENDS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: standard deviations of third differences that are compared
+LINE_SPLINES = 28  # of 25 knots: lenses and focal planes bend over a twentieth of the line, or more slowly
+_COEFFICIENT_SIGMA = (
+    3.0  # px: standard deviation of a coefficient before anything is known, far above any optics that is sold
+)
+_STEP_SIGMA = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
+_ROUGHNESS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: standard deviations of third differences that are compared
 _CANDIDATES = 128  # places of a step that are looked at first; each turn looks at `_FINER` times as many around it
 _FINER = 12
 _MOST_STEPS = 40  # taken one by one; focal planes have up to some thirty detectors
-_TERMS = 5  # nuisances of a coordinate of a view
+_NUISANCES = 5  # nuisances of a coordinate of a view
 _LOOSE = 100.0  # px: standard deviation of nuisances, of which a block leaves some open
-_FINEST = 2e-3  # px: no tie points are better, whatever they say of each other
+_BEST_NOISE = 2e-3  # px: no tie points are better, whatever they say of each other
 # standard deviations up to which tie points count alike: were they weighted by size, what contradicts the curve so far
 # would count less, and a turn would keep a third of its error
 _CUT = 3.0
-COLUMNS = 400  # at which a curve is looked at
+CURVE_COLUMNS = 400  # at which a curve is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,9 @@ class _Eliminated:
         col, row = ties.place.T
         terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
         self.weight = weight
-        self._nuisances = self.both(terms, 2 * _TERMS * ties.view[:, None] + np.arange(_TERMS), _TERMS, self.num_views)
+        self._nuisances = self.both(
+            terms, 2 * _NUISANCES * ties.view[:, None] + np.arange(_NUISANCES), _NUISANCES, self.num_views
+        )
         self._residual = (residual * weight[:, None]).ravel()
         loose = sp.eye_array(self._nuisances.shape[1]) / _LOOSE**2
         normal = (self.product(self._nuisances) + loose).tocsc()
@@ -160,7 +164,7 @@ class _Eliminated:
             self.product(unknowns).toarray() - cross.T @ solved[:, :-1],
             self.gradient(unknowns) - cross.T @ solved[:, -1],
             float(off @ off - self._half @ solved[:, -1]),
-            float(self._residual.size - 3 * self.num_points - 2 * _TERMS * self.num_views),
+            float(self._residual.size - 3 * self.num_points - 2 * _NUISANCES * self.num_views),
         )
 
 
@@ -203,7 +207,7 @@ class Told:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class LineCurve:
     """Layout of a sensor's curve: splines of a coordinate, and steps at columns `edges` (C,), then of the other one."""
 
     width: int
@@ -212,17 +216,17 @@ class Curve:
     @property
     def size(self) -> int:
         """Number of unknowns of a coordinate."""
-        return SPLINES + len(self.edges)
+        return LINE_SPLINES + len(self.edges)
 
     def told(self, block: _Eliminated, col: Array) -> Told:
         """Return what a block tells, whose points are seen in columns (K,)."""
-        first, pieces = bspline_pieces(self.along(col), SPLINES)
-        detector = SPLINES + np.searchsorted(self.edges, col, side="right")
+        first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
+        detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
         place = np.column_stack([first[:, None] + np.arange(4), detector])
         found = block.told(block.both(np.column_stack([pieces.T, np.ones(len(col))]), place, self.size + 1))
         # of detectors each, to steps from each edge on
         steps = np.tri(len(self.edges) + 1, len(self.edges), -1)
-        change = la.block_diag(*2 * [la.block_diag(np.eye(SPLINES), steps)])
+        change = la.block_diag(*2 * [la.block_diag(np.eye(LINE_SPLINES), steps)])
         return replace(found, matrix=change.T @ found.matrix @ change, gradient=change.T @ found.gradient)
 
     def along(self, col: Array) -> Array:
@@ -232,26 +236,28 @@ class Curve:
     def basis(self, col: Array) -> Array:
         """Return the curve (n, size) by one unit of each unknown of a coordinate, at columns (n,)."""
         steps = (col[:, None] >= self.edges).astype(np.float64)
-        return np.concatenate([bsplines(self.along(col), SPLINES).T, steps], axis=1)
+        return np.concatenate([bsplines(self.along(col), LINE_SPLINES).T, steps], axis=1)
 
     def prior(self, bend: float) -> Array:
         """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
-        rough = np.diff(np.eye(SPLINES), n=3, axis=0) / bend
-        smooth = rough.T @ rough + np.eye(SPLINES) / _OPEN**2
-        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / _STEP**2)])
+        rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
+        smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
+        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / _STEP_SIGMA**2)])
 
     @cached_property
     def columns(self) -> Array:
-        """Columns at which the curve is looked at (`COLUMNS`,), evenly spread."""
-        return (np.arange(COLUMNS) + 0.5) * self.width / COLUMNS - 0.5
+        """Columns at which the curve is looked at (`CURVE_COLUMNS`,), evenly spread."""
+        return (np.arange(CURVE_COLUMNS) + 0.5) * self.width / CURVE_COLUMNS - 0.5
 
     @cached_property
     def bent(self) -> Array:
         """(n, n) What takes a constant and a slope off the unknowns: splines make both exactly."""
-        lines = np.stack([np.ones(SPLINES), (np.arange(SPLINES) - 1.0) * 2.0 / (SPLINES - 3) - 1.0], axis=1)
-        straight = np.stack([np.ones(COLUMNS), self.along(self.columns)], axis=1)
+        lines = np.stack(
+            [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
+        )
+        straight = np.stack([np.ones(CURVE_COLUMNS), self.along(self.columns)], axis=1)
         one = np.eye(self.size)
-        one[:SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
+        one[:LINE_SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
         return np.asarray(la.block_diag(one, one))
 
     def sizes(self, unknowns: Array) -> Array:
@@ -267,7 +273,7 @@ class Curve:
         """Return the correction with unknowns (n,)."""
         col, row = unknowns.reshape(2, -1)
         both = np.stack([col, row], axis=1)
-        return ColumnSpline(self.width, both[:SPLINES], self.edges, both[SPLINES:])
+        return ColumnSpline(self.width, both[:LINE_SPLINES], self.edges, both[LINE_SPLINES:])
 
 
 def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
@@ -282,7 +288,7 @@ def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
         weight = np.minimum(1.0, _CUT * spread / np.maximum(off, 1e-9)) ** 2
         left = _Eliminated(ties, residual, weight).left()
     noise = np.sqrt((weight**2 * (left**2).sum(axis=1)).sum() / (weight**2 * 2.0 * free).sum())
-    return _Eliminated(ties, ties.residual, weight / max(noise, _FINEST))
+    return _Eliminated(ties, ties.residual, weight / max(noise, _BEST_NOISE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +306,7 @@ class Calibration:
         """Independent errors of the curve, each by one standard deviation, the largest first."""
         size, vectors = la.eigh(self.covariance)
         kept = np.flatnonzero(size > SLIGHT * size.sum())[::-1]
-        curve = Curve(self.spline.width, self.spline.edges)
+        curve = LineCurve(self.spline.width, self.spline.edges)
         return tuple(curve.spline(vectors[:, i] * np.sqrt(size[i])) for i in kept)
 
 
@@ -341,7 +347,7 @@ class Learnt:
 
     Parameters
     ----------
-    curve : Curve, its layout
+    curve : LineCurve, its layout
     unknowns, covariance : (n,), (n, n), without a constant and a slope
     gain : (R,), what the curve of the other blocks takes off each block's cost, in variances of its noise
     rms : (float, float), of blocks' residuals a degree of freedom over their noise, without and with that curve
@@ -351,7 +357,7 @@ class Learnt:
         much more probable that is than that it stays [nats]
     """
 
-    curve: Curve
+    curve: LineCurve
     unknowns: Array
     covariance: Array
     gain: Array
@@ -379,14 +385,14 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
         raise InputError(f"{len(blocks)} blocks of images of {len(widths)} widths: three of one are needed at least")
     width = float(widths.pop())
     spacing, around = width / _CANDIDATES, np.zeros(0)
-    spline, bend = None, float(_BENDS[len(_BENDS) // 2])
+    spline, bend = None, float(_ROUGHNESS[len(_ROUGHNESS) // 2])
     places = np.arange(1, _CANDIDATES) * spacing
     for turn in range(STEPS):
-        candidates = Curve(int(width), np.unique(np.round(places)) - 0.5)
+        candidates = LineCurve(int(width), np.unique(np.round(places)) - 0.5)
         weights = [weighted(block, spline) for block in blocks]
         total = Told.total([candidates.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)])
         chosen, bend = _best(total, candidates)
-        curve = Curve(int(width), np.sort(candidates.edges[chosen]))
+        curve = LineCurve(int(width), np.sort(candidates.edges[chosen]))
         told = [curve.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)]
         spline = curve.spline(Told.total(told).solved(curve.prior(bend))[0])
         if turn + 1 < STEPS:
@@ -397,18 +403,18 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
     return _judged(curve, told, curve.prior(bend), noise)
 
 
-def _best(total: Told, curve: Curve) -> tuple[list[int], float]:
+def _best(total: Told, curve: LineCurve) -> tuple[list[int], float]:
     """Return which steps to take, and the size of third differences, that make the data most probable."""
-    found = [_forward(total, curve, float(bend)) for bend in _BENDS]
+    found = [_forward(total, curve, float(bend)) for bend in _ROUGHNESS]
     best = max(range(len(found)), key=lambda i: found[i][1])
-    return found[best][0], float(_BENDS[best])
+    return found[best][0], float(_ROUGHNESS[best])
 
 
-def _forward(total: Told, curve: Curve, bend: float) -> tuple[list[int], float]:
+def _forward(total: Told, curve: LineCurve, bend: float) -> tuple[list[int], float]:
     """Return the steps that are taken one by one while each makes the data clearly more probable, and how probable."""
     size, count = curve.size, len(curve.edges)
-    smooth = np.r_[0:SPLINES, size : size + SPLINES]
-    steps = np.r_[SPLINES:size, size + SPLINES : 2 * size]
+    smooth = np.r_[0:LINE_SPLINES, size : size + LINE_SPLINES]
+    steps = np.r_[LINE_SPLINES:size, size + LINE_SPLINES : 2 * size]
     prior = curve.prior(bend)[np.ix_(smooth, smooth)]
     alone = Told(total.matrix[np.ix_(smooth, smooth)], total.gradient[smooth], 0.0, 0.0)
     (found, _, evidence), cross = alone.solved(prior), total.matrix[np.ix_(smooth, steps)]
@@ -416,10 +422,10 @@ def _forward(total: Told, curve: Curve, bend: float) -> tuple[list[int], float]:
     gradient, chosen, pairs = total.gradient[steps] + cross.T @ found, list[int](), np.arange(count)
     while count and len(chosen) < _MOST_STEPS:
         own = np.stack([pairs, pairs + count], axis=1)
-        blocks = matrix[own[:, :, None], own[:, None, :]] + np.eye(2) / _STEP**2
+        blocks = matrix[own[:, :, None], own[:, None, :]] + np.eye(2) / _STEP_SIGMA**2
         pull = gradient[own]
         gains = 0.5 * np.einsum("ni,ni->n", pull, np.linalg.solve(blocks, pull[..., None])[..., 0])
-        gains -= 0.5 * np.linalg.slogdet(blocks * _STEP**2)[1] + np.log(count)
+        gains -= 0.5 * np.linalg.slogdet(blocks * _STEP_SIGMA**2)[1] + np.log(count)
         best = int(np.argmax(gains))
         if not gains[best] > SURE:
             break
@@ -431,11 +437,11 @@ def _forward(total: Told, curve: Curve, bend: float) -> tuple[list[int], float]:
     return chosen, evidence
 
 
-def _judged(curve: Curve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
+def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
     """Return the curve with what blocks say of each other."""
     total = Told.total(told)
     at, halves = _split(told, prior)
-    scatter = _scatter(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
+    scatter = _between_blocks(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
     told = [one.times(1.0 / scatter) for one in told]
     total = Told.total(told)
     found, covariance, evidence = total.solved(prior)
@@ -458,7 +464,7 @@ def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]
     return best[1:]
 
 
-def _scatter(told: Sequence[Told], curves: Sequence[Array], total: Told, prior: Array) -> float:
+def _between_blocks(told: Sequence[Told], curves: Sequence[Array], total: Told, prior: Array) -> float:
     """Return the variance of blocks' gradients at a curve over that of their noise; what a view shares is in it."""
     covariance, seen, expected = total.solved(prior)[1], 0.0, 0.0
     for one, curve in zip(told, curves, strict=True):
@@ -469,7 +475,7 @@ def _scatter(told: Sequence[Told], curves: Sequence[Array], total: Told, prior: 
     return max(seen / max(expected, 1.0), ROUNDING)
 
 
-def amplitude(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
+def share_shown(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
     """Return how much of a curve the tie points of a block show, 1: all of it, and its standard deviation."""
     block = weighted(ties, spline)
     shown = spline.at(ties.xy[:, 0])

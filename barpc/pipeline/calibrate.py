@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment
-from barpc.ba.calibration import SPLINES, Calibration, Learnt, SensorTies, amplitude, learn
+from barpc.ba.calibration import LINE_SPLINES, Calibration, Learnt, SensorTies, learn, share_shown
 from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
 from barpc.base.errors import InputError, RpcError, listed, plain
@@ -32,11 +32,11 @@ from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
 
 logger = logging.getLogger(__name__)
 
-SCHEMA = "barpc calibration 1"
+CALIBRATION_SCHEMA = "barpc calibration 1"
 SUFFIX = ".cal"
 _FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
 _MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
-_LARGEST = 1e3  # px: no curve is larger
+_ABSURD = 1e3  # px: no curve is larger
 _FLAT = 30.0  # deg: rows that run within so much of each other are of one direction
 
 
@@ -94,10 +94,10 @@ def calibrate(
     return content
 
 
-_Opened = tuple[Earlier, list[View], Sequence[SensorModel], list[str]]
+_OpenedRun = tuple[Earlier, list[View], Sequence[SensorModel], list[str]]
 
 
-def _images_of(folder: Path) -> _Opened:
+def _images_of(folder: Path) -> _OpenedRun:
     """Return a run, its images with their corrected cameras, and the sensors that they state."""
     earlier, summary = Earlier.open(folder), read_summary(folder)
     refuse_edited(folder, [table_path(folder, name) for name in ("observations.csv", "residuals.csv")])
@@ -196,7 +196,7 @@ def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Se
     rows = np.tril_indices(len(learnt.unknowns))
     dates = [one.ties.date for one in found if one.ties.date]
     return {
-        "schema": SCHEMA,
+        "schema": CALIBRATION_SCHEMA,
         "barpc": __version__,
         "sensor": name,
         "columns": spline.width,
@@ -223,19 +223,19 @@ def read_calibration(path: str | Path) -> Calibration:
     """Read a file of `calibrate`; InputError where it is none, or damaged."""
     found = read_json(path, CALIBRATION)
     schema = found.get("schema") if isinstance(found, dict) else None
-    if schema != SCHEMA:
-        raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({SCHEMA})")
+    if schema != CALIBRATION_SCHEMA:
+        raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({CALIBRATION_SCHEMA})")
     try:
         edges, steps = np.array(found["edges"], dtype=np.float64), np.array(found["steps_px"], dtype=np.float64)
         coeffs, width = np.array(found["coefficients_px"], dtype=np.float64), found["columns"]
-        if type(width) is not int or not isinstance(found["sensor"], str) or coeffs.shape != (SPLINES, 2):
+        if type(width) is not int or not isinstance(found["sensor"], str) or coeffs.shape != (LINE_SPLINES, 2):
             raise ValueError("its columns, sensor or coefficients are none")
         spline = ColumnSpline(width, coeffs, edges, steps.reshape(-1, 2))
-        size = 2 * (SPLINES + len(edges))
+        size = 2 * (LINE_SPLINES + len(edges))
         rows, covariance = np.tril_indices(size), np.zeros((size, size))
         covariance[rows] = np.array(found["covariance_px2"], dtype=np.float64)
         covariance += np.tril(covariance, -1).T
-        if not (np.abs(spline.coeffs) < _LARGEST).all() or not (np.abs(spline.steps) < _LARGEST).all():
+        if not (np.abs(spline.coeffs) < _ABSURD).all() or not (np.abs(spline.steps) < _ABSURD).all():
             raise ValueError("a distortion that is absurdly large")
         if not (np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
             raise ValueError("its covariance is none")
@@ -296,7 +296,7 @@ def _own(view: View, sensor: str, given: Mapping[str, Calibration]) -> Calibrati
 def refuse_strange(run: Run, adjustment: Adjustment) -> None:
     """Raise InputError where the tie points of a run contradict a calibration that it was adjusted with."""
     for used, ties in _ties_by_calibration(run, adjustment):
-        shown, sigma = amplitude(ties, used.spline)
+        shown, sigma = share_shown(ties, used.spline)
         logger.info("%s: tie points show %.2f +- %.2f of it", used.path, shown, sigma)
         if shown < 0.5 and 1.0 - shown > CRITICAL * sigma:
             raise InputError(

@@ -336,7 +336,7 @@ def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
     return Added(name, len(earlier.images), met, beyond, ranked[0], floor, written)
 
 
-def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> Corrected:
+def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> CorrectedViews:
     """Return the images that move beside those `done`, as `corrected_views` does."""
     assert run.added is not None
     earlier: Earlier = run.earlier
@@ -345,10 +345,10 @@ def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[s
     return corrected_views(there, grown, hosts) if there else ([], (), ())
 
 
-Corrected = tuple[list[View], Sequence[SensorModel], Sequence[Camera]]
+CorrectedViews = tuple[list[View], Sequence[SensorModel], Sequence[Camera]]
 
 
-def corrected_views(images: Sequence[Known], block: BlockPrior, hosts: Sequence[str] = ()) -> Corrected:
+def corrected_views(images: Sequence[Known], block: BlockPrior, hosts: Sequence[str] = ()) -> CorrectedViews:
     """Return images of a run as delivered, their corrected cameras by its block, and where the delivered came from."""
     loaded = load_views([image.spec for image in images], min_views=1, distinct=False, hosts=hosts)
     names = {image.path: image.name for image in images}

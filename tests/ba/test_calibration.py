@@ -12,12 +12,12 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.calibration import (
     Calibration,
     CommonErrors,
-    Curve,
     Learnt,
+    LineCurve,
     SensorTies,
     _Eliminated,
-    amplitude,
     learn,
+    share_shown,
 )
 from barpc.base.errors import InputError
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline
@@ -41,7 +41,7 @@ def test_points_and_nuisances_are_eliminated_as_a_dense_solution_does() -> None:
     rng = np.random.default_rng(1)
     made = ties(scene(any_looks(3, rng), Sensor.made("waves", 1, size=SIZE), rng, 60, size=SIZE))
     count, points, views = len(made.view), int(made.point.max()) + 1, int(made.view.max()) + 1
-    weight, curve = rng.uniform(5, 10, count), Curve(SIZE[0], np.array([1500.5, 4200.5]))
+    weight, curve = rng.uniform(5, 10, count), LineCurve(SIZE[0], np.array([1500.5, 4200.5]))
     told = curve.told(_Eliminated(made, made.residual, weight), made.xy[:, 0])
     col, row = made.place.T
     terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
@@ -127,9 +127,9 @@ def test_a_block_shows_its_own_curve_whole_and_none_of_another(found: Learnt, se
     for seed in range(3):
         rng = np.random.default_rng(seed + 50)
         looks = any_looks(3, rng)
-        shown, sigma = amplitude(ties(scene(looks, sensor, rng, 700, size=SIZE)), found.spline)
+        shown, sigma = share_shown(ties(scene(looks, sensor, rng, 700, size=SIZE)), found.spline)
         assert abs(shown - 1.0) < 5.0 * sigma + 0.1
-        shown, sigma = amplitude(ties(scene(looks, mirrored, rng, 700, size=SIZE)), found.spline)
+        shown, sigma = share_shown(ties(scene(looks, mirrored, rng, 700, size=SIZE)), found.spline)
         assert shown < 0.5
         assert 1.0 - shown > 4.0 * sigma
 

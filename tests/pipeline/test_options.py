@@ -19,6 +19,7 @@ from barpc.base.errors import BarpcError, FitError, InputError, OutputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import FitOptions
 from barpc.pipeline import AdjustResult, RunOptions, adjust
+from barpc.pipeline.calibrate import CALIBRATION_SCHEMA
 from barpc.tie import TieOptions
 from tests.pipeline.known import part
 from tests.rasters.test_dem import write_dem, write_geoid
@@ -369,13 +370,29 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
         RunOptions(allow_remote=("a b",))
 
 
+def calibration(run: Run, out: Path, scene: Path) -> None:  # what it does: test_calibrate
+    width, path = run.plain.run.views[0].size[0], scene / "line.cal"
+    text = {"schema": CALIBRATION_SCHEMA, "sensor": "A", "columns": width, "edges": [], "steps_px": []}
+    text |= {
+        "coefficients_px": [[0.0, 0.0]] * 28,
+        "covariance_px2": [1e-4 * (i == j) for i in range(56) for j in range(i + 1)],
+    }
+    path.write_text(json.dumps(text))
+    found = run("b", calibration=str(path), stop_after="adjustment")
+    np.testing.assert_allclose(found.adjustment.params, run.plain.adjustment.params, atol=1e-9)
+    assert (found.adjustment.covariance.variances() > run.plain.adjustment.covariance.variances()).all()
+    path.write_text(json.dumps(text | {"columns": width + 1}))
+    with pytest.raises(InputError, match=f"of {width + 1} columns"):
+        run("c", calibration=str(path))
+
+
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
     "grids": grids, "resample": resample,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
     "check_points": check_points,
-    "add_to": add_to, "update": update, "dem": dem, "geoid": geoid, "heights": heights,
+    "add_to": add_to, "update": update, "calibration": calibration, "dem": dem, "geoid": geoid, "heights": heights,
     "reference": reference, "reference_sigma": reference_sigma,
     "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
 }  # fmt: skip
@@ -394,6 +411,7 @@ tests/remote and tests/reliability, or beside them: matches_only, reference_sigm
 
 
 SLOW = (
+    "calibration",
     "gcp_crs",
     "reference_sigma",
     "stop_after",
