@@ -44,7 +44,7 @@ def many(value: float) -> str:
 
 def rows() -> list[tuple[str, str]]:
     """What is read, and what of it is refused beyond."""
-    bounded = (safe_io.RPC_FILE, safe_io.GEOJSON, safe_io.OPTIONS, safe_io.SUMMARY)
+    bounded = (safe_io.RPC_FILE, safe_io.GEOJSON, safe_io.OPTIONS, safe_io.CALIBRATION, safe_io.SUMMARY)
     unpacked = f"packed, unpacked, and as numbers of {safe_io.BYTES_PER_NUMBER} bytes"
     return [
         *((kind.words, size(kind.most)) for kind in bounded),

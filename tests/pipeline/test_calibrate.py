@@ -14,16 +14,18 @@ import rasterio
 from click.testing import CliRunner, Result
 
 import barpc
+from barpc.ba.calibration import SensorTies, learn
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import read_calibration
+from barpc.pipeline.calibrate import _FinishedRun, _refuse_unsure, _row_direction, read_calibration
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio.carried import put_tag
 from barpc.sensor.rpc import RPC
+from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, scene
 
 SIZE = (4000, 3000)
@@ -227,3 +229,16 @@ def test_a_damaged_calibration_is_one_line(text: str, words: str, tmp_path: Path
     with pytest.raises(InputError, match=words) as caught:
         read_calibration(path)
     assert str(path) in str(caught.value)
+
+
+def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Sensor) -> None:
+    """Pairs of one track, all of the same: along their epipolar lines, which are their rows, nothing is told."""
+    rng, found = np.random.default_rng(4), []
+    for i in range(4):
+        made = scene([Look(12.0, 12.0), Look(12.0, 192.0)], line, rng, 250, size=SIZE)
+        ties = SensorTies.of(f"run{i}", made.views, made.tracks, made.cameras, made.ground)
+        directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
+        found.append(_FinishedRun(Path(f"run{i}"), ties, directions, 2))
+    assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
+    with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):
+        _refuse_unsure("A", learn([one.ties for one in found]), found)
