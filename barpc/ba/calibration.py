@@ -1,12 +1,12 @@
-"""What one sensor does in every image, from the tie points of many finished blocks.
+"""Interior distortion and detector steps of one sensor, from the tie points of many finished blocks.
 
 The detector line of a pushbroom stands in the same columns of all its images: x = P(X) + c(col), where c is a spline
 of the column with steps where another detector begins. One block does not tell c along its epipolar lines; blocks of
 other directions do. Every view has nuisances, 1, col, row, col row and row^2 of either coordinate: what rotations,
-drifts and orbits do. So c is known beside a constant and a slope, which a camera's correction holds, and has neither.
+drifts and orbits do. So c is estimated beside a constant and a slope, which a camera's correction holds, and has neither.
 
-Points are eliminated, then nuisances: of every block the normal equations of c are left, and what is asked afterwards,
-of blocks left out or of those before and after a day, is a sum of these.
+Points are eliminated, then nuisances: every block leaves normal equations of c. Tests on blocks left out, or on those
+before and after a day, are sums of these.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class SensorTies:
 
     Parameters
     ----------
-    name, date : str, the block; its first day (ISO 8601), empty where nobody says
+    name, date : str, the block; its first day (ISO 8601), empty where not stated
     width : int, columns of every image
     view, point : (K,), indices
     xy : (K, 2), where a point is seen, col, row [px]
@@ -101,7 +101,7 @@ class SensorTies:
 
 
 class _Eliminated:
-    """A block, weighted by (K,) [1/px], with points and nuisances eliminated from what is asked of it."""
+    """A block, weighted by (K,) [1/px], with points and nuisances eliminated."""
 
     def __init__(self, ties: SensorTies, residual: Array, weight: Array) -> None:
         count, self.num_points, self.num_views = len(ties.view), ties.point.max() + 1, ties.view.max() + 1
@@ -156,7 +156,7 @@ class _Eliminated:
         return self._off_points(moved).reshape(-1, 2) / self.weight[:, None]
 
     def told(self, unknowns: sp.csr_array) -> Told:
-        """Return what the block tells of unknowns."""
+        """Return the block's normal equations of the unknowns."""
         cross = self.product(self._nuisances, unknowns).toarray()
         solved = self._solve(np.column_stack([cross, self._half]))
         off = self._off_points(self._residual)
@@ -186,7 +186,7 @@ class Told:
 
     @staticmethod
     def total(several: Sequence[Told]) -> Told:
-        """Return what several blocks tell."""
+        """Return the sum of several blocks' equations."""
         parts = zip(*((one.matrix, one.gradient, one.cost, one.freedom) for one in several), strict=True)
         return Told(*(sum(part) for part in parts))
 
@@ -202,7 +202,7 @@ class Told:
         return found, la.cho_solve(factor, np.eye(len(found))), float(-0.5 * self.gradient @ found - lost)
 
     def gain(self, unknowns: Array) -> float:
-        """Return what unknowns (n,) take off the cost."""
+        """Return the reduction of the cost by unknowns (n,)."""
         return float(-(2.0 * self.gradient + self.matrix @ unknowns) @ unknowns)
 
 
@@ -219,7 +219,7 @@ class LineCurve:
         return LINE_SPLINES + len(self.edges)
 
     def told(self, block: _Eliminated, col: Array) -> Told:
-        """Return what a block tells, whose points are seen in columns (K,)."""
+        """Return a block's normal equations, of points at columns (K,)."""
         first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
         detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
         place = np.column_stack([first[:, None] + np.arange(4), detector])
@@ -277,7 +277,7 @@ class LineCurve:
 
 
 def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
-    """Return a block beside a curve that is known so far, its tie points weighted by what is left of them."""
+    """Return a block linearised at the present curve, its tie points weighted by their residuals."""
     residual = ties.residual if curve is None else ties.residual + curve.at(ties.xy[:, 0])
     count = np.bincount(ties.point)[ties.point]
     free = (2.0 * count - 3.0) / (2.0 * count)  # of a track's coordinates three go into its point
@@ -317,7 +317,7 @@ class CommonErrors:
     of_view: tuple[Calibration | None, ...]
 
     def moved(self, view: IntArray, col: Array) -> Array:
-        """Return how far (k, K, 2) [px] each error by its standard deviation moves what is seen in columns (K,)."""
+        """Return the displacements (k, K, 2) [px] at columns (K,) by one standard deviation of each error."""
         found = []
         for used in {one.sha256: one for one in self.of_view if one is not None}.values():
             rows = np.array([one is not None and one.sha256 == used.sha256 for one in self.of_view])[view]
@@ -325,7 +325,7 @@ class CommonErrors:
         return np.array(found).reshape(-1, len(col), 2)
 
     def by_unknowns(self, problem: Problem, state: tuple[Array, Array, Array], covariance: Covariance) -> Array:
-        """Return what unknowns (N q, k) do with each error by its standard deviation, at the end of an adjustment.
+        """Return the response of the unknowns (N q, k) to one standard deviation of each error, after an adjustment.
 
         `state`: unknowns (N, q), points (P, 3) [m] and weights (K,) [1/px].
         """
@@ -438,7 +438,7 @@ def _forward(total: Told, curve: LineCurve, bend: float) -> tuple[list[int], flo
 
 
 def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
-    """Return the curve with what blocks say of each other."""
+    """Return the curve with its tests between blocks."""
     total = Told.total(told)
     at, halves = _split(told, prior)
     scatter = _between_blocks(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
@@ -456,7 +456,7 @@ def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) 
 
 
 def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]]:
-    """Return where blocks are best told into those before and after, and the curves of both."""
+    """Return the split of the blocks by time with the largest evidence, and the curves of both parts."""
     best = (-np.inf, 1, (np.zeros(0), np.zeros(0)))
     for at in range(1, len(told)):
         (first, _, one), (second, _, other) = (Told.total(part).solved(prior) for part in (told[:at], told[at:]))

@@ -44,7 +44,7 @@ COMMANDS = {
     "convert": "Write RPCs in other formats, cut out windows, deliver images.",
     "export": "Export a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
-    "calibrate": "Learn from finished runs what a sensor does in every image.",
+    "calibrate": "Estimate a sensor's interior distortion from finished runs.",
     "verify": "Whether inputs, outputs and cameras of a run are unchanged.",
     "report": "Make report.html of a finished run again, or compare two runs.",
 }

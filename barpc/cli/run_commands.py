@@ -137,10 +137,10 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
 @click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
 @click.pass_obj
 def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
-    r"""Learn from finished runs what one sensor does in every image: distortion by column, and steps of detectors.
+    r"""Estimate the interior distortion and detector steps of one sensor from finished runs.
 
-    `barpc adjust --calibration FILE` takes it off. Exit code 1, and nothing written, where it changes with time,
-    directions do not suffice, or runs that were left out are not met better.
+    `barpc adjust --calibration FILE` corrects for it. Exit code 1, and nothing written, where it changes with time,
+    directions do not suffice, or the residuals of runs left out do not improve.
 
     \b
     Example:
@@ -154,9 +154,9 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
     elif not obj["quiet"]:
         (col, row), (of_col, of_row) = found["size_px"], found["sigma_px"]
         better = sum(run["gain"] > 0 for run in found["runs"])
-        tell(f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, known to {of_col:.4f} and "
-             f"{of_row:.4f} px; {len(found['edges'])} steps; {better} of {len(runs)} runs left out in turn are met "
-             "better")  # fmt: skip
+        tell(f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, standard deviations {of_col:.4f} and "
+             f"{of_row:.4f} px; {len(found['edges'])} steps; of {len(runs)} runs left out in turn the residuals of "
+             f"{better} improve")  # fmt: skip
         tell(out)
     return 0
 

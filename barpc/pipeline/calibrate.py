@@ -1,4 +1,4 @@
-"""`calibrate`: what finished runs tell of a sensor, in a file; and such files for a run of its images."""
+"""Calibration of a sensor from finished runs (`calibrate`), and calibration files applied to a run of its images."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _FLAT = 30.0  # deg: rows that run within so much of each other are of one direc
 
 @dataclass(frozen=True, eq=False)
 class _FinishedRun:
-    """What a finished run tells of a sensor; the directions of its images' rows, clockwise from north [deg]."""
+    """A finished run's information on a sensor, and the directions of its images' rows, clockwise from north [deg]."""
 
     folder: Path
     ties: SensorTies
@@ -53,25 +53,25 @@ class _FinishedRun:
 def calibrate(
     runs: Sequence[str | Path], out: str | Path, sensor: str | None = None, *, overwrite: bool = False
 ) -> dict[str, Any]:
-    """Learn what one sensor does in every image from finished runs, and write it to a file that `adjust` applies.
+    """Estimate the interior distortion of one sensor from finished runs, for `adjust` to apply.
 
     Parameters
     ----------
     runs : sequence of path, three finished runs or more, whose images still are where they were
     out : path, the file to write (JSON)
     sensor : str, optional
-        Its name. Images that state another one take no part; without, all images must state the same.
+        Its name. Images that state another one are excluded; without, all images must state the same.
     overwrite : bool, replace the file
 
     Returns
     -------
-    dict, what the file holds
+    dict, the content of the file
 
     Raises
     ------
     InputError
-        Runs that cannot be used, or that tell no curve: it changes with time, directions do not suffice, or runs that
-        were left out are not met better. Nothing is written then.
+        Runs that cannot be used or that determine no curve: it changes with time, directions do not suffice, or the
+        residuals of runs left out do not improve. Nothing is written then.
     """
     out = Path(out)
     refuse_existing(out, overwrite)
@@ -115,7 +115,7 @@ def _stated(view: View, source: Camera) -> str:
 
 
 def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
-    """Return the sensor that is meant; InputError where it is not one."""
+    """Return the name of the one sensor; InputError where there are several or none."""
     names = sorted({name for run in stated for name in run})
     if given is not None:
         if given not in names and any(names):
@@ -153,7 +153,7 @@ def _finished_run(
 
 
 def _row_direction(view: View, sensor: SensorModel) -> float:
-    """Return where rows advance over the ground, clockwise from north [deg]."""
+    """Return the directions of rows over the ground, clockwise from north [deg]."""
     middle = (view.size[0] - 1) / 2
     first, last = sensor.localize(np.array([[middle, 0.0], [middle, view.size[1] - 1.0]]), np.full(2, view.altitude))
     east, north = ((last - first) * metres_per_unit(first))[:2]
@@ -183,12 +183,12 @@ def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> 
         more = (
             f"whose rows run across those of these, near {(mean + 90) % 180:.0f} degrees of north" if flat else "more"
         )
-        raise InputError(f"{name}: a distortion of {size:.3f} px is known to {sigma:.3f} px by these runs only: runs "
+        raise InputError(f"{name}: a distortion of {size:.3f} px has a standard deviation of {sigma:.3f} px by these runs: runs "
                          f"{more} are needed")  # fmt: skip
     better = int((learnt.gain > 0).sum())
     if not (learnt.gain.sum() > 2.0 * SURE and 2 * better > len(found)):
-        raise InputError(f"{name}: of {len(found)} runs left out in turn {better} are met better by the distortion "
-                         "that the others show: it is none that these images share")  # fmt: skip
+        raise InputError(f"{name}: the distortion estimated from the others improves the residuals of only {better} of "
+                         f"{len(found)} runs left out in turn: these images do not share it")  # fmt: skip
 
 
 def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Sequence[str]) -> dict[str, Any]:

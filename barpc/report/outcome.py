@@ -128,7 +128,7 @@ class Run:
         return tuple(Calibrated(one, used[v.name].spline) if v.name in used else one for v, one in pairs)
 
     def undistorted(self, view: IntArray, xy: Array) -> Array:
-        """Return where cameras without a calibration have what is seen at xy (K, 2) [px] in views (K,)."""
+        """Return image positions (K, 2) [px] of views (K,) as cameras without a calibration have them."""
         out = xy.copy()
         for v, one in enumerate(self.views):
             if one.name in self.calibrated:

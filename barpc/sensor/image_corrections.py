@@ -264,7 +264,7 @@ class Splined(Displaced):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ColumnSpline(Frozen):
-    """A displacement that goes with the column alone: what a detector line does in every image that it takes.
+    """Displacement by column alone: the distortion and detector steps of a sensor, alike in all its images.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ class ColumnSpline(Frozen):
 
 @dataclass(frozen=True)
 class Calibrated(Displaced):
-    """`sensor` with its image points displaced by what its detector line does; itself a `SensorModel`."""
+    """A sensor model with its image points displaced by a column correction; itself a `SensorModel`."""
 
     correction: ColumnSpline  # what is added to its image points
 
