@@ -3,7 +3,8 @@
 The detector line of a pushbroom stands in the same columns of all its images: x = P(X) + c(col), where c is a spline
 of the column with steps where another detector begins. One block does not tell c along its epipolar lines; blocks of
 other directions do. Every view has nuisances, 1, col, row, col row and row^2 of either coordinate: what rotations,
-drifts and orbits do. So c is estimated beside a constant and a slope, which a camera's correction holds, and has neither.
+drifts and orbits do. So c is estimated beside a constant and a slope, which
+a camera's correction holds, and has neither.
 
 Points are eliminated, then nuisances: every block leaves normal equations of c. Tests on blocks left out, or on those
 before and after a day, are sums of these.

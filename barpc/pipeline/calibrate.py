@@ -183,8 +183,8 @@ def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> 
         more = (
             f"whose rows run across those of these, near {(mean + 90) % 180:.0f} degrees of north" if flat else "more"
         )
-        raise InputError(f"{name}: a distortion of {size:.3f} px has a standard deviation of {sigma:.3f} px by these runs: runs "
-                         f"{more} are needed")  # fmt: skip
+        raise InputError(f"{name}: a distortion of {size:.3f} px has a standard deviation of {sigma:.3f} px by these "
+                         f"runs: runs {more} are needed")  # fmt: skip
     better = int((learnt.gain > 0).sum())
     if not (learnt.gain.sum() > 2.0 * SURE and 2 * better > len(found)):
         raise InputError(f"{name}: the distortion estimated from the others improves the residuals of only {better} of "

@@ -165,7 +165,7 @@ def _sha(inputs: Mapping[str, Input], path: str) -> str:
 
 
 def refuse_edited(folder: Path, files: Sequence[Path]) -> None:
-    """Raise InputError where files of a run folder are not what the run wrote."""
+    """Raise InputError where files of a run folder have changed since the run wrote them."""
     if not os.path.lexists(folder / manifest.SUMS):
         raise InputError(f"{folder / manifest.SUMS}: missing, as of a run that was interrupted: run it again")
     sums = {name: sha for layer in manifest.read(folder)[1] for name, sha in layer.files.items()}
