@@ -53,7 +53,7 @@ def main() -> None:
 
             def write(run: Run = run, summary: Summary = summary, folder: str = folder) -> None:
                 for name, content in TABLES.items():
-                    Path(folder, name).write_bytes(content(run, summary))
+                    Path(folder, name).write_bytes(b"".join(content(run, summary)))
 
             tables_seconds, _ = seconds(write, options.repeats)
             page_seconds, html = seconds(lambda s=summary, f=folder: report_html(s, f), options.repeats)

@@ -155,8 +155,8 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     """Write the tables, report.html where jinja2 is there, and summary.json after them; return what that holds."""
     with workspace.stage("tables"):
         for name, content in TABLES.items():
-            with workspace.output(f"{FOLDER}/{name}") as partial:
-                partial.write_bytes(content(run, summary))
+            with workspace.output(f"{FOLDER}/{name}") as partial, partial.open("wb") as file:
+                file.writelines(content(run, summary))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
             workspace.write_text(GCP_FILE, gcps_geojson(run).decode())
     with workspace.stage(REPORT_STAGE):

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -21,9 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc import __version__
-from barpc.base.errors import InputError, plain
+from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, feature_collection, geojson_feature
-from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, Kind, parse_json, read_json, read_text
+from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, column, value_of
@@ -46,6 +46,7 @@ OBSERVATION_COLUMNS = ("view", "track", "col", "row", "col_before", "row_before"
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
 _BASE64 = r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z"
+_TOGETHER = 1 << 13  # rows of a table that are written, or read, at a time: 20 MB as numbers and texts of Python
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
@@ -68,34 +69,51 @@ def _per_track(run: Run) -> Array:
     return np.asarray(table[run.written_tracks])
 
 
-def _residuals_csv(run: Run, _: Summary) -> bytes:
-    rows = [
+def _csv(header: Sequence[str], lines: Iterable[str]) -> Iterator[bytes]:
+    """Yield a table, a part of its lines at a time."""
+    yield f"{','.join(header)}\n".encode()
+    rest = iter(lines)
+    while part := [*islice(rest, _TOGETHER)]:
+        yield "\n".join([*part, ""]).encode()
+
+
+def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of columns as Python's values."""
+    for start in range(0, len(columns[0]), _TOGETHER):
+        yield from zip(*(column[start : start + _TOGETHER].tolist() for column in columns), strict=True)
+
+
+def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
+    rows = (
         f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_rounded(before, 4)},{track:.0f}"
-        for lon, lat, alt, mean, count, before, track in _per_track(run).tolist()
-    ]
-    return "\n".join([",".join(RESIDUALS), *rows, ""]).encode()
+        for lon, lat, alt, mean, count, before, track in _rows(*_per_track(run).T)
+    )
+    return _csv(RESIDUALS, rows)
 
 
-def _observations_csv(run: Run, _: Summary) -> bytes:
-    tracks = run.tracks
+def _observations_csv(run: Run, _: Summary) -> Iterable[bytes]:
+    return _csv(OBSERVATION_COLUMNS, _observation_lines(run))
+
+
+def _observation_lines(run: Run) -> Iterator[str]:
+    tracks, names = run.tracks, [cell(view.name) for view in run.views]
     rows = np.flatnonzero(np.isin(tracks.point, run.written_tracks))
-    before = run.ties_before.residuals[rows]
-    after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals[rows]
-    numbers = np.column_stack([tracks.xy[rows], before, after])
-    names, whole = [cell(view.name) for view in run.views], np.isfinite(numbers).all(axis=1)
-    columns = (tracks.view[rows], tracks.point[rows], numbers, run.keep[rows], whole)
-    lines = [",".join(OBSERVATION_COLUMNS)]
-    for view, track, row, used, full in zip(*(part.tolist() for part in columns), strict=True):
-        text = _RESIDUAL_CELLS(*row) if full else ",".join(_rounded(value, 4) for value in row)
-        lines.append(f"{names[view]},{track},{text},{used:d}")
-    return "\n".join([*lines, ""]).encode()
+    for part in np.split(rows, range(_TOGETHER, len(rows), _TOGETHER)):
+        before = run.ties_before.residuals[part]
+        after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals[part]
+        numbers = np.column_stack([tracks.xy[part], before, after])
+        whole = np.asarray(np.isfinite(numbers).all(axis=1))
+        for view, track, row, used, full in _rows(
+            tracks.view[part], tracks.point[part], numbers, run.keep[part], whole
+        ):
+            text = _RESIDUAL_CELLS(*row) if full else ",".join(_rounded(value, 4) for value in row)
+            yield f"{names[view]},{track},{text},{used:d}"
 
 
-def _pairs_csv(_: Run, summary: Summary) -> bytes:
+def _pairs_csv(_: Run, summary: Summary) -> Iterable[bytes]:
     paths = PairEntry.CSV.split()
-    lines = [[path.replace(".", "_") + "_px" * ("." in path) for path in paths]]
-    lines += [[_formatted_cell(value_of(pair, path)) for path in paths] for pair in summary.pairs]
-    return "".join(",".join(line) + "\n" for line in lines).encode()
+    lines = (",".join(_formatted_cell(value_of(pair, path)) for path in paths) for pair in summary.pairs)
+    return _csv([path.replace(".", "_") + "_px" * ("." in path) for path in paths], lines)
 
 
 def _formatted_cell(value: str | float | None) -> str:
@@ -108,16 +126,16 @@ def _rounded(value: float | None, digits: int) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
-def _footprints_geojson(run: Run, summary: Summary) -> bytes:
+def _footprints_geojson(run: Run, summary: Summary) -> Iterable[bytes]:
     """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
     rings, features = footprints(run.after or run.before, [view.size for view in run.views], run.altitude), []
     for ring, entry in zip(np.round(rings, 9), summary.views, strict=True):
         properties = {key: getattr(entry, key) for key in ViewEntry.FOOTPRINT.split()}
         features.append(geojson_feature(ring, **properties, altitude_m=summary.altitude_m))
-    return (json.dumps(feature_collection(features)) + "\n").encode()
+    return [(json.dumps(feature_collection(features)) + "\n").encode()]
 
 
-def _points_ply(run: Run, _: Summary) -> bytes:
+def _points_ply(run: Run, _: Summary) -> Iterable[bytes]:
     """Return the tie points in metres east, north, up of an origin that the header states, binary."""
     rows = _per_track(run)
     origin = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
@@ -127,7 +145,7 @@ def _points_ply(run: Run, _: Summary) -> bytes:
     columns: dict[str, Any] = dict(zip("xyz", local.T, strict=True))
     columns |= {"mean_residual": rows[:, 3].astype(np.float32), "num_observations": rows[:, 4].astype(np.int32)}
     place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
-    return ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")
+    return [ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")]
 
 
 _PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar"}
@@ -162,14 +180,14 @@ def gcps_geojson(run: Run) -> bytes:
     return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
 
 
-TABLES: dict[str, Callable[[Run, Summary], bytes]] = {
+TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
     "residuals.csv": _residuals_csv,
     "observations.csv": _observations_csv,
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints_geojson,
     "points.ply": _points_ply,
 }
-"""File name -> its bytes, of a run and its summary."""
+"""File name -> the parts of its bytes, of a run and its summary."""
 SURFACE = "surface.json"
 """Two reliefs and two images on the surface for the report, of a run of which one was made, and which run (`run_key`).
 """
@@ -287,15 +305,15 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
         A table is missing or damaged; the message names it.
     """
     names = [view.name for view in summary.views]
-    outlines = _parse_file(place := table_path(folder, "footprints.geojson"), GEOJSON, _parse_outlines)
+    outlines = _parsed(place := table_path(folder, "footprints.geojson"), read_text(place, GEOJSON), _parse_outlines)
     if len(outlines) != len(names):
         raise InputError(f"{place}: {len(outlines)} outlines of {len(names)} images")
-    of_names = partial(_parse_observations, names=names)
-    observations = _parse_file(table_path(folder, "observations.csv"), TABLE, of_names)
-    points, tracks = _parse_file(table_path(folder, "residuals.csv"), TABLE, _parse_points)
+    observations = _parse_table(table_path(folder, "observations.csv"), partial(_parse_observations, names=names))
+    points, tracks = _parse_table(table_path(folder, "residuals.csv"), _parse_points)
     surface = table_path(folder, SURFACE)
     made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
-    shown = _parse_file(surface, SUMMARY, partial(_parse_surface, run=run_key(summary))) if made else ((), ())
+    of_run = partial(_parse_surface, run=run_key(summary))
+    shown = _parsed(surface, read_text(surface, SUMMARY), of_run) if made else ((), ())
     return RunFiles(summary, observations, points, tracks, outlines, *shown)
 
 
@@ -320,22 +338,31 @@ def _parse_surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple
     return reliefs, draped
 
 
-def _parse_file(path: Path, kind: Kind, parse: Any) -> Any:
-    text = read_text(path, kind)
+def _parse_table(path: Path, parse: Any) -> Any:
+    with opened_text(path, TABLE) as lines:
+        return _parsed(path, lines, parse)
+
+
+def _parsed(path: Path, text: Any, parse: Any) -> Any:
     try:
         return parse(text)
+    except (BarpcError, UnicodeDecodeError):
+        raise
     except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
         raise InputError(f"{path}: damaged ({plain(error)}); run the adjustment again") from error
 
 
-def _table_columns(text: str, header: Sequence[str]) -> list[list[str]]:
-    rows = csv.reader(io.StringIO(text, newline=""))
+def _table_columns(lines: Iterable[str], header: Sequence[str]) -> Iterator[list[tuple[str, ...]]]:
+    """Yield the columns of a table, a part of its rows at a time; at the end of none."""
+    rows = csv.reader(lines)
     if tuple(next(rows)) != tuple(header):
         raise ValueError(f"its columns are not {', '.join(header)}")
-    columns = [list(column) for column in zip(*rows, strict=True)]
-    if columns and len(columns) != len(header):
-        raise ValueError(f"rows of {len(columns)} cells")
-    return columns or [[] for _ in header]
+    while part := [*islice(rows, _TOGETHER)]:
+        columns = [*zip(*part, strict=True)]
+        if len(columns) != len(header):
+            raise ValueError(f"rows of {len(columns)} cells")
+        yield columns
+    yield [() for _ in header]
 
 
 def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
@@ -346,18 +373,21 @@ def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
     return table
 
 
-def _parse_observations(text: str, names: Sequence[str]) -> ObservationTable:
-    columns = _table_columns(text, OBSERVATION_COLUMNS)
-    index = {name: i for i, name in enumerate(names)}
-    view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
-    numbers = _floats(columns[2:8], 2)
-    used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
-    return ObservationTable(view, _track_numbers(columns[1]), numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+def _parse_observations(lines: Iterable[str], names: Sequence[str]) -> ObservationTable:
+    index, found = {name: i for i, name in enumerate(names)}, []
+    for columns in _table_columns(lines, OBSERVATION_COLUMNS):
+        view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
+        used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
+        found.append((view, _track_numbers(columns[1]), _floats(columns[2:8], 2), used))
+    view, track, numbers, used = map(np.concatenate, zip(*found, strict=True))
+    return ObservationTable(view, track, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
-def _parse_points(text: str) -> tuple[Array, IntArray]:
-    columns = _table_columns(text, RESIDUALS)
-    return _in_degrees(_floats(columns[:4], 3)), _track_numbers(columns[6])
+def _parse_points(lines: Iterable[str]) -> tuple[Array, IntArray]:
+    parts = _table_columns(lines, RESIDUALS)
+    found = [(_in_degrees(_floats(columns[:4], 3)), _track_numbers(columns[6])) for columns in parts]
+    points, tracks = map(np.concatenate, zip(*found, strict=True))
+    return points, tracks
 
 
 def _track_numbers(cells: Sequence[str]) -> IntArray:

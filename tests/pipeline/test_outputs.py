@@ -299,7 +299,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
 def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) -> None:
     """Tables, the page where it can be drawn, and the summary, in this order."""
     written = []
-    monkeypatch.setattr(outputs, "TABLES", {"a.csv": lambda run, summary: b"1", "b.csv": lambda run, summary: b"2"})
+    monkeypatch.setattr(outputs, "TABLES", {"a.csv": lambda run, summary: [b"1"], "b.csv": lambda run, summary: [b"2"]})
     monkeypatch.setattr(outputs, "can_render", lambda: page)
     monkeypatch.setattr(outputs, "report_html", lambda summary, folder: f"<p>{summary.of} in {folder.name}</p>")
     for method in ("write_text", "output"):

@@ -113,7 +113,25 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     assert again == summary
     assert json.dumps(json_form(again)) == json.dumps(block_run.summary)
     for name, content in TABLES.items():
-        assert content(run, again) == (block_run.folder / "tables" / name).read_bytes(), name
+        assert b"".join(content(run, again)) == (block_run.folder / "tables" / name).read_bytes(), name
+
+
+def test_tables_are_written_and_read_in_parts_of_any_size(block_run, monkeypatch):
+    rows = 7
+    tables, whole = block_run.folder / "tables", read_tables(block_run.record, block_run.folder)
+    assert len(whole.tracks) % rows
+    monkeypatch.setattr(modules, "_TOGETHER", rows)
+    for name, content in TABLES.items():
+        assert b"".join(content(block_run.run, block_run.record)) == (tables / name).read_bytes(), name
+    again = read_tables(block_run.record, block_run.folder)
+    assert (again.points == whole.points)[np.isfinite(whole.points)].all()
+    assert (again.tracks == whole.tracks).all()
+    for name in ("view", "track", "xy", "before", "used"):
+        assert (getattr(again.observations, name) == getattr(whole.observations, name)).all(), name
+    text = (tables / "residuals.csv").read_text().splitlines()
+    for lost in (1 + rows, 2 * rows):  # blank lines as many as a part has, or one
+        with pytest.raises(ValueError, match=r"cells|shorter|longer"):
+            _parse_points([*text[: 1 + rows], *[""] * lost, *text[1 + rows :]])
 
 
 def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
@@ -122,9 +140,10 @@ def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
     found = summary.tables
     assert not found.complete
     assert 50 < found.num_written_tracks <= 100
-    lines = TABLES["residuals.csv"](block_run.run, summary).decode().splitlines()
+    lines = b"".join(TABLES["residuals.csv"](block_run.run, summary)).decode().splitlines()
     assert len(lines) == found.num_written_tracks + 1
-    observed = {line.split(",")[1] for line in TABLES["observations.csv"](block_run.run, summary).decode().split()[1:]}
+    table = b"".join(TABLES["observations.csv"](block_run.run, summary)).decode()
+    observed = {line.split(",")[1] for line in table.split()[1:]}
     assert len(observed) == found.num_written_tracks
     assert block_run.summary["tables"]["complete"]
 
@@ -150,17 +169,17 @@ PLACES, PLACE = ",".join(RESIDUALS), "10,20,30,0.5,3,0.7,8"
 
 
 def test_observations_are_read_with_what_is_missing():
-    found = _parse_observations(f"{HEAD}\nB,4,1,2,3,4,5,6,0\n{ROW}\n", ["A", "B"])
+    found = _parse_observations([HEAD, "B,4,1,2,3,4,5,6,0", ROW], ["A", "B"])
     assert (found.view.tolist(), found.track.tolist(), found.used.tolist()) == ([1, 0], [4, 3], [False, True])
     assert found.xy.tolist() == [[1, 2], [1.5, 2.5]]
     assert found.before.tolist() == [[3, 4], [0.1, 0.2]]
     assert found.after[0].tolist() == [5, 6]
     assert np.isnan(found.after[1]).all()
-    assert len(_parse_observations(f"{HEAD}\n", ["A"]).view) == 0
+    assert len(_parse_observations([HEAD], ["A"]).view) == 0
 
 
 def test_places_are_read_with_their_numbers():
-    points, tracks = _parse_points(f"{PLACES}\n{PLACE}\n10,20,30,,3,,999999999999999999\n")
+    points, tracks = _parse_points([PLACES, PLACE, "10,20,30,,3,,999999999999999999"])
     assert points[0].tolist() == [10, 20, 30, 0.5]
     assert np.isnan(points[1, 3])
     assert tracks.tolist() == [8, 999999999999999999]
@@ -181,24 +200,24 @@ def test_places_are_read_with_their_numbers():
     ],
 )
 def test_an_observation_that_cannot_be_is_refused(row):
-    _parse_observations(f"{HEAD}\n{ROW}\n", ["A"])
+    _parse_observations([HEAD, ROW], ["A"])
     with pytest.raises((ValueError, LookupError)):
-        _parse_observations(f"{HEAD}\n{row}\n", ["A"])
+        _parse_observations([HEAD, row], ["A"])
 
 
 @pytest.mark.parametrize(
     "place", [(540.0, 90.0), (-540.0, -90.0), (540.1, 0.0), (-540.1, 0.0), (0.0, 90.1), (0.0, -90.1)]
 )
 def test_a_place_is_on_the_earth_up_to_a_turn_and_a_half(place):
-    text = f"{PLACES}\n{place[0]},{place[1]},30,0.5,3,0.7,8\n"
+    lines = [PLACES, f"{place[0]},{place[1]},30,0.5,3,0.7,8"]
     ring = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], list(place), [0, 0]]]}
     outline = json.dumps({"features": [{"geometry": ring}]})
     if abs(place[0]) <= 540 and abs(place[1]) <= 90:
-        assert len(_parse_points(text)[0]) == 1
+        assert len(_parse_points(lines)[0]) == 1
         assert len(_parse_outlines(outline)[0][0]) == 4
         return
     with pytest.raises(ValueError, match="no longitude and latitude"):
-        _parse_points(text)
+        _parse_points(lines)
     with pytest.raises(ValueError, match="no longitude and latitude"):
         _parse_outlines(outline)
 
@@ -219,8 +238,8 @@ def test_outlines_are_the_outer_rings():
 
 
 def test_a_table_with_other_columns_is_refused():
-    assert _table_columns("a,b\n1,2\n3,4\n", ("a", "b")) == [["1", "3"], ["2", "4"]]
-    assert _table_columns("a,b\n", ("a", "b")) == [[], []]
+    assert [*_table_columns(["a,b", "1,2", "3,4"], ("a", "b"))] == [[("1", "3"), ("2", "4")], [(), ()]]
+    assert [*_table_columns(["a,b"], ("a", "b"))] == [[(), ()]]
     wrong = {
         "a,c\n1,2\n": "columns are not a, b",
         "a,b\n1,2,3\n": "rows of 3 cells",
@@ -228,7 +247,7 @@ def test_a_table_with_other_columns_is_refused():
     }
     for text, said in wrong.items():
         with pytest.raises(ValueError, match=said):
-            _table_columns(text, ("a", "b"))
+            [*_table_columns(text.splitlines(), ("a", "b"))]
     assert _floats([["1", ""], ["", "1e12"]], 0)[1, 1] == 1e12
     assert _track_numbers(["0", "12"]).tolist() == [0, 12]
 
@@ -294,7 +313,7 @@ def test_a_point_cloud_across_the_antimeridian_is_in_one_place(antimeridian_run)
 
 def test_the_cloud_of_no_tie_point_is_empty(block_run, monkeypatch):
     monkeypatch.setattr(modules, "_per_track", lambda _: np.zeros((0, 7)))
-    data = TABLES["points.ply"](block_run.run, block_run.record)
+    data = b"".join(TABLES["points.ply"](block_run.run, block_run.record))
     assert b"element vertex 0\n" in data
     assert b"lon 0.000000000 lat 0.000000000 alt 0.0000" in data
     assert data.endswith(b"end_header\n")
