@@ -44,7 +44,12 @@ def template(name: str) -> Any:
 
     loader, undefined = jinja2.PackageLoader("barpc.report", ""), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=undefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader,
+        autoescape=True,
+        undefined=undefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        optimized=False,  # it is used once
     )
     environment.filters |= {"n": coordinate, "tally": tally}
     environment.filters |= {one.__name__: one for one in (counted, known, listed, metres)}

@@ -108,22 +108,26 @@ def _reader(kind: Any) -> Callable[[Any], Any] | None:
     return tuple if item is None else lambda values: tuple(map(item, values))
 
 
+_PLAIN = frozenset({str, int, bool, NoneType})
+
+
 def json_form(value: Any, keep: bool = False) -> Any:
     """Return the JSON form of a value: arrays as lists, records as mappings, numbers that are not finite as null.
 
     With `keep` as it is read from there: records stay what they are, lists become tuples.
     """
-    if isinstance(value, float) and not isinstance(value, np.generic):
+    kind: Any = type(value)
+    if kind is float:  # most values
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
+    if kind in _PLAIN or isinstance(value, (int, str)):
         return value
     if isinstance(value, (list, tuple)):
         found = [json_form(item, keep) for item in value]
         return tuple(found) if keep else found
     if is_dataclass(value) and not isinstance(value, type):
-        held = ((name, getattr(value, name), optional) for name, optional in _serialized_fields(type(value)))
+        held = ((name, getattr(value, name), optional) for name, optional in _serialized_fields(kind))
         items = {name: json_form(item, keep) for name, item, optional in held if item is not None or not optional}
-        return type(value)(**items) if keep else items
+        return kind(**items) if keep else items
     if isinstance(value, (np.ndarray, np.generic)):
         return json_form(value.tolist(), keep)
     return {str(k): json_form(v) for k, v in value.items()} if isinstance(value, Mapping) else str(value)
