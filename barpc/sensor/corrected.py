@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
@@ -31,7 +30,7 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import Behind, SensorModel
-from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
+from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix, rotation_vector
 from barpc.sensor.image_corrections import fixed_point
 
 _DERIVATIVE_ACCURACY = 1e-8  # of derivatives: the solver's steps ask for no more
@@ -209,7 +208,7 @@ def correction_of(matrix: Array, at: Array) -> Correction:
     """
     left, stretch, right = np.linalg.svd(matrix[:, :3])  # the rotation that a rounded matrix is nearest to
     motion = matrix @ np.append(at, 1.0) - at
-    turn = Rotation.from_matrix((left @ right).T).as_rotvec()
+    turn = rotation_vector((left @ right).T)
     return Correction(turn, motion, at, scale=1.0 / float(stretch.mean()))
 
 
