@@ -339,20 +339,25 @@ def _fill_of(views: int, made: SimulatedBlock) -> None:
             print(f"    SuperLU {name}: {error}", flush=True)
 
 
-SIZES = (3, 1500), (10, 5000), (30, 10000), (100, 15000), (300, 30000)
-"""Views and tracks of the blocks that are compared with another commit's."""
+SIZES = (3, 1500, 0), (10, 5000, 0), (30, 10000, 0), (100, 15000, 0), (300, 30000, 0), (30, 10000, 2), (300, 30000, 2)
+"""Views and tracks of the blocks that are compared with another commit's, and which per cent of observations are wrong.
+"""
 ONE_RUN = """
 import sys, time, warnings
 warnings.simplefilter("ignore")
 from barpc.ba import adjust_tracks
+from dataclasses import replace
+import numpy as np
 from barpc.simulate import simulate_block
-views, tracks, seed = map(int, sys.argv[1:])
-block = simulate_block(views, tracks, seed=seed)
-adjust_tracks(block.views, block.tracks)
+views, tracks, wrong, seed = map(int, sys.argv[1:])
+block, rng = simulate_block(views, tracks, seed=seed), np.random.default_rng(seed)
+ties = block.tracks
+ties = replace(ties, xy=ties.xy + (rng.random(len(ties)) < wrong / 100)[:, None] * rng.normal(0, 20, ties.xy.shape))
+adjust_tracks(block.views, ties)
 best = 1e9
 for _ in range(3):
     start = time.process_time()
-    adjust_tracks(block.views, block.tracks)
+    adjust_tracks(block.views, ties)
     best = min(best, time.process_time() - start)
 print(best)
 """
@@ -366,17 +371,17 @@ def against(commit: str, repeat: int) -> None:
         git = ["git", "-C", str(root), "worktree"]
         subprocess.run([*git, "add", "--detach", str(other), commit], check=True, capture_output=True)
         try:
-            print(f"views  tracks |  this [s]  {commit} [s]  ratio")
-            for views, tracks in SIZES:
+            print(f"views  tracks  wrong |  this [s]  {commit} [s]  ratio")
+            for views, tracks, wrong in SIZES:
                 found: dict[Path, list[float]] = {root: [], other: []}
                 for seed in range(repeat):
                     for tree, seconds in found.items():
-                        command = [sys.executable, "-c", ONE_RUN, str(views), str(tracks), str(seed)]
+                        command = [sys.executable, "-c", ONE_RUN, str(views), str(tracks), str(wrong), str(seed)]
                         ran = subprocess.run(command, cwd=tree, check=True, capture_output=True, text=True)
                         seconds.append(float(ran.stdout.split()[-1]))
                 this, that = (statistics.median(seconds) for seconds in found.values())
                 ratio = statistics.median(np.array(found[root]) / np.array(found[other]))
-                print(f"{views:5d} {tracks:7d} | {this:9.3f} {that:12.3f} {ratio:6.2f}", flush=True)
+                print(f"{views:5d} {tracks:7d} {wrong:4d} % | {this:9.3f} {that:12.3f} {ratio:6.2f}", flush=True)
         finally:
             subprocess.run([*git, "remove", "--force", str(other)], check=True, capture_output=True)
 
