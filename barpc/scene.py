@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
@@ -299,6 +297,9 @@ def middle_altitude(views: Sequence[View]) -> float:
 
 def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
     """Return the connected component (num,) of each node, numbered by its first; links (M, 2) join two."""
+    from scipy.sparse import coo_array  # a fifth of a second, with what it loads, which no camera needs
+    from scipy.sparse.csgraph import connected_components
+
     first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
     graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)

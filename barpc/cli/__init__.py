@@ -20,12 +20,11 @@ import click
 
 from barpc import __version__
 from barpc.base.errors import BarpcError, BarpcWarning, has_room, out_of_memory
-from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible
+from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible, quicken
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import THREADS, Formatter, echo, say
 
 _LIBRARIES = 512 << 20  # bytes that numpy, scipy, GDAL and OpenCV map: 460 MB, of which OpenBLAS waits for its own
-_OBJECTS = 50_000  # made between two looks for cycles
 
 EXIT_FAILED = 1
 
@@ -149,8 +148,8 @@ cli.help = _kept_lines(cli.help)
 def main(args: list[str] | None = None) -> None:
     """Run a verb, and turn errors into one line and an exit code."""
     argv = sys.argv[1:] if args is None else args
-    if args is None:  # the process is ours: no looking for cycles every 700 objects while modules are loaded
-        gc.set_threshold(_OBJECTS)
+    if args is None:  # the process is ours
+        quicken()
         hold_streams()
     for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
         os.environ.setdefault(name, "1")

@@ -87,10 +87,10 @@ def _unknown(camera: Camera) -> str:
 @cache
 def _written_in(folder: Path) -> dict[str, float]:
     """Return the files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
-    from barpc.report.runfiles import read_summary
-
     if not (folder / "summary.json").is_file():
         return {}
+    from barpc.report.runfiles import read_summary  # with all that a run has to say: as long again as the cameras take
+
     try:
         summary = read_summary(folder)
     except BarpcError:

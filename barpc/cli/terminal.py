@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.base.errors import InputError, visible
+from barpc.cli.process import quicken
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
@@ -421,6 +422,7 @@ def _enter_worker() -> None:
     os.environ.update(dict.fromkeys(THREADS, "1"))  # before numpy is imported
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("ignore")
+    quicken()
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 
 

@@ -12,7 +12,7 @@ from functools import cache, cached_property
 from math import comb
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from barpc.base.geodesy import CHUNK, Array, BoolArray, IntArray
 from barpc.fit.system import EPS, MAX_PASSES, TriangularSystem, solution
@@ -162,7 +162,9 @@ def bounded(system: TriangularSystem, region: Region, active: IntArray) -> Array
             return x
         used = np.append(used, broken)
         rows = region.rows(used) - floor * region.there[0]
-        normal = solve_triangular(system.matrix, np.pad(rows[:, active[1:]], ((0, 0), (len(x) - m, 0))).T, trans="T")
+        normal = scipy.linalg.solve_triangular(
+            system.matrix, np.pad(rows[:, active[1:]], ((0, 0), (len(x) - m, 0))).T, trans="T"
+        )
         below = -rows[:, 0] - system.target @ normal
         size, last = np.linalg.norm(normal, axis=0), np.eye(len(x) + 1)[-1]
         columns = np.vstack([normal, below]) / size
@@ -172,5 +174,5 @@ def bounded(system: TriangularSystem, region: Region, active: IntArray) -> Array
             return None
         if not abs(residual[-1]) > EPS:  # no x keeps them all
             return None
-        x = np.asarray(solve_triangular(system.matrix, system.target - residual[:-1] / residual[-1]))
+        x = np.asarray(scipy.linalg.solve_triangular(system.matrix, system.target - residual[:-1] / residual[-1]))
     return None

@@ -19,8 +19,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dtpqrt
+import scipy
 
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
@@ -117,7 +116,7 @@ class TriangularSystem:
 def _take_in(triangle: Array, rows: Array) -> Array:
     """Return the triangular factor of `triangle` on top of `rows`."""
     block = min(_HOUSEHOLDER_COLUMNS, len(triangle))
-    factor: Array = dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
+    factor: Array = scipy.linalg.lapack.dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
     return factor
 
 
@@ -240,7 +239,7 @@ def solution(system: TriangularSystem, quantize: Rounding | None = None) -> Arra
     """
     matrix, target = system.matrix, system.target
     if quantize is None:
-        return np.asarray(solve_triangular(matrix, target))
+        return np.asarray(scipy.linalg.solve_triangular(matrix, target))
     x = np.zeros(len(target))
     for i in range(len(x) - 1, -1, -1):
         x[i] = quantize((target[i] - matrix[i, i + 1 :] @ x[i + 1 :]) / matrix[i, i])

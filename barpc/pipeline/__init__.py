@@ -1,9 +1,23 @@
-"""The pipeline: the only place that knows every stage."""
+"""The pipeline: the only place that knows every stage.
+
+The names below are imported when first used: a worker process, which does the tasks of a stage, loads no other stage.
+"""
 
 from __future__ import annotations
 
-from barpc.base.options import RunOptions
-from barpc.pipeline.loading import LoadedViews, load_views
-from barpc.pipeline.run import AdjustResult, adjust, check
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from barpc.base.options import RunOptions
+    from barpc.pipeline.loading import LoadedViews, load_views
+    from barpc.pipeline.run import AdjustResult, adjust, check
 
 __all__ = ["AdjustResult", "LoadedViews", "RunOptions", "adjust", "check", "load_views"]
+_MODULES = {"RunOptions": "barpc.base.options", **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading")}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES.get(name, f"{__name__}.run")), name)

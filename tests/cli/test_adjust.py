@@ -297,6 +297,33 @@ def test_help_imports_nothing_heavy():
     assert "adjust" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("command", "unwanted"),
+    [
+        ("main()", "scipy.linalg scipy.sparse scipy.spatial scipy.special cv2 shapely jinja2 boto3 barpc.ba barpc.tie"),
+        ("_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading", "barpc.ba barpc.report boto3"),
+    ],
+    ids=["info", "worker"],
+)
+def test_what_is_not_needed_is_not_loaded(command, unwanted, tmp_path):
+    (tmp_path / "boto3.py").write_text("")
+    code = (
+        f"import sys\nsys.path.append({str(tmp_path)!r})\nsys.argv = ['barpc', 'info', 'none.tif']\n"
+        "from barpc.cli import main\nfrom barpc.cli.terminal import _enter_worker\n"
+        f"try:\n    {command}\nexcept SystemExit:\n    pass\nimport rasterio\n"
+        f"print(*(name for name in {unwanted.split()} if sys.modules.get(name) is not None))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+
+
+def test_in_a_process_of_others_rasterio_has_what_it_looks_for(tmp_path):
+    (tmp_path / "boto3.py").write_text("")
+    code = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nimport barpc.pipeline.run\nimport boto3\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.slow
 def test_warnings_are_not_shown_as_python_sees_them(crops):
     assert issubclass(NotGeoreferencedWarning, UserWarning)
