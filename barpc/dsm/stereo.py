@@ -21,7 +21,7 @@ from barpc.ba.parameters.projected import Cameras
 from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
 from barpc.base.errors import BarpcError, InputError
-from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, parts
+from barpc.base.geodesy import Array, ecef_from_ground, parts
 from barpc.base.options import TieOptions
 from barpc.base.remote import is_url
 from barpc.base.statistics import MAD
@@ -34,7 +34,7 @@ from barpc.report.runfiles import read_summary, table_path
 from barpc.report.summary import Summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import View
-from barpc.sensor.geometry import is_radar, triangulate
+from barpc.sensor.geometry import intersect_pair, is_radar
 from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import ACROSS, COLUMNS_PER_PIXEL, WINDOW, DenseMatches, dense_matches, epipolar_frame
 
@@ -159,11 +159,9 @@ def _tile_points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0
 
 def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
     """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
-    places, ground = (np.stack([found.a, found.b], axis=1) + 0.5) * zoom - 0.5, np.empty((len(found.a), 3))
+    a, b, ground = (found.a + 0.5) * zoom - 0.5, (found.b + 0.5) * zoom - 0.5, np.empty((len(found.a), 3))
     for part in parts(len(ground)):
-        view, point = np.tile([0, 1], len(places[part])), np.repeat(np.arange(len(places[part])), 2)
-        sensors, xy = [one.sensor for one in pair], places[part].reshape(-1, 2)
-        ground[part] = ground_from_ecef(triangulate(sensors, view, point, xy, alt=found.alt[part]).points)
+        ground[part] = intersect_pair([view.sensor for view in pair], (a[part], b[part]), found.alt[part])
     return ground
 
 
@@ -175,10 +173,12 @@ def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
     inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))
     cell, alt = row[inside] * width + col[inside], ground[inside, 2]
     order = np.lexsort((alt, cell))
-    of, start, count = np.unique(cell[order], return_index=True, return_counts=True)
+    cell, alt = cell[order], alt[order]
+    start = np.flatnonzero(np.diff(cell, prepend=-1))
+    of, count = cell[start], np.diff(start, append=len(cell))
     cells = np.full((2, height * width), np.nan, np.float32)
-    cells[0, of] = (alt[order[start + (count - 1) // 2]] + alt[order[start + count // 2]]) / 2
-    total = np.bincount(cell, sigma[inside] ** 2, height * width)[of]
+    cells[0, of] = (alt[start + (count - 1) // 2] + alt[start + count // 2]) / 2
+    total = np.bincount(cell, sigma[inside[order]] ** 2, height * width)[of]
     cells[1, of] = np.sqrt(total / count) * noise_of_mean(np.sqrt(count))
     return cells.reshape(2, height, width)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeGuard
+from functools import partial
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -421,6 +422,9 @@ def epipolar_offset(
     return offset, alt
 
 
+_LAST_STEP = 1e-3  # m: intersections are quadratic, so that the next would be below 1e-9
+
+
 @dataclass(frozen=True, eq=False)
 class Triangulation:
     """Ground points intersected from tracks."""
@@ -485,29 +489,63 @@ def _intersect(
         ground[point[rows]] = stack.localize(xy[rows], alt[point[rows]], np.searchsorted(rows, bounds)).T
         untried = np.setdiff1d(untried, rows, assume_unique=True)
         untried = untried[np.isnan(ground[point[untried], 0])]
-    ok = np.ones(len(ground), dtype=bool)
+    ok, of_points = np.ones(len(ground), dtype=bool), partial(np.bincount, point, minlength=len(ground))
     for _ in range(steps):
         scale = metres_per_unit(ground)
         image, jacobian = stack.seen_jacobian(ground[point], bounds)
         residual = (image - xy.T) * weight
         jacobian *= weight
-        step, ok = _normal_step(jacobian.swapaxes(0, 1), residual, point, scale.T)
+        step, ok = _normal_step(jacobian.swapaxes(0, 1), residual, scale.T, of_points)
         ground -= step.T / scale
-        if not np.abs(step[:, ok]).max(initial=0.0) > 1e-3:  # metres; quadratic: the next is below 1e-9
+        if not np.abs(step[:, ok]).max(initial=0.0) > _LAST_STEP:
             break
     return ground, ok
 
 
-def _normal_step(jacobian: Array, residual: Array, point: IntArray, scale: Array) -> tuple[Array, BoolArray]:
+def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array, steps: int = 10) -> Array:
+    """Return the ground points (n, 3) [deg, deg, m] of matches of two images, as `triangulate` finds their tracks.
+
+    Parameters
+    ----------
+    pair : two SensorModels
+    image : two arrays (n, 2), col, row [px] of the matches
+    alt : (n,), altitude [m] that the first guess is localised at
+
+    A point is NaN where the rays do not meet, or are parallel.
+    """
+    goal = np.concatenate([one.T for one in image])
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        ground = pair[0].localize(image[0], alt)
+        lost = np.isnan(ground[:, 0])
+        ground[lost] = pair[1].localize(image[1][lost], alt[lost])
+        for _ in range(steps):
+            scale = metres_per_unit(ground)
+            seen, slopes = zip(*(sensor.project_jacobian(ground) for sensor in pair), strict=True)
+            residual = np.concatenate([one.T for one in seen]) - goal
+            jacobian = np.concatenate([np.moveaxis(one, 0, -1) for one in slopes]).swapaxes(0, 1)
+            step, ok = _normal_step(jacobian, residual, scale.T)
+            ground -= step.T / scale
+            if not np.abs(step[:, ok]).max(initial=0.0) > _LAST_STEP:
+                break
+    ground[~ok | ~np.isfinite(residual).all(axis=0)] = np.nan
+    return ground
+
+
+def _normal_step(
+    jacobian: Array, residual: Array, scale: Array, of_points: Callable[[Array], Any] = np.asarray
+) -> tuple[Array, BoolArray]:
     """Return Gauss-Newton steps (3, num) [m] and for which points the rays determine one.
 
-    `jacobian` (3, 2, K) and `residual` (2, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt.
+    `jacobian` (3, m, K) and `residual` (m, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt;
+    `of_points` sums (K,) numbers of observations by point: each of m is one in one image, or all that there are.
     """
     num = scale.shape[1]
 
     def total(u: Array, v: Array) -> Array:
-        weights: Array = u[0] * v[0] + u[1] * v[1]
-        return np.asarray(np.bincount(point, weights, minlength=num), dtype=np.float64)
+        weights = u[0] * v[0]
+        for one, other in zip(u[1:], v[1:], strict=True):
+            weights += one * other
+        return np.asarray(of_points(weights), dtype=np.float64)
 
     normal = np.empty((3, 3, num))
     for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):

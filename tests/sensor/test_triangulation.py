@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.geometry import intersect_pair, triangulate
 from barpc.sensor.rpc import RpcStack
 from tests.sensor.test_geometry import tilted_rpc
 
@@ -84,3 +84,33 @@ def test_it_stops_where_the_step_is_below_a_millimetre(monkeypatch) -> None:
     monkeypatch.setattr(RpcStack, "seen_jacobian", lambda *given: calls.append(1) or project(*given))
     triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 1.0)
     assert len(calls) in (2, 3)  # all cameras at once
+
+
+def test_matches_of_a_pair_meet_where_their_tracks_do(monkeypatch) -> None:
+    rng = np.random.default_rng(8)
+    truth = SENSORS[0].localize(rng.uniform(4000, 15000, (60, 2)), rng.uniform(100, 900, 60))
+    image = [SENSORS[v].project(truth) + rng.normal(0, 2.0, (60, 2)) for v in (0, 1)]
+    image[0][3] = image[1][5] = np.nan
+    alt = np.full(60, 500.0)
+    tracks = np.tile([0, 1], 60), np.repeat(np.arange(60), 2), np.stack(image, axis=1).reshape(-1, 2)
+    wanted = ground_from_ecef(triangulate(SENSORS[:2], *tracks, alt=alt).points)
+    found = intersect_pair(SENSORS[:2], image, alt)
+    assert np.flatnonzero(np.isnan(found).any(axis=1)).tolist() == [3, 5]
+    assert (np.isnan(found) == np.isnan(wanted)).all()
+    known = np.isfinite(found[:, 0])
+    assert np.abs(ecef_from_ground(found[known]) - ecef_from_ground(wanted[known])).max() < 1e-6
+    assert np.abs(found[known, 2] - truth[known, 2]).max() > 1.0  # the noise counts
+    parallel = intersect_pair([SENSORS[0], SENSORS[0]], [image[0], image[0]], alt)
+    assert np.isnan(parallel).all()
+    # the first camera's guess is none: the second's counts
+    monkeypatch.setattr(type(SENSORS[0]), "localize", _blind_at_first(type(SENSORS[0]).localize))
+    again = intersect_pair(SENSORS[:2], image, alt)
+    assert np.abs(ecef_from_ground(again[known]) - ecef_from_ground(found[known])).max() < 0.1  # residuals of 2 px
+
+
+def _blind_at_first(localize):
+    def blind(self, image, alt):
+        found = localize(self, image, alt)
+        return np.full_like(found, np.nan) if self is SENSORS[0] else found
+
+    return blind
