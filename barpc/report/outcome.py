@@ -25,6 +25,7 @@ from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.report import FINE_STRUCTURE
 
+_TOGETHER = 1 << 16  # observations that are intersected at a time: 30 MB
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
@@ -311,12 +312,16 @@ def triangulate_tracks(tracks: Tracks, sensors: Sequence[SensorModel], alt: floa
     The residuals of the others are measured against the same points; a track with fewer than two observations that
     count is NaN.
     """
-    point, view = tracks.point[keep], tracks.view[keep]
-    found = triangulate(sensors, view, point, tracks.xy[keep], tracks.sigma[keep], alt=alt)
-    points = np.full((tracks.num_points, 3), np.nan)
-    points[: len(found.points)] = found.points
-    residuals = np.full((len(tracks), 2), np.nan)
-    residuals[keep] = found.residuals
+    points, residuals = np.full((tracks.num_points, 3), np.nan), np.full((len(tracks), 2), np.nan)
+    rows = np.flatnonzero(keep)
+    rows = rows[np.argsort(tracks.point[rows], kind="stable")]
+    point = tracks.point[rows]
+    for part in np.split(rows, np.searchsorted(point, np.unique(point[_TOGETHER::_TOGETHER]))):  # of whole tracks
+        own = tracks.point[part]
+        first = int(own[0]) if len(own) else 0
+        found = triangulate(sensors, tracks.view[part], own - first, tracks.xy[part], tracks.sigma[part], alt=alt)
+        points[first : first + len(found.points)] = found.points
+        residuals[part] = found.residuals
     ground = ground_from_ecef(points)
     rest = np.flatnonzero(~keep)
     projected = Several(sensors, tracks.view[rest]).project(ground[tracks.point[rest]])

@@ -105,6 +105,20 @@ def test_the_circle_of_ninety_per_cent_is_that_of_an_integral(minor):
     assert ce90(3.0, 3.0 * minor) == pytest.approx(3.0 * radius)
 
 
+@pytest.mark.parametrize("rows", [50, 333])
+def test_tracks_are_intersected_alike_in_parts_of_any_size(block_run, monkeypatch, rows):
+    run = block_run.run
+    keep = run.keep & (np.arange(len(run.tracks)) % 7 > 0) & (run.tracks.point > 3)
+    whole = triangulate_tracks(run.tracks, run.after, run.altitude, keep)
+    monkeypatch.setattr(runs, "_TOGETHER", rows)
+    parts = triangulate_tracks(run.tracks, run.after, run.altitude, keep)
+    assert (parts.ok == whole.ok).all()
+    assert not parts.ok[:4].any()
+    assert np.nanmax(np.abs(parts.points - whole.points)) < 1e-6
+    assert (np.isnan(parts.residuals) == np.isnan(whole.residuals)).all()
+    assert np.nanmax(np.abs(parts.residuals - whole.residuals)) < 1e-6
+
+
 def test_a_track_is_intersected_from_what_counts_and_the_rest_is_measured_against_it(block_run):
     run = block_run.run
     tracks = run.tracks
