@@ -61,6 +61,7 @@ def benchmarks(data: Path | None, peers: str | None, rpcfit: str | None, cars: s
         Benchmark("ba.py", "The same, plain, beside Ceres", ("--ceres",), "adjustment.md"),
         Benchmark("ba.py", "With defaults, beside release 0.1", ("--against", FIRST), "adjustment.md"),
         Benchmark("ba.py", "A jump, and views of one place", ("--jump", "--series", "1000"), "adjustment.md"),
+        Benchmark("tail.py", "Whole runs, matches given, by the number of images", (), "report.md"),
         Benchmark("simulate.py", "Simulation", (), "simulate.md"),
         Benchmark("report.py", "Summary, tables and report", ("--views", "3", "50"), "report.md"),
     ]
