@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, TrackGroup
@@ -329,6 +329,34 @@ class Mixture:
         scatter = 0.0 if self.group is None else self.moved.noise
         step = step.reshape(linear.shape)
         return MixtureFit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
+
+    def scores(self, new: Array, cell: IntArray, cells: int) -> tuple[Array, Array, Array]:
+        """Return what unknowns that move the observations of one cell each by `new` (2, m, K) [px] would gain.
+
+        At the present unknowns: curvature (C, m, m) and pull (C, m) of each cell's, the pull less what cameras and
+        the others follow, and (C, P, m) by what root of curvature they are followed.
+        """
+        linear, seen, moves = self.linear, self._expected(), new / self.linear.sigma
+        (views, q), (e, m) = linear.shape, (self.extra.shape[1], new.shape[1])
+        curvature, across = np.zeros((cells, m, m)), np.zeros((cells, views * q + e, m))
+        of_views = across[:, : views * q].reshape(cells, views, q, m)
+        for tracks, of_subset in zip(linear.tracks, seen.kinds[0].weight, strict=True):
+            columns = moves[:, :, tracks.rows].transpose(2, 3, 0, 1).reshape(len(tracks.rows), -1, m)
+            weighted = tracks.weight(of_subset) @ columns
+            own = cell[tracks.rows[:, 0]]
+            np.add.at(curvature, own, np.swapaxes(columns, 1, 2) @ weighted)
+            for k, rows in enumerate(tracks.rows.T):
+                part = weighted[:, 2 * k : 2 * k + 2]
+                np.add.at(of_views, (own, linear.view[rows]), np.swapaxes(linear.by_row[rows], 1, 2) @ part)
+                np.add.at(across[:, views * q :], own, self.extra[:, :, rows].transpose(2, 1, 0) @ part)
+        self.curvature = [self._curvature(seen.kinds[0].weight, self.extra)]
+        lower = np.linalg.cholesky(self._matrix())
+        followed = solve_triangular(lower, across.transpose(1, 0, 2).reshape(len(lower), -1), lower=True) / self.noise**2
+        followed = followed.reshape(len(lower), cells, m).transpose(1, 0, 2)
+        pulls = np.einsum("cmk,ck->mk", moves, seen.kinds[0].pull) / self.noise**2
+        pull = np.stack([np.bincount(cell, one, cells) for one in pulls], axis=1)
+        pull -= np.swapaxes(followed, 1, 2) @ solve_triangular(lower, self._gradient(seen), lower=True)
+        return curvature / self.noise**2, pull, followed
 
     def _noise(self, seen: _Expectations, known: float) -> bool:
         """Return the noise, and what is wrong, as they are seen; whether the noise stands."""

@@ -340,7 +340,9 @@ class _ExplanationSearch:
 
     def run(self) -> Selection:
         """Return all that were taken."""
-        states, ended = [_SearchState(self.start, self.start.base)], False
+        states, ended = self._grown([_SearchState(self.start, self.start.base)])
+        # ground that moves and explains more than anything else is taken out first: all else competes again without it
+        ended |= any(row.one.group is not None for row in states[0].taken)
         while not ended:
             states, ended = self._grown(states)
         best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)

@@ -21,10 +21,11 @@ from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import BACKFITTING, LEVEL, RIVALS, SAMPLE, TIMES
+from barpc.base.statistics import LEVEL, SAMPLE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 GROUND_CELLS = 6  # a side of the ground: the group's share is free in each
+_STARTS = 8  # regions of which more than a score is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +103,12 @@ def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Arra
     few = linear.thinned(SAMPLE)
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
-    rows = np.zeros(len(cell), dtype=bool)
-    for tracks in few.tracks:
-        rows[tracks.rows] = True
+    rows = few.taking_part
     if not rows.any():
         return None
-    starts = [replace(group, share=share) for share in _first_shares(ground, rows, base.right)]
-    begun = [Mixture(few, extra, sigma, base, start) for start in starts]
-    looks = [one.run(BACKFITTING, COOLED**2) for one in begun]  # only the best go on
-    best = sorted(range(len(looks)), key=lambda n: -looks[n].evidence)[:RIVALS]
-    ended = [(begun[n].run(), starts[n]) for n in best]
+    starts = [replace(group, share=share) for share in _first_shares(linear, group, base, extra, sigma)]
+    # what a few iterations show does not tell which start ends best
+    ended = [(Mixture(few, extra, sigma, base, one).run(cooled=COOLED**2), one) for one in starts]
     found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _cell_shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
@@ -127,19 +124,57 @@ def price_of_group(linear: Linear, cell: IntArray) -> float:
     return float(0.5 * np.log(count[count > 0]).sum())
 
 
-def _first_shares(ground: GroundMotion, rows: BoolArray, right: Array) -> Iterator[Array]:
-    """Yield the probabilities (K,) that tracks move, to start from."""
-    cut = np.where(right < 0.5, 1.0 - LEVEL, LEVEL)
-    if (cut[rows] > 0.5).any():
+def _first_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Iterator[Array]:
+    """Yield the probabilities (K,) that tracks move, to start from: those that were cut, and the likeliest regions."""
+    cut = np.where(base.right < 0.5, 1.0 - LEVEL, LEVEL)
+    if (cut[linear.taking_part] > 0.5).any():
         yield cut
-    cell, place = ground.cells(GROUND_CELLS // 2), ground.place
-    for one in np.unique(cell[rows]):
-        inside = cell == one
-        middle = np.median(place[:, inside & rows], axis=1, keepdims=True)
-        far = np.nan_to_num(np.linalg.norm(place - middle, axis=0))
-        share = np.where(far > np.median(far[rows]), LEVEL, 0.5)
-        share[inside] = 1.0 - LEVEL
-        yield share
+    gains = _region_gains(linear, group, base, extra, sigma)
+    for region in _distinct(_REGIONS, gains):
+        yield np.where(region[group.cell], 1.0 - LEVEL, LEVEL)
+
+
+def _region_gains(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Array:
+    """Return the gain [nats] (R,) of a common motion of each of the regions of the ground: a score test.
+
+    The cameras and what is beside them follow (Schur complement of the curvature at the fit `base`); cells of the
+    ground are summed up before.
+    """
+    scores = Mixture(linear, extra, sigma, base).scores(group.by_move, group.cell, GROUND_CELLS**2)
+    regions = _REGIONS.astype(np.float64)
+    curvature, pull, across = (np.tensordot(regions, one, axes=1) for one in scores)
+    curvature = curvature - np.swapaxes(across, 1, 2) @ across + np.diag(1.0 / group.sigma**2)
+    return 0.5 * (pull * np.linalg.solve(curvature, pull[..., None])[..., 0]).sum(axis=1)
+
+
+def _regions() -> BoolArray:
+    """Return regions (R, GROUND_CELLS^2) of cells: rectangles, half-planes and bands in eight directions."""
+    row, col = np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS)
+    low, high = np.triu_indices(GROUND_CELLS)
+    inside = [(one >= low[:, None]) & (one <= high[:, None]) for one in (row, col)]
+    found = [(inside[0][:, None] & inside[1]).reshape(-1, len(row))]
+    for angle in np.arange(8) * np.pi / 8:
+        away = np.cos(angle) * col + np.sin(angle) * row
+        edges = np.quantile(away, np.arange(GROUND_CELLS + 1) / GROUND_CELLS)
+        edges[-1] += 1.0
+        low, high = np.triu_indices(GROUND_CELLS + 1, 1)
+        found.append((away >= edges[low, None]) & (away < edges[high, None]))
+    every = np.unique(np.concatenate(found), axis=0)
+    return every[every.any(axis=1) & ~every.all(axis=1)]
+
+
+_REGIONS = _regions()
+
+
+def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
+    """Return the best regions (C,), none of which covers more than half of what it has in common with another."""
+    found: list[BoolArray] = []
+    for n in np.argsort(-gains, kind="stable"):
+        one = regions[n]
+        same = (2 * (one & other).sum() > (one | other).sum() for other in found)
+        if not any(same) and len(found) < _STARTS:
+            found.append(one)
+    return found
 
 
 def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
