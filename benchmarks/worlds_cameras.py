@@ -173,6 +173,7 @@ class Flaw:
     chips : (8, 2), displacement of the detectors, col and row [px]
     focal, rate : float, relative errors of focal length and line period
     air : float, displacement along the columns' middle line of sight by height: at `air_alt` +- `air_half` [px]
+    lost : row after which lines were never written, and their number; all that follows is numbered too low
     """
 
     attitude: Array = field(default_factory=lambda: np.zeros(3))
@@ -185,6 +186,7 @@ class Flaw:
     air: float = 0.0
     air_alt: float = 0.0
     air_half: float = 1.0
+    lost: tuple[float, float] = (np.inf, 0.0)
 
 
 SOUND = Flaw()
@@ -247,7 +249,7 @@ class Camera:
 
     def sight(self, image: Array, flaw: Flaw = SOUND) -> tuple[Array, Array]:
         """Where rays (n, 3) start and their directions."""
-        place, attitude = self._pose(image[:, 1], flaw)
+        place, attitude = self._pose(image[:, 1] + flaw.lost[1] * (image[:, 1] > flaw.lost[0]), flaw)
         look = self._look(image[:, 0], flaw)
         return place, unit((attitude @ np.column_stack([look, np.ones(len(look))])[..., None])[..., 0])
 
@@ -279,7 +281,9 @@ class Camera:
         if flaw.air:
             image[:, 1] += flaw.air * (ground[:, 2] - flaw.air_alt) / flaw.air_half
             image[:, 0] += 0.5 * flaw.air * ((ground[:, 2] - flaw.air_alt) / flaw.air_half) ** 2
-        image[np.abs(miss) > 1e-6] = np.nan
+        low, gone = flaw.lost
+        image[(np.abs(miss) > 1e-6) | ((row > low) & (row < low + gone))] = np.nan
+        image[row > low, 1] -= gone
         return image
 
     def _miss(self, row: Array, goal: Array, flaw: Flaw) -> tuple[Array, Array]:

@@ -578,7 +578,7 @@ def _lost(seed: int, rng: np.random.Generator) -> Plan:
     plan.tails, plan.bias = rng.uniform(3, 6), (0.03, 12)
     for view in (int(v) for v in rng.permutation(4)[: 1 + seed % 2]):
         size, low = float(rng.integers(4, 60)), rng.uniform(0.15, 0.85) * plan.size[1]
-        plan.flaw(view, pointing=step(low, np.inf, np.array([0.0, -size])))
+        plan.flaw(view, lost=(low, size))
         plan.injected.append(Injected("jump", (view,), 1, low, plan.size[1], size, "lines lost"))
     return plan
 

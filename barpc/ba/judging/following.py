@@ -189,7 +189,11 @@ def without_strips(found: Solution, judged: Selection, block: Block, outer: Bloc
     if not parts or options.jitter == OFF or options.is_plain:
         return found
     waves, params = _waves_of(parts, len(block.views))
-    tried = _with_waves(_at_selection(found, judged, block), block, outer, options, waves, start=params)
+    at, drift = _at_selection(found, judged, block), found.problem.cameras.unknowns.drift
+    tried = _with_waves(at, block, outer, options, waves, start=params)
+    if "drift" in found.asked:  # before the parts were found: is it still asked for?
+        plain = _with_waves(at, block, outer, options, waves, start=params, drift=drift - 1)
+        tried = tried if is_better(tried.after, plain.after, outer) else replace(plain, asked={})
     plainly = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     if is_better(found.after, tried.after, outer):
         return plainly
@@ -284,6 +288,7 @@ def _with_waves(
     waves: AdditionalParameters,
     once: bool = False,
     start: Array | None = None,
+    drift: int | None = None,
 ) -> Solution:
     """Return a block solved again with splines and steps, from where it ended; every observation may come
     back.
@@ -293,11 +298,11 @@ def _with_waves(
     ended, unknowns = found.outcome.minimum.state, found.problem.cameras.unknowns
     if unknowns.waves is not None:  # strips and swings that were found stay
         waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
-    bent = make_problem(block, options, unknowns.center, None, unknowns.drift, waves)
-    params = np.zeros_like(bent.camera_prior.mean)
-    params[:, : unknowns.in_waves.start] = ended.params[:, : unknowns.in_waves.start]
+    bent = make_problem(block, options, unknowns.center, None, unknowns.drift if drift is None else drift, waves)
+    params, first = np.zeros_like(bent.camera_prior.mean), bent.cameras.unknowns.in_waves.start
+    params[:, :first] = ended.params[:, :first]
     if start is not None:
-        params[:, unknowns.in_waves.start :] = start
+        params[:, first:] = start
     elif unknowns.waves is not None:
         params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
     outcome, weight = found.outcome, block.use / block.sigma

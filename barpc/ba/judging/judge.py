@@ -287,6 +287,16 @@ class _SearchState:
         """Evidence gained by all explanations taken."""
         return sum(row.gain for row in self.taken)
 
+    @property
+    def moves(self) -> bool:
+        """Whether ground that moves is what was taken last."""
+        return bool(self.taken) and self.taken[-1].one.group is not None
+
+    @property
+    def gain_beside_motion(self) -> float:
+        """Evidence gained by what is followed beside ground that moves; all of it where none does."""
+        return self.gain - (self.taken[-1].gain if self.moves else 0.0)
+
     def may_pass(self, best: _SearchState) -> bool:
         """Return whether some more, each gaining less than the last, may explain more than another that ended."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
@@ -303,7 +313,8 @@ class _SearchState:
         """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
-        one, made, gain = min(same, key=lambda row: _image_share(row[0], self.seen))  # of two that are as good
+        # of those that are as good the simplest, then the smallest
+        one, made, gain = min(same, key=lambda row: (row[0].kind == FADE, _image_share(row[0], self.seen)))
         others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
         other = max(((row[0].kind, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
         close = [row[0] for row in others if row[2] > gain - SURE]
@@ -340,11 +351,13 @@ class _ExplanationSearch:
 
     def run(self) -> Selection:
         """Return all that were taken."""
-        states, ended = self._grown([_SearchState(self.start, self.start.base)])
-        # ground that moves and explains more than anything else is taken out first: all else competes again without it
-        ended |= any(row.one.group is not None for row in states[0].taken)
+        first, ended = self._grown([_SearchState(self.start, self.start.base)])
+        states = first
         while not ended:
             states, ended = self._grown(states)
+        if first[0].moves and states[0].gain_beside_motion < first[0].gain:
+            # what is found with ground that moves explains less than that alone: all competes again without it
+            states = first[:1]
         best, margin = states[0], states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
         for n, row in enumerate(best.taken):  # what is left, as well
             if sum(one.gain for one in best.taken[n:]) <= _by_neighbours(row.beside):
