@@ -182,6 +182,7 @@ class Ended:
     after: int
     findings: tuple[Any, ...] = ()
     outcome: Any = None
+    asked: tuple[str, ...] = ()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from barpc.ba.apart import Parts
 from barpc.ba.constraints.block import Block as Joined
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence.linearised import linearise
-from barpc.ba.evidence.mixture import Group, fit_mixture
+from barpc.ba.evidence.mixture import Group, Mixture, fit_mixture
 from barpc.ba.evidence.mixture import moving as moving_of
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.judging import explanations, moving
@@ -156,17 +156,45 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     assert 0.9 < group.share.max() < 1.0
 
 
-@pytest.mark.parametrize(("cut", "first"), [([], False), ([1], True), ([5], False)])
-def test_what_was_cut_may_be_what_moves(cut: list[int], first: bool) -> None:
-    """Of six ties, the last of which takes no part, in two cells; then each cell may be it."""
-    rows, right = np.arange(6) < 5, np.ones(6)
-    right[cut] = 0.1
-    ground: Any = SimpleNamespace(cells=lambda _: np.array([0, 0, 0, 1, 1, 1]), place=np.arange(12.0).reshape(2, 6))
-    shares = list(moving._first_shares(ground, rows, right))
-    assert len(shares) == 2 + first
-    if first:
-        np.testing.assert_array_equal(shares[0], np.where(right < 0.5, 1.0 - LEVEL, LEVEL))
-    assert [np.flatnonzero(share > 0.5).tolist() for share in shares[first:]] == [[0, 1, 2], [3, 4, 5]]
+@pytest.mark.parametrize("cut", [False, True])
+def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
+    """Half of the ground behind a line moved: what is proposed holds it; what was cut is proposed, too."""
+    made, tracks, moves = drifting(3, 300, 0.5, 2.0)
+    block, problem, state = started(made, tracks)
+    linear = linearise(problem, state, block.use, block.sigma, 800.0)
+    ground, none = GroundMotion.of(problem, state), np.zeros((2, 0, len(block.view)))
+    base = fit_mixture(linear)
+    base = replace(base, right=np.where(moves[block.order] & cut, 0.1, np.maximum(base.right, 0.6)))
+    by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
+    group = Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.full(len(cell), 0.5))
+    shares = list(moving._first_shares(linear, group, base, none, np.zeros(0)))
+    assert len(shares) == moving._STARTS + cut
+    assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
+    inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]
+    assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
+    if cut:
+        assert inside[0] == 1.0
+
+
+def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
+    """Of a motion so small that no tie is wrong for it: but for the room of its unknowns, the gain of the evidence."""
+    made, tracks, _ = drifting(3, 300, 0.5, 0.2)
+    block, problem, state = started(made, tracks)
+    linear = linearise(problem, state, block.use, block.sigma, 800.0)
+    ground, none = GroundMotion.of(problem, state), np.zeros((2, 0, len(block.view)))
+    base, by_move, cell = fit_mixture(linear), ground.by_moves(block.view, 3), ground.cells(GROUND_CELLS)
+    group = Group(by_move, np.full(4, 30.0), cell, np.full(len(cell), 0.5))
+    gains = moving._region_gains(linear, group, base, none, np.zeros(0))
+    curvature, _, across = Mixture(linear, none, np.zeros(0), base).scores(by_move, cell, GROUND_CELLS**2)
+    best = np.argsort(-gains)[[0, 10, 100]]
+    assert gains[best[0]] > 20.0
+    for n in best:
+        region = moving._REGIONS[n]
+        part = across[region].sum(axis=0)
+        room = np.eye(4) + 30.0**2 * (curvature[region].sum(axis=0) - part.T @ part)
+        found = fit_mixture(linear, by_move * region[cell], group.sigma, base)
+        gained = found.evidence - base.evidence + 0.5 * np.linalg.slogdet(room)[1]
+        assert gains[n] == pytest.approx(gained, rel=0.15, abs=1.0)
 
 
 def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:

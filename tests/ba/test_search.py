@@ -233,6 +233,8 @@ def search(**given: Any) -> _ExplanationSearch:
 def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> None:
     """Where it was not the best by itself; all that are followed have their cameras and probabilities."""
 
+    monkeypatch.setattr(judging, "_simplified", lambda state: state)
+
     def ran(*states: _SearchState) -> tuple[list[_TakenExplanation], Any]:
         monkeypatch.setattr(_ExplanationSearch, "_grown", lambda self, before: (list(states), True))
         monkeypatch.setattr(judging, "_findings_of", lambda rows, n, seen: [rows[n]])

@@ -351,12 +351,14 @@ class Mixture:
                 np.add.at(across[:, views * q :], own, self.extra[:, :, rows].transpose(2, 1, 0) @ part)
         self.curvature = [self._curvature(seen.kinds[0].weight, self.extra)]
         lower = np.linalg.cholesky(self._matrix())
-        followed = solve_triangular(lower, across.transpose(1, 0, 2).reshape(len(lower), -1), lower=True) / self.noise**2
+        followed = (
+            solve_triangular(lower, across.transpose(1, 0, 2).reshape(len(lower), -1), lower=True) / self.noise**2
+        )
         followed = followed.reshape(len(lower), cells, m).transpose(1, 0, 2)
         pulls = np.einsum("cmk,ck->mk", moves, seen.kinds[0].pull) / self.noise**2
-        pull = np.stack([np.bincount(cell, one, cells) for one in pulls], axis=1)
-        pull -= np.swapaxes(followed, 1, 2) @ solve_triangular(lower, self._gradient(seen), lower=True)
-        return curvature / self.noise**2, pull, followed
+        own = np.stack([np.bincount(cell, one, cells) for one in pulls], axis=1)
+        taken = np.swapaxes(followed, 1, 2) @ solve_triangular(lower, self._gradient(seen), lower=True)
+        return curvature / self.noise**2, own - taken, followed
 
     def _noise(self, seen: _Expectations, known: float) -> bool:
         """Return the noise, and what is wrong, as they are seen; whether the noise stands."""

@@ -107,6 +107,13 @@ def _local(kind: str, seen: BlockResiduals, view: int, where: Where, sigma: floa
     return Explanation(kind, view, extra, np.full(2, sigma), cost, where)
 
 
+def step_of(seen: BlockResiduals, one: Explanation) -> Explanation:
+    """Return a decay without its decay: the rows that it begins at are displaced as a whole."""
+    assert one.where is not None
+    axis, start, stop = one.where[:3]
+    return replace(_local(STRIP, seen, one.view, (axis, start, stop, 0.0, 0.0), FIRST_SIGMA), sigma=one.sigma)
+
+
 def transient(seen: BlockResiduals, _interval: Interval) -> list[Explanation]:
     """Return the explanation that the first, or last, rows of all images are displaced and fade, each image
     by its own amount.

@@ -189,10 +189,11 @@ def without_strips(found: Solution, judged: Selection, block: Block, outer: Bloc
     if not parts or options.jitter == OFF or options.is_plain:
         return found
     waves, params = _waves_of(parts, len(block.views))
-    at, drift = _at_selection(found, judged, block), found.problem.cameras.unknowns.drift
+    at = _at_selection(found, judged, block)
     tried = _with_waves(at, block, outer, options, waves, start=params)
     if "drift" in found.asked:  # before the parts were found: is it still asked for?
-        plain = _with_waves(at, block, outer, options, waves, start=params, drift=drift - 1)
+        drift = found.problem.cameras.unknowns.drift - 1
+        plain = _with_waves(at, block, outer, options, waves, start=params, drift=drift)
         tried = tried if is_better(tried.after, plain.after, outer) else replace(plain, asked={})
     plainly = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     if is_better(found.after, tried.after, outer):

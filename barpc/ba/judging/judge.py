@@ -31,6 +31,7 @@ from barpc.ba.judging.explanations import (
     faster,
     proposed,
     sharpened,
+    step_of,
 )
 from barpc.ba.judging.moving import GroundMotion, Motion, MovingGroup, group_of
 from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
@@ -313,8 +314,7 @@ class _SearchState:
         """Return the state with the first of the explanations tried; the others are its rivals."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
-        # of those that are as good the simplest, then the smallest
-        one, made, gain = min(same, key=lambda row: (row[0].kind == FADE, _image_share(row[0], self.seen)))
+        one, made, gain = min(same, key=lambda row: _image_share(row[0], self.seen))  # of two that are as good
         others = [row for row in tried if row[0] is not one and _differs(row[0], one)]
         other = max(((row[0].kind, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
         close = [row[0] for row in others if row[2] > gain - SURE]
@@ -365,6 +365,7 @@ class _ExplanationSearch:
                 break
         if not best.taken:
             return Selection()
+        best = _simplified(best)
         self.seen = best.seen
         # what was not the best by itself is beside the others: by what these gain together
         taken = [row if row.gap > 0.0 else replace(row, gap=margin) for row in best.taken]
@@ -511,6 +512,24 @@ class _ExplanationSearch:
         seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([seen.extra, one.extra], axis=1)
         return fit_mixture(linear or seen.linear, extra, sigma, base or seen.base, one.group)
+
+
+def _simplified(state: _SearchState) -> _SearchState:
+    """Return a search with steps for decays that explain no more, now that all others are found."""
+    for n, row in enumerate(state.taken):
+        one, seen = row.one, state.seen
+        if one.kind != FADE or state.moves:
+            continue
+        assert one.where is not None
+        plain = step_of(seen, one)
+        at = slice(*(sum(len(row.one.sigma) for row in state.taken[: n + k]) for k in (0, 1)))
+        extra = seen.extra.copy()
+        extra[:, at] = plain.extra
+        found = fit_mixture(seen.linear, extra, seen.sigma, seen.base)
+        if found.evidence - plain.price > seen.base.evidence - one.price:
+            taken = (*state.taken[:n], replace(row, one=plain), *state.taken[n + 1 :])
+            state = replace(state, seen=replace(seen, base=found, extra=extra), followed=found, taken=taken)
+    return state
 
 
 def _stands(one: Explanation, before: Explanation) -> bool:

@@ -144,7 +144,7 @@ def _region_gains(linear: Linear, group: Group, base: MixtureFit, extra: Array, 
     regions = _REGIONS.astype(np.float64)
     curvature, pull, across = (np.tensordot(regions, one, axes=1) for one in scores)
     curvature = curvature - np.swapaxes(across, 1, 2) @ across + np.diag(1.0 / group.sigma**2)
-    return 0.5 * (pull * np.linalg.solve(curvature, pull[..., None])[..., 0]).sum(axis=1)
+    return np.asarray(0.5 * (pull * np.linalg.solve(curvature, pull[..., None])[..., 0]).sum(axis=1))
 
 
 def _regions() -> BoolArray:
