@@ -305,11 +305,13 @@ class Parts:
 
     def less(self, found: Solution, one: MovingGroup) -> Parts:
         """Return the parts with one more group taken out."""
-        number, group = self.group.max(initial=0) + 1, self.group.copy()
+        number, group, block = self.group.max(initial=0) + 1, self.group.copy(), self.block
         still = group == 0
         group[still & ~self.kept_out] = number * one.member
-        outer = members(found.problem, found.final.params, one, self.outer)
-        group[still & self.kept_out] = number * outer
+        # held-out tracks, and control points on it, whose place is none of both dates
+        of_gcps = (block.point >= block.num_tracks) & (block.point < block.num_known)
+        for rows in (still & self.kept_out, still & of_gcps):
+            group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
         return replace(self, group=group)
 
     def is_tied(self) -> bool:
@@ -358,7 +360,11 @@ class Parts:
         west, east = (float(wrap_longitude(lon)) for lon in (low[0], high[0]))
         box = west, float(low[1]), east, float(high[1])
         share = len(of_group) / max(len(every), 1)
-        return Motion(one.metres, one.between, share, box, "-".join(side for side in sides[::-1] if side))
+        side = "-".join(one_side for one_side in sides[::-1] if one_side)
+        gcps = np.unique(self.block.point[(self.group == number) & (self.block.point >= self.block.num_tracks)])
+        names = tuple(self.block.gcps.names[g - self.block.num_tracks] for g in gcps.tolist())
+        first, second = (self.block.views[v].date for v in one.between)
+        return Motion(one.metres, one.between, share, box, side, names, (first, second))
 
 
 def _groups(block: Block) -> int:

@@ -24,7 +24,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.base.statistics import LEVEL
-from barpc.scene import BoolArray, Tracks
+from barpc.scene import BoolArray, GroundPoints, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.lanes import rest_slow
@@ -232,15 +232,51 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     block = join(made.views, tracks, None, AdjustOptions())
     parts = Parts(block, block.point % 5 == 0, np.zeros(len(block.view), dtype=np.int64))
     found: Any = SimpleNamespace(problem="problem", final=SimpleNamespace(params="params"))
+    asked: list[Joined] = []
     for number, share in ((1, 3), (2, 2)):
-        inner, outer = parts.inner.point % share == 0, parts.outer.point % share == 0
-        one: Any = SimpleNamespace(member=inner)
-        told = {("problem", "params", id(one), id(parts.outer)): outer}
-        monkeypatch.setattr("barpc.ba.apart.members", lambda a, b, *c, told=told: told[a, b, *map(id, c)])
+
+        def of_share(problem: str, params: str, _one: Any, part: Joined, share: int = share) -> BoolArray:
+            assert (problem, params) == ("problem", "params")
+            asked.append(part)
+            return part.point % share == 0
+
+        monkeypatch.setattr("barpc.ba.apart.members", of_share)
+        one: Any = SimpleNamespace(member=parts.inner.point % share == 0)
         gone = (parts.group == 0) & (block.point % share == 0)
         less = parts.less(found, one)
         np.testing.assert_array_equal(less.group, np.where(gone, number, parts.group))
         parts = less
+    assert [len(part.view) for part in asked[1::2]] == [0, 0]  # no control points
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
+    """Their places are of another date than some of their images: named, and the scene stands by the others."""
+    made, tracks, moves = drifting(4, 900, 0.3, 4.0, seed)
+    seen = np.bincount(tracks.point) == 4
+    rng, inside = np.random.default_rng(seed), np.bincount(tracks.point, moves) > 0
+    picked = np.concatenate([rng.choice(np.flatnonzero(seen & part), 3, replace=False) for part in (inside, ~inside)])
+    rows = np.concatenate([np.flatnonzero(tracks.point == point) for point in picked])
+    gcps = GroundPoints(
+        names=tuple(f"P{n}" for n in range(6)),
+        lonlatalt=made.truth.ground[picked],
+        sigma=np.full((6, 3), 0.2),
+        point=np.repeat(np.arange(6), 4),
+        view=tracks.view[rows],
+        xy=tracks.xy[rows],
+        xy_sigma=np.full(24, 0.2),
+    )
+    found = adjust_tracks(made.views, tracks, gcps=gcps)
+    (one,) = [f for f in found.findings if f.kind == MOVING]
+    assert one.motion is not None
+    assert one.motion.gcps == ("P0", "P1", "P2")
+    assert found.control is not None
+    assert found.control.used.tolist() == [False] * 3 + [True] * 3
+    assert not found.gcp_inlier[gcps.point < 3].any()
+    still = ~inside & (np.bincount(tracks.point) > 0)
+    off = np.median(found.points[still] - ecef_from_ground(made.truth.ground[still]), axis=0)
+    assert np.linalg.norm(off) < 0.5
+    assert (np.abs(off) < 4.0 * found.gauge.sigma.max()).all()
 
 
 def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:

@@ -128,13 +128,34 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
     (found,) = explanations(adjustment([finding]))
     assert found.sentence == (
-        f"{said} (a cloud, water or shadows?), by 1.1 m from east to west apart from an effect of height, and "
-        "were excluded"
+        f"{said} (a cloud, water or shadows, or, between dates, a glacier, a landslide, a fault?), by 1.1 m from east "
+        "to west apart from an effect of height, and were excluded; the larger part of the ground was taken to stand "
+        "still"
     )
     assert (found.image, found.share, found.moved_m, found.between) == (None, 0.354, 1.14, ("east", "west"))
     assert found.box == (5.0, 43.0, 5.1, 43.2)
     assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
     assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
+
+
+@pytest.mark.parametrize(
+    ("dates", "cause"),
+    [
+        (("2020-01-02", "2020-01-02"), "(a cloud, water or shadows?)"),
+        (
+            ("2020-01-02", "2021-03-04"),
+            "(a glacier, a landslide, a fault, or change between 2020-01-02 and 2021-03-04?)",
+        ),
+        (("", "2021-03-04"), "(a cloud, water or shadows, or, between dates, a glacier, a landslide, a fault?)"),
+    ],
+)
+def test_a_group_that_moves_is_ground_only_between_dates(dates: tuple[str, str], cause: str) -> None:
+    """Of less than a third nothing is said of the rest; control points on it are named."""
+    motion = Motion(1.14, (1, 0), 0.3, (5.0, 43.0, 5.1, 43.2), "west", ("P1", "P4"), dates)
+    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
+    (found,) = explanations(adjustment([finding]))
+    assert f"together {cause}, by 1.1 m" in found.sentence
+    assert found.sentence.endswith("of height, and were excluded, with the GCPs P1, P4")
 
 
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])

@@ -84,6 +84,8 @@ class Motion:
     share: float  # of the tracks
     box: tuple[float, float, float, float]  # west, south, east, north [deg], of nine in ten of its tracks each way
     side: str  # of the middle of the block on which they lie, as "north-west"; "" where on both
+    gcps: tuple[str, ...] = ()  # names of control points among them
+    dates: tuple[str, str] = ("", "")  # of the two views; empty where nobody says
 
 
 @dataclass(frozen=True, eq=False)

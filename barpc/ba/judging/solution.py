@@ -204,10 +204,14 @@ def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> 
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
     told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
+    # on ground that moves: seen, and excluded with it
+    gone = np.isin(np.arange(count), block.gcps.point) & ~np.isin(
+        np.arange(count), block.point[mine & block.use] - first
+    )
     covariance = outcome.minimum.covariance(outcome.problem.free)
     faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
     found = agreement(offsets_of(covariance, block, outcome.minimum.state.points, faint), told)
-    found = replace(found, used=found.used & ~lost)
+    found = replace(found, used=found.used & ~lost & ~gone)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
     return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))

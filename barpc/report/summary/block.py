@@ -14,6 +14,7 @@ from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.evidence.scan import ImageRegion
 from barpc.ba.judging.explanations import FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER
 from barpc.ba.judging.judge import Finding
+from barpc.base.errors import listed
 from barpc.base.geodesy import wrap_longitude
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, column
@@ -40,9 +41,10 @@ _EXPLANATION_SENTENCES = {
     TRANSIENT: "rows at the {end} of all images are displaced by up to {size:.2f} px, decaying in {length:.0f} rows",
     WANDER: "rows of {image} have a low-frequency displacement of {size:.2f} px",
     SWING: "rows of {image} have a sinusoidal displacement of {least}{size:.2f} px with a period of {period:.0f} rows",
-    MOVING: "{share:.0f} % of the tie points{side} move together (a cloud, water or shadows?), by {metres:.2g} m from "
-    "{between[0]} to {between[1]} apart from an effect of height, and were excluded",
+    MOVING: "{share:.0f} % of the tie points{side} move together ({cause}), by {metres:.2g} m from {between[0]} to "
+    "{between[1]} apart from an effect of height, and were excluded{control}{larger}",
 }
+_MINORITY = 1 / 3  # of the tie points: twice as many stand still; of more either part may be the one that moved
 EXPLANATION_WORDS = {
     STRIP: "displaced rows or columns of an image",
     FADE: "a decaying displacement of the rows of an image",
@@ -325,7 +327,11 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
         )
         between = names[one.motion.between[0]], names[one.motion.between[1]]
         words |= {"share": 100.0 * one.motion.share, "side": f", {side},", "metres": one.motion.metres}
-        words["between"] = between
+        words |= {"between": between, "cause": _motion_cause(*one.motion.dates), "larger": "", "control": ""}
+        if one.motion.gcps:
+            words["control"] = f", with the GCPs {listed(one.motion.gcps)}"
+        if one.motion.share > _MINORITY:
+            words["larger"] = "; the larger part of the ground was taken to stand still"
         fields = {"share": one.motion.share, "moved_m": one.motion.metres, "between": between, "box": box}
     elif one.where is not None:
         axis, start, stop, origin, rate = one.where
@@ -341,6 +347,14 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
     return ExplanationEntry(
         one.kind, _EXPLANATION_SENTENCES[one.kind].format(**words), None if of_all else image, *numbers, **fields
     )
+
+
+def _motion_cause(first: str, second: str) -> str:
+    """Return what may move between the dates of two views, in words; a date may be empty."""
+    objects, ground = "a cloud, water or shadows", "a glacier, a landslide, a fault"
+    if first and second:
+        return f"{objects}?" if first == second else f"{ground}, or change between {first} and {second}?"
+    return f"{objects}, or, between dates, {ground}?"
 
 
 def strangeness(apart: ForeignCamera) -> str:
