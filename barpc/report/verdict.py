@@ -10,6 +10,7 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import FOREIGN_CAMERA
+from barpc.ba.constraints.gauge import MOTIONS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
@@ -42,6 +43,7 @@ TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 MIN_PAIR_MATCHES = 30  # Of a pair that is called good for heights: they tell its offset to a fifth of its scatter
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
+_SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _IMAGE_CHECKED = "The image was checked"
@@ -117,15 +119,8 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
             f"The cameras are {common:.1f} times less accurate than stated: their standard deviations were widened, "
             "and with them the uncertainty of the scene's position."
         )
-    if found.in_space_rms is not None:
-        tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10)))
-        yield (
-            f"Check tie points keep residuals of {found.in_space_rms:.3f} px with a rotation and translation an image, "
-            f"of {median(found.held_out_rms):.3f} px with an affine in each image, which was selected. Possible "
-            "causes: images rotated, resampled or cropped after their RPCs were made, or RPCs of other images. The "
-            f"scene's tilts have standard deviations of {tilts} (east, north), its twist and bending of {bends} "
-            "(twist, east, north)."
-        )
+    if _is_bent(found):
+        yield from _of_image_model(found)
     if found.apart is not None and not found.apart.clear:
         error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"
         yield (
@@ -133,6 +128,25 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
             "them the rest agree, with all of them they do not. The tie points do not tell which: check the RPCs, or "
             "add an image."
         )
+
+
+def _is_bent(found: Adjustment) -> bool:
+    """Return whether tilts, twist and bending make heights at the scene's edge less certain than the scene's own."""
+    return bool(found.gauge.motion_sigma[_SHAPE].max() > found.gauge.sigma[2])
+
+
+def _of_image_model(found: Adjustment) -> Iterator[str]:
+    """Yield the selection of an affine in the image, and the uncertainty of the scene's shape with it."""
+    if found.in_space_rms is None:
+        return
+    tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (_SHAPE[:2], _SHAPE[2:]))
+    yield (
+        f"Check tie points keep residuals of {found.in_space_rms:.3f} px with a rotation and translation an image, "
+        f"of {median(found.held_out_rms):.3f} px with an affine in each image, which was selected. Possible "
+        "causes: images rotated, resampled or cropped after their RPCs were made, or RPCs of other images. At "
+        f"{metres(found.gauge.radius)} from the scene's middle its heights have standard deviations of {tilts} by its "
+        f"tilts (east, north), over the scene of {bends} by its twist and bending (twist, east, north)."
+    )
 
 
 def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
@@ -251,6 +265,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they shifted it by {enu(heights.motion)}."
         )
+    if not _is_bent(run.adjustment):
+        yield from _of_image_model(run.adjustment)
     yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
