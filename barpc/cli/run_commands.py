@@ -154,9 +154,11 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
     elif not obj["quiet"]:
         (col, row), (of_col, of_row) = found["size_px"], found["sigma_px"]
         better = sum(run["gain"] > 0 for run in found["runs"])
-        tell(f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, standard deviations "
-             f"{of_col:.4f} and {of_row:.4f} px; {len(found['edges'])} steps; of {len(runs)} runs left out in turn the residuals of "
-             f"{better} improve")  # fmt: skip
+        tell(
+            f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, standard deviations "
+            f"{of_col:.4f} and {of_row:.4f} px; {len(found['edges'])} steps; of {len(runs)} runs left out in turn the "
+            f"residuals of {better} improve"
+        )
         tell(out)
     return 0
 
