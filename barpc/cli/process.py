@@ -26,7 +26,7 @@ CLEAN_UP = 2.0
 
 
 def quicken() -> None:
-    """Let a process that is ours load modules quickly: in one of others all of it may be wanted.
+    """Shorten the start of barpc's own process; a host application's imports are left alone.
 
     Cycles are not looked for every 700 objects, and rasterio does not load boto3, a sixth of a second: what is on
     other hosts is opened by `barpc.base.remote`.

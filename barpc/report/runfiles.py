@@ -355,7 +355,7 @@ def _parsed(path: Path, text: Any, parse: Any) -> Any:
 def _table_columns(lines: Iterable[str], header: Sequence[str]) -> Iterator[list[tuple[str, ...]]]:
     """Yield the columns of a table, a part of its rows at a time; at the end of none."""
     rows = csv.reader(lines)
-    if tuple(next(rows)) != tuple(header):
+    if tuple(next(rows, ())) != tuple(header):
         raise ValueError(f"its columns are not {', '.join(header)}")
     while part := [*islice(rows, _TOGETHER)]:
         columns = [*zip(*part, strict=True)]

@@ -350,7 +350,7 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
 
 
 def _motion_cause(first: str, second: str) -> str:
-    """Return what may move between the dates of two views, in words; a date may be empty."""
+    """Return the possible causes of a motion between two views, by their dates, which may be empty, in words."""
     objects, ground = "a cloud, water or shadows", "a glacier, a landslide, a fault"
     if first and second:
         return f"{objects}?" if first == second else f"{ground}, or change between {first} and {second}?"
