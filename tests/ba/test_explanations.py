@@ -299,6 +299,9 @@ def test_a_strip_at_an_end_goes_on_beyond_it(monkeypatch, axis: int) -> None:
     for inside, ends in (
         (part < 0.2, (-size, 0.2 * size)),
         (part > 0.8, (0.8 * size, 2.0 * size)),
+        ((part > 0.8) & (part < 0.94), (0.8 * size, 2.0 * size)),  # two that contradict tell no end of it
+        ((part > 0.06) & (part < 0.2), (-size, 0.2 * size)),
+        ((part > 0.5) & (part < 0.7), (0.5 * size, 0.7 * size)),
         (part > 0.0, (-size, 2.0 * size)),
     ):
         gains(monkeypatch, s, inside)

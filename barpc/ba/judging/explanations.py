@@ -15,7 +15,7 @@ from barpc.ba.judging import moving
 from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA, MIN_SPLINES, AdditionalParameters
 from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.base.geodesy import Array
-from barpc.base.statistics import FEW, TIMES
+from barpc.base.statistics import FEW, SURE, TIMES
 from barpc.scene import IntArray
 from barpc.sensor.image_corrections import profile
 from barpc.sensor.image_corrections import sine_and_cosine as waves_of
@@ -177,6 +177,11 @@ def sharpened(seen: BlockResiduals, one: Explanation, found: MixtureFit, others:
     if one.kind == FADE:
         return _begun(seen, one, gain, place, sigma)
     first, last = _largest_part(gain)
+    # an end within the image has to gain: few ties beyond it, some of them wrong, are none
+    first, last = (
+        (0 if gain[:first].sum() > -SURE else first),
+        (len(gain) - 1 if gain[last + 1 :].sum() > -SURE else last),
+    )
     start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
     stop = np.inf if last == len(rows) - 1 else 0.5 * (place[last] + place[last + 1])
     ends = _open_ended(max(start, 0.0), min(stop, size), size)
