@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
     from barpc.report import Summary
+    from barpc.report.summary import StepEntry
     from barpc.tie.tasks import Progress
 
 
@@ -106,13 +107,17 @@ def print_summary(summary: Summary, root: str = "") -> None:
 
     `root`: that of the files that were written.
     """
-    from barpc.report.verdict import TABLE_ROWS_SHOWN, VERDICT_SENTENCES, sentences
+    from barpc.report.ranking import TABLE_ROWS_SHOWN
+    from barpc.report.verdict import VERDICT_SENTENCES, sentences
 
     width, lines = output_width(), sentences(summary)
+    folder = shlex.quote(summary.out_dir or ".")
+    steps = [f"Next: {_step_line(step, folder)}" for step in summary.next]
     counted = width and max(width, _TERMINAL_COLUMNS)  # nothing is dropped because a terminal is narrow
     for rows in range(TABLE_ROWS_SHOWN, 0, -1):
         tables = _tables(summary, rows)
-        room = MOST_LINES - 3 - bool(root) - sum(_height(table, counted) for table in tables)
+        room = MOST_LINES - 2 - bool(root) - sum(_height(table, counted) for table in tables)
+        room -= sum(len(_wrapped(step, counted)) for step in steps)
         if room >= min(len(lines), VERDICT_SENTENCES):
             break
     for title, texts, more in tables:
@@ -123,14 +128,18 @@ def print_summary(summary: Summary, root: str = "") -> None:
         echo(f"Written to {summary.out_dir}")
         if root:
             echo(f"Root: {root}")
-        if any(view.outputs for view in summary.views):
-            folder = shlex.quote(summary.out_dir)
-            echo(f"Orthoimages by GDAL: barpc export {folder} ortho --to ortho && sh ortho/ortho.sh")
+    _echo_lines(steps, width)
+
+
+def _step_line(step: StepEntry, folder: str) -> str:
+    """Return a step as a line, its commands with the folder of the run."""
+    commands = "; ".join(command.replace(" . ", f" {folder} ") for command in step.commands)
+    return f"{step.text[:-1]}: {commands}" if commands else step.text
 
 
 def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
     """Return titles, cells and a remark on omitted rows: of many rows the worst of those beyond a limit are kept."""
-    from barpc.report import verdict
+    from barpc.report import ranking
     from barpc.report.records import table
     from barpc.report.summary.block import DATUM, DatumEntry
     from barpc.report.summary.ground_points import GCP_CAPTION, GcpEntry
@@ -138,8 +147,8 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     from barpc.report.summary.views import ViewEntry
 
     views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
-    some_views = views if len(views) <= rows else verdict.flagged(views)[:rows]
-    some_pairs = pairs if len(pairs) <= rows else verdict.torn(pairs)[:rows]
+    some_views = views if len(views) <= rows else ranking.flagged(views)[:rows]
+    some_pairs = pairs if len(pairs) <= rows else ranking.torn(pairs)[:rows]
     datum = () if summary.scene is None else summary.scene.datum
     if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()

@@ -16,10 +16,10 @@ from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_un
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
 from barpc.report.compare import written_rpc
+from barpc.report.ranking import sure_pairs
 from barpc.report.runfiles import RunFiles, read_summary, read_tables
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
-from barpc.report.verdict import sure_pairs
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray

@@ -18,13 +18,13 @@ import numpy as np
 
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.report.ranking import TABLE_ROWS_SHOWN, flagged, worst_first
 from barpc.report.records import MAX_SHOWN
 from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
 from barpc.report.summary.words import counted, known, metres
-from barpc.report.verdict import TABLE_ROWS_SHOWN, flagged, worst_first
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images

@@ -19,6 +19,15 @@ from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
 from barpc.report.quality_checks import GOOD_RMSE
+from barpc.report.ranking import (
+    MIN_PAIR_MATCHES,
+    TABLE_ROWS_SHOWN,
+    flagged,
+    offset_of,
+    sure_pairs,
+    worst_first,
+    worst_pairs,
+)
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
@@ -27,17 +36,7 @@ from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, Gcp
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import NAMED, largest
-from barpc.report.verdict import (
-    MIN_PAIR_MATCHES,
-    TABLE_ROWS_SHOWN,
-    VERDICT_SENTENCES,
-    flagged,
-    offset_of,
-    sentences,
-    sure_pairs,
-    worst_first,
-    worst_pairs,
-)
+from barpc.report.verdict import VERDICT_SENTENCES, sentences
 from barpc.scene import connected_groups
 
 REPORT_FILE = "report.html"
@@ -66,6 +65,7 @@ def report_html(summary: Summary, folder: Path | str) -> str:
         template("template.html.j2").render(
             summary=summary,
             sections=shown,
+            keys={section.key: section.question for section in shown},
             verdict=sentences(summary),
             large=len(summary.views) > TABLE_ROWS_SHOWN,
             shown_lines=VERDICT_SENTENCES,

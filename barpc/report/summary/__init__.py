@@ -21,7 +21,7 @@ from barpc.report.summary.block import SceneEntry, measure_scene
 from barpc.report.summary.ground_points import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
 from barpc.report.summary.pairs import PairEntry, measure_pairs
 from barpc.report.summary.views import ViewEntry, measure_views
-from barpc.report.summary.words import ABOVE, Count
+from barpc.report.summary.words import ABOVE, Count, Vector
 
 SCHEMA = 3  # Version of summary.json
 _Plain = float | str | bool | None
@@ -53,6 +53,23 @@ class OutputEntry(Record):
 
     file: str = column("Its name in the run folder")
     sha256: str = column("SHA-256 of its bytes")
+
+
+class ExpectedEntry(Record):
+    """The standard deviation to expect with a further input, by the covariance."""
+
+    source: Literal["dem", "gcps"] = column("A DEM of known vertical datum; three GCPs of the accuracy assumed")
+    sigma_enu_m: Vector = column("Standard deviation of the scene's position with it; null: not predicted", "m")
+
+
+class StepEntry(Record):
+    """A next step: use of the results, a further input, or a review."""
+
+    kind: Literal["use", "improve", "review"] = column("Files to hand over; further inputs; parts to review")
+    text: str = column("The step as a sentence", minLength=1)
+    commands: tuple[str, ...] = column("Commands for it, where . is the run folder", default=())
+    expected: tuple[ExpectedEntry, ...] = column("Effect of further inputs", default=())
+    part: str | None = column("Part of report.html that shows it", default=None)
 
 
 class TracksEntry(Record):
@@ -104,6 +121,7 @@ class Summary(Record):
     check_points: tuple[CheckPointEntry, ...] = column("Check points, which the adjustment did not use")
     options: Mapping[str, _Value | Mapping[str, _Value | Mapping[str, _Value]]] | None = column("Options of the run")
     versions: Mapping[str, str] = column("Versions of Python and packages")
+    next: tuple[StepEntry, ...] = column("Next steps, at most one of a kind", default=())
     control_test: ControlTestEntry | None = column("Test of the residuals of control", default=None)
     reference: ReferenceEntry | None = column("A reference orthoimage, where one was given", default=None)
     inputs: tuple[InputEntry, ...] | None = column("Every input file, for `barpc verify`", default=None)

@@ -1,0 +1,181 @@
+"""Next steps of a run: files to hand over, inputs that would improve it with their expected gain, parts to review."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from barpc.ba.constraints.gauge import MOTIONS, SIMILAR
+from barpc.ba.constraints.ground import KNOWN_BIAS
+from barpc.base.errors import listed
+from barpc.base.geodesy import Array
+from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.report.quality_checks import lengths
+from barpc.report.ranking import flagged, sure_pairs
+from barpc.report.records import value_of
+from barpc.report.summary import ExpectedEntry, StepEntry, Summary
+from barpc.report.summary.block import SceneEntry
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, metres
+
+MIN_GAIN = 1.5  # A standard deviation that falls by less is not worth an input: the prediction is as good as that
+NUM_GCPS = 3  # the fewest of which two can outvote a wrong one
+_PLACE = slice(0, 3)  # of the scene's motions: east, north, up
+_HEIGHTS = [MOTIONS.index(name) for name in ("up", "tilt east", "tilt north")]  # a DEM's level and slopes
+_LINE = 160  # characters of a reservation that is not of an image
+
+_PARTS = {
+    **dict.fromkeys(("no_overlap", "untied", "few", "none", "few_gcps", "gap"), "map"),
+    **dict.fromkeys(("contradicted", "systematic", "rejected", "wrong_matches", "place", "beside"), "random"),
+    **dict.fromkeys(("held_out", "left", "moving_objects"), "random"),
+    **dict.fromkeys(("foreign_camera", "odd"), "moves"),
+    **dict.fromkeys(("one_rpc_misses", "follows_more"), "files"),
+}
+"""Cause of a reservation -> the part of the report that shows it; others: the table of images."""
+
+
+def next_steps(summary: Summary) -> tuple[StepEntry, ...]:
+    """Return the next steps of a run, at most one of each kind: use, improve, review.
+
+    Parameters
+    ----------
+    summary : Summary
+        Of a run, with its verdict.
+
+    Returns
+    -------
+    steps : tuple of StepEntry
+        Empty where nothing was written, nothing would help and nothing needs review.
+    """
+    use = {"adjust": _hand_over, "check": _adjust, "match": _adjust_matched}[summary.kind]
+    return (*use(summary), *_improve(summary), *_review(summary))
+
+
+# --- files to hand over ------------------------------------------------------------------------------------
+
+
+def _hand_over(summary: Summary) -> Iterator[StepEntry]:
+    """Yield the files of the images without reservation, and the commands that such images are enough for."""
+    good = [view for view in summary.views if view.outputs and not view.advice]
+    if not good:
+        return
+    # the file that stands for the image, before texts of RPCs alone
+    files = [next((f for f in view.outputs if f.endswith((".vrt", ".tif"))), next(iter(view.outputs))) for view in good]
+    heights = [pair for pair in sure_pairs(summary.views, summary.pairs) if pair.height_m_per_px]
+    commands = ["barpc export . ortho --to ortho && sh ortho/ortho.sh"]
+    best = ""
+    if heights:
+        pair = min(heights, key=lambda pair: pair.height_m_per_px or np.inf)
+        best = f"; best pair for heights: {pair.a} - {pair.b}, {metres(pair.height_m_per_px or np.nan)} per pixel"
+        best += " (cars and asp are exported as s2p is)"
+        commands = ["barpc dsm . -o dsm.tif", "barpc export . s2p --to s2p", *commands]
+    start = "Hand over" if summary.passed else "After review, hand over"
+    yield StepEntry("use", f"{start} {listed(files, NAMED)}{best}.", tuple(commands))
+
+
+def _adjust(summary: Summary) -> Iterator[StepEntry]:
+    """Yield the adjustment of cameras that disagree."""
+    if any(view.cause == "disagrees" for view in summary.views):
+        yield StepEntry("use", "The cameras disagree: adjust them.", ("barpc adjust IMAGE... -o adjusted",))
+
+
+def _adjust_matched(summary: Summary) -> Iterator[StepEntry]:
+    if summary.tracks.num_tracks:
+        command = "barpc adjust IMAGE... --matches matches.npz --matches-only -o adjusted"
+        yield StepEntry("use", "Adjust the cameras with these tie points.", (command,))
+
+
+# --- inputs that would improve it --------------------------------------------------------------------------------
+
+
+def _improve(summary: Summary) -> Iterator[StepEntry]:
+    """Yield the inputs that lower a standard deviation of the scene's position by more than `MIN_GAIN`."""
+    scene, covariance = summary.scene, None if summary.scene is None else _covariance(summary.scene)
+    # of GCPs in use that do not agree the covariance is not that of the scene
+    if scene is None or covariance is None or any(gcp.status == "contradicts" for gcp in summary.gcps):
+        return
+    now = np.sqrt(np.diag(covariance))[_PLACE]
+    options, found, words = summary.options or {}, list[ExpectedEntry](), list[str]()
+    if not (options.get("dem") or options.get("reference")):
+        then = _sigma_with(covariance, *_dem_observations(options))
+        if now[2] > MIN_GAIN * then[2]:
+            found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
+            words.append(f"with a DEM of known vertical datum (--dem, --geoid): height to about {metres(then[2])}")
+    then = _sigma_with(covariance, *_gcp_observations(summary, scene))
+    if (now > MIN_GAIN * then).any():
+        found.append(ExpectedEntry("gcps", tuple(then.tolist())))
+        accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
+        words.append(f"with {NUM_GCPS} GCPs accurate to {accuracy} (--gcp): to about {lengths(then)}")
+    if found:
+        text = f"The scene's position is uncertain by {lengths(now)} (east, north, up; 1 sigma); {'; '.join(words)}."
+        yield StepEntry("improve", text, expected=tuple(found), part="gauge")
+
+
+def _covariance(scene: SceneEntry) -> Array | None:
+    """Return the covariance (10, 10) of the scene's motions [m^2]; None where it is not known."""
+    found = np.full((len(MOTIONS), len(MOTIONS)), np.nan)
+    for mode in scene.weakest_modes:
+        column = np.array([mode.sigma_m, *mode.motion_m], dtype=np.float64)
+        if len(column) == len(MOTIONS) + 1:
+            found[:, MOTIONS.index(mode.meaning)] = column[0] * column[1:]
+    return 0.5 * (found + found.T) if np.isfinite(found).all() else None
+
+
+def _sigma_with(covariance: Array, rows: Array, variance: Array) -> Array:
+    """Return standard deviations (3,) east, north, up [m] after observations `rows` (n, 10) of given variance (n,)."""
+    gain = np.linalg.solve(rows @ covariance @ rows.T + np.diag(variance), rows @ covariance)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance - covariance @ rows.T @ gain), 0.0))[_PLACE])
+
+
+def _dem_observations(options: Mapping[str, object]) -> tuple[Array, Array]:
+    """Return the observations of a DEM: level and slopes, with the error common to its heights."""
+    adjust = options.get("adjust")
+    given = adjust.get("dem_bias_sigma") if isinstance(adjust, Mapping) else None
+    bias = float(given or KNOWN_BIAS)
+    return np.eye(len(MOTIONS))[_HEIGHTS], np.full(len(_HEIGHTS), bias**2)
+
+
+def _gcp_observations(summary: Summary, scene: SceneEntry) -> tuple[Array, Array]:
+    """Return the observations of GCPs around the scene, at the RMS distance of its tie points from their centre.
+
+    The variance is that of the GCP, of its image coordinates in as many images as a tie point has, and of the bending
+    of the scene, whose sigmas are ranges: half of each from the middle.
+    """
+    angle = 2.0 * np.pi * np.arange(NUM_GCPS) / NUM_GCPS
+    east, north, one, zero = np.cos(angle), np.sin(angle), np.ones(NUM_GCPS), np.zeros(NUM_GCPS)
+    by_motion = np.zeros((3, NUM_GCPS, len(MOTIONS)))  # of the motions before bends, as the gauge counts them
+    by_motion[0, :, :SIMILAR] = np.column_stack([one, zero, zero, zero, zero, -north, east])
+    by_motion[1, :, :SIMILAR] = np.column_stack([zero, one, zero, zero, zero, east, north])
+    by_motion[2, :, :SIMILAR] = np.column_stack([zero, zero, one, east, north, zero, zero])
+    seen = max(summary.tracks.num_observations / max(summary.tracks.num_tracks, 1), 1.0)
+    pixel = float(np.median([view.gsd_m or 0.0 for view in summary.views]))
+    per_pixel = [pair.height_m_per_px for pair in summary.pairs if pair.height_m_per_px]
+    flat = (IMAGE_SIGMA * pixel) ** 2 / seen
+    # a parallax is the difference of two image coordinates
+    up = 2.0 * (IMAGE_SIGMA * min(per_pixel, default=pixel)) ** 2
+    bends = [mode.sigma_m or 0.0 for mode in scene.weakest_modes if MOTIONS.index(mode.meaning) >= SIMILAR]
+    up += float(np.sum(np.square(bends))) / 4.0
+    variance = GROUND_SIGMA**2 + np.repeat([flat, flat, up], NUM_GCPS)
+    return by_motion.reshape(-1, len(MOTIONS)), variance
+
+
+# --- parts to review ---------------------------------------------------------------------------------------
+
+
+def _review(summary: Summary) -> Iterator[StepEntry]:
+    """Yield the worst reservation: of images first, then of files that were left out, then of the block."""
+    if views := flagged(summary.views):
+        alike = [view.name for view in views if (view.cause, view.status) == (views[0].cause, views[0].status)]
+        label = CAUSES[views[0].cause].label if views[0].cause in CAUSES else STATUS_WORDS[views[0].status]
+        rest = len(views) - len(alike)
+        more = f", then at {counted(rest, 'more image')}" if rest else ""
+        part = _PARTS.get(views[0].cause or "", "images")
+        yield StepEntry("review", f"Look at {listed(alike, NAMED)} ({label}){more}.", part=part)
+    elif summary.left_out:
+        names = listed([one.path for one in summary.left_out], NAMED)
+        yield StepEntry("review", f"Check the files that were left out: {names}.")
+    elif summary.reasons:
+        of_control = any(gcp.status not in ("used", "not seen") for gcp in summary.gcps)
+        text = textwrap.shorten(f"Review: {summary.reasons[0]}", _LINE, placeholder=" ...")
+        yield StepEntry("review", text, part="gauge" if of_control or value_of(summary, "scene.dem") else "decisions")

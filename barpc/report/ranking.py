@@ -1,0 +1,54 @@
+"""Images and pairs in the order in which they are shown: the worst first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from barpc.report.quality_checks import GOOD_RMSE
+from barpc.report.summary.pairs import PairEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import CAUSES, STATUS_WORDS
+
+TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
+MIN_PAIR_MATCHES = 30  # Of a pair that is called good for heights: they tell its offset to a fifth of its scatter
+
+
+def worst_first(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Return images sorted by verdict, cause and error; those without reservation last, in their order."""
+    return sorted(views, key=_badness)
+
+
+def _badness(view: ViewEntry) -> tuple[int, int, float]:
+    if not view.advice:
+        return 1, 0, 0.0
+    cause = list(CAUSES).index(view.cause) if view.cause in CAUSES else len(CAUSES)
+    errors = (view.rmse_after, view.held_out_px, view.rmse_before if view.rmse_after is None else None)
+    worst = max((error for error in errors if error is not None), default=0.0)
+    return -list(STATUS_WORDS).index(view.status), cause, -worst
+
+
+def flagged(views: Sequence[ViewEntry]) -> list[ViewEntry]:
+    """Return images with a reservation, the worst first."""
+    return [view for view in worst_first(views) if view.advice]
+
+
+def offset_of(pair: PairEntry) -> float:
+    """Return the epipolar offset (RMS) of a pair at the end of its run [px]; 0 where unknown."""
+    before, after = pair.offset_rms
+    return (before if pair.epipolar_after is None else after) or 0.0
+
+
+def worst_pairs(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs with an epipolar offset above the limit of stereo, the largest first, then the others."""
+    return sorted(pairs, key=lambda pair: -max(offset_of(pair), GOOD_RMSE))
+
+
+def sure_pairs(views: Sequence[ViewEntry], pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs of images without reservation, with at least `MIN_PAIR_MATCHES` matches."""
+    doubted = {view.name for view in views if view.advice}
+    return [pair for pair in pairs if pair.num_matches >= MIN_PAIR_MATCHES and not {pair.a, pair.b} & doubted]
+
+
+def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
+    """Return pairs whose epipolar offset exceeds the limit of stereo, the worst first."""
+    return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]

@@ -1,0 +1,292 @@
+"""What a run says to do next: predictions against runs with the input that they speak of, and what is left unsaid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import click
+import numpy as np
+import pytest
+
+from barpc import report
+from barpc.ba import Adjustment, adjust_tracks
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.base.options import AdjustOptions, RunOptions
+from barpc.cli import cli
+from barpc.cli.terminal import print_summary
+from barpc.export import TARGETS
+from barpc.report import Run, Summary
+from barpc.report.next_steps import _PARTS, next_steps
+from barpc.report.page import _QUESTIONS, report_html
+from barpc.report.records import json_form
+from barpc.report.summary import LeftOutEntry, StepEntry
+from barpc.report.summary.words import CAUSES
+from barpc.scene import GroundPoints
+from barpc.sensor.corrected import Corrected
+from barpc.simulate import SimulatedBlock, simulate_block
+
+from .made import a_gcp, a_pair, a_summary, a_view
+
+OFF = 1.5  # a prediction is right to this factor, both ways
+OPTIONS = AdjustOptions(dem_sigma=2.0)
+
+
+class Hills:
+    """A terrain whose vertical datum is known, `off` metres too high."""
+
+    known = True
+
+    def __init__(self, off: float = 0.0) -> None:
+        self.off = off
+
+    def __call__(self, lon: Array, lat: Array) -> Array:
+        return np.asarray(300.0 + self.off + 120.0 * np.sin(lon * 700.0) * np.cos(lat * 500.0))
+
+
+class Case:
+    """A block whose tie points lie on the hills, seen by the true cameras, and its ground control."""
+
+    def __init__(self, views: int, **options: object) -> None:
+        made = simulate_block(views, 1200, seed=3, num_gcps=0, **options)
+        self.exact = [Corrected(v.sensor, c) for v, c in zip(made.views, made.truth.corrections, strict=True)]
+        self.ground = made.truth.ground.copy()
+        self.ground[:, 2] = Hills()(*self.ground[:, :2].T)
+        tracks, rng = made.tracks, np.random.default_rng(7)
+        self.rng = rng
+        xy = self.seen(self.ground, tracks.point, tracks.view) + rng.normal(0.0, 0.1, tracks.xy.shape)
+        self.block: SimulatedBlock = replace(made, tracks=replace(tracks, xy=xy, sigma=np.full(len(xy), 0.1)))
+
+    def seen(self, ground: Array, point: Array, view: Array) -> Array:
+        xy = np.empty((len(view), 2))
+        for v, camera in enumerate(self.exact):
+            xy[view == v] = camera.project(ground[point[view == v]])
+        return xy
+
+    def control(self, num: int, wrong: float = 0.0) -> GroundPoints:
+        """Points of 1 m and 0.5 px spread over the block; the first one `wrong` metres too far east."""
+        tracks = self.block.tracks
+        long = np.flatnonzero(np.bincount(tracks.point) == min(len(self.exact), 3))
+        angle = 2.0 * np.pi * np.arange(num) / num
+        at = (self.ground[:, :2] - self.ground[:, :2].mean(axis=0)) / self.ground[:, :2].std(axis=0)
+        want = np.column_stack([np.cos(angle), np.sin(angle)])
+        chosen = np.array([long[np.argmin(((at[long] - one) ** 2).sum(axis=1))] for one in want])
+        rows = np.flatnonzero(np.isin(tracks.point, chosen))
+        point = np.searchsorted(np.sort(chosen), tracks.point[rows])
+        ground = self.ground[np.sort(chosen)].copy()
+        xy = self.seen(ground, point, tracks.view[rows]) + self.rng.normal(0.0, 0.5, (len(rows), 2))
+        metre = np.array([1.0 / 81000.0, 1.0 / 111000.0, 1.0])
+        ground += self.rng.normal(0.0, 1.0, ground.shape) * metre
+        ground[0, 0] += wrong * metre[0]
+        names = tuple(f"P{k}" for k in range(num))
+        return GroundPoints(names, ground, np.ones((num, 3)), point, tracks.view[rows], xy, np.full(len(rows), 0.5))
+
+    def adjusted(self, gcps: GroundPoints | None = None, dem: Hills | None = None) -> tuple[Summary, Adjustment]:
+        block = self.block
+        found = adjust_tracks(block.views, block.tracks, OPTIONS, gcps, dem)
+        options = RunOptions(adjust=OPTIONS, gcp=("p.gcp",) if gcps else (), dem=("dem.tif",) if dem else ())
+        written = tuple({f"{view.name}.vrt": {"gdal": 1e-9}, f"{view.name}_RPC.TXT": {}} for view in block.views)
+        run = Run("adjust", block.views, (), block.tracks, adjustment=found, options=options, gcps=gcps)
+        return report.summarize(replace(run, written=written)), found
+
+    def off(self, found: Adjustment) -> Array:
+        """How far the scene lies from its true place, east, north, up [m]."""
+        moved = (found.points[: len(self.ground)] - ecef_from_ground(self.ground)) @ enu_basis(self.ground[0]).T
+        return np.asarray(np.nanmean(moved, axis=0))
+
+
+@pytest.fixture(scope="module", params=[(2, {}), (3, {}), (5, {"per_site": 5}), (3, {"attitude": 40e-6})], ids=str)
+def case(request) -> Case:
+    views, options = request.param
+    return Case(views, **options)
+
+
+def expected(summary: Summary) -> dict[str, tuple[float | None, ...]]:
+    return {one.source: one.sigma_enu_m for step in summary.next for one in step.expected}
+
+
+def test_a_dem_and_control_do_what_was_promised_of_them(case):
+    plain, _ = case.adjusted()
+    promised = expected(plain)
+    assert list(promised) == ["dem", "gcps"]
+    with_dem, by_dem = case.adjusted(dem=Hills(5.0))
+    up = promised["dem"][2]
+    assert up is not None
+    assert 1 / OFF < by_dem.gauge.sigma[2] / up < OFF
+    assert abs(case.off(by_dem)[2]) < 3.0 * up  # of heights that are 5 m too high
+    _, by_gcps = case.adjusted(case.control(3))
+    ratio = by_gcps.gauge.sigma / promised["gcps"]
+    assert (ratio > 1 / OFF).all(), ratio
+    assert (ratio < OFF).all(), ratio
+    assert (np.abs(case.off(by_gcps)) < 4.0 * np.array(promised["gcps"], float)).all()
+    # what was given is not asked for again, and what is left is told of the run as it is
+    assert "dem" not in expected(with_dem)
+
+
+def kinds(summary: Summary) -> list[str]:
+    return [step.kind for step in summary.next]
+
+
+@pytest.fixture(scope="module")
+def triplet() -> Case:
+    return Case(3)
+
+
+def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
+    plain, _ = triplet.adjusted()
+    assert kinds(plain) == ["use", "improve"]
+    use, improve = plain.next
+    files = "view_0000.vrt, view_0001.vrt, view_0002.vrt"
+    assert use.text.startswith(f"Hand over {files}; best pair for heights: ")
+    best = min(plain.pairs, key=lambda pair: pair.height_m_per_px)
+    assert f"{best.a} - {best.b}, " in use.text
+    assert [command.split()[1:4] for command in use.commands] == [
+        ["dsm", ".", "-o"], ["export", ".", "s2p"], ["export", ".", "ortho"]
+    ]  # fmt: skip
+    for command in use.commands:
+        verb = cli.get_command(click.Context(cli), command.split()[1])
+        assert verb is not None
+        verb.make_context(None, command.replace(" . ", " adjusted ").split(" && ")[0].split()[2:])
+    assert use.commands[1].split()[3] in TARGETS
+    assert improve.part == "gauge"
+    assert "--dem" in improve.text
+    assert "--gcp" in improve.text
+
+
+def test_a_run_with_good_control_asks_for_nothing(triplet):
+    summary, _ = triplet.adjusted(triplet.control(5))
+    assert summary.passed
+    assert kinds(summary) == ["use"]
+
+
+def test_with_a_dem_only_control_is_asked_for_and_with_wrong_control_the_part_that_shows_it(triplet):
+    summary, _ = triplet.adjusted(dem=Hills())
+    assert list(expected(summary)) == ["gcps"]
+    wrong, _ = triplet.adjusted(triplet.control(5, wrong=60.0))
+    assert not wrong.passed
+    last = wrong.next[-1]
+    assert (last.kind, last.part) == ("review", "gauge")
+    assert "P0" in last.text
+    assert wrong.next[0].text.startswith("After review, hand over")
+
+
+def test_control_in_use_that_does_not_agree_promises_nothing(triplet):
+    summary, _ = triplet.adjusted()
+    assert expected(summary)
+    torn = replace(summary, gcps=(a_gcp("P", 5.0, 43.0, status="contradicts"),))
+    assert not {step.kind for step in next_steps(torn)} & {"improve"}
+
+
+@pytest.mark.parametrize("motion", [None, float("nan")])
+def test_a_covariance_that_is_not_known_promises_nothing(triplet, motion):
+    summary, _ = triplet.adjusted()
+    scene = summary.scene
+    assert scene is not None
+    first = scene.weakest_modes[0]
+    modes = (replace(first, motion_m=(motion, *first.motion_m[1:])), *scene.weakest_modes[1:])
+    for some in (modes, scene.weakest_modes[:-1], ()):
+        assert not expected(
+            replace(summary, next=next_steps(replace(summary, scene=replace(scene, weakest_modes=some))))
+        )
+
+
+def test_no_gain_is_promised_that_is_smaller_than_the_prediction_is_sure_of(triplet):
+    """A DEM that is wrong by more than the cameras are."""
+    summary, _ = triplet.adjusted()
+    coarse = {**(summary.options or {}), "adjust": {"dem_bias_sigma": summary.scene.sigma_enu_m[2]}}  # type: ignore[union-attr]
+    steps = next_steps(replace(summary, options=coarse))
+    assert [one.source for step in steps for one in step.expected] == ["gcps"]
+
+
+def flagged_view(cause: str | None, name: str = "B", **fields):
+    known = CAUSES.get(cause or "")
+    status = known.status if known else "doubtful"
+    return a_view(name, cause=cause, advice="something", status=status, outputs={f"{name}.vrt": {}}, **fields)
+
+
+@pytest.mark.parametrize("cause", [*CAUSES, None])
+def test_a_flagged_image_is_not_handed_over_and_the_part_that_shows_it_is_linked(cause):
+    good = [a_view(name, outputs={f"{name}_RPC.TXT": {}, f"{name}.tif": {}}) for name in "AC"]
+    views = [good[0], flagged_view(cause), good[1]]
+    pairs = [a_pair("A", "B", height_m_per_px=0.1), a_pair("A", "C", height_m_per_px=2.0)]
+    use, review = next_steps(a_summary(views, pairs, passed=False, status="look"))
+    assert "A.tif" in use.text
+    assert "C.tif" in use.text
+    assert "B." not in use.text
+    assert "A - C, 2.0 m per pixel" in use.text
+    assert review.text.startswith("Look at B (")
+    assert review.part in _QUESTIONS
+
+
+def test_one_line_names_some_of_three_hundred_images_and_counts_the_others():
+    views = [a_view(f"v{k:03d}", outputs={f"v{k:03d}.vrt": {}}) for k in range(280)]
+    views += [flagged_view("few", f"w{k:02d}") for k in range(20)]
+    views += [flagged_view("contradicted", f"x{k:02d}") for k in range(3)]
+    steps = next_steps(a_summary(views, passed=False, status="look"))
+    assert all(len(step.text) < 250 for step in steps)
+    assert "then at 20 more images" in steps[-1].text
+
+
+def test_one_image_is_handed_over_for_an_orthoimage_and_for_no_surface():
+    (use,) = next_steps(a_summary([a_view("A", outputs={"A.vrt": {}})]))
+    assert len(use.commands) == 1
+    assert "ortho" in use.commands[0]
+    assert "best pair" not in use.text
+
+
+def test_nothing_is_handed_over_of_a_run_that_wrote_nothing():
+    assert not next_steps(a_summary([a_view("A"), a_view("B")], [a_pair()]))
+
+
+def test_files_that_were_left_out_and_reservations_of_the_block_are_reviewed():
+    views = [a_view("A"), a_view("B")]
+    summary = a_summary(views, passed=False, reasons=("x " * 300,))
+    (step,) = next_steps(summary)
+    assert step.part == "decisions"
+    assert len(step.text) <= 160
+    (step,) = next_steps(replace(summary, left_out=(LeftOutEntry("c.tif", "no RPC"),)))
+    assert "c.tif" in step.text
+
+
+@pytest.mark.parametrize(("kind", "cause", "words"), [
+    ("check", "disagrees", "barpc adjust IMAGE... -o adjusted"),
+    ("match", None, "barpc adjust IMAGE... --matches matches.npz --matches-only -o adjusted"),
+])  # fmt: skip
+def test_a_check_and_matches_lead_to_an_adjustment(kind, cause, words):
+    views = [flagged_view(cause) if cause else a_view("B"), a_view("A")]
+    assert next_steps(a_summary(views, kind=kind))[0].commands == (words,)
+
+
+def test_a_check_of_cameras_that_agree_has_no_next_step():
+    assert not next_steps(a_summary([a_view("A"), a_view("B")], [a_pair()], kind="check"))
+
+
+def test_parts_are_those_of_the_report_and_causes_those_there_are():
+    assert set(_PARTS) <= set(CAUSES)
+    assert set(_PARTS.values()) <= set(_QUESTIONS)
+
+
+def test_the_terminal_ends_with_the_steps_and_the_folder_that_was_written(triplet, capsys):
+    summary, _ = triplet.adjusted()
+    print_summary(replace(summary, out_dir="a run"))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.startswith("Next: ") for line in lines[-3:]] == [False, True, True]
+    assert "barpc dsm 'a run' -o dsm.tif; barpc export 'a run' s2p --to s2p; " in lines[-2]
+    assert lines[-1] == f"Next: {summary.next[1].text}"
+
+
+def test_the_page_shows_the_steps_before_its_questions_and_links_to_parts_that_it_has(block_run):
+    pytest.importorskip("jinja2")
+    steps = (StepEntry("use", "Use <it>.", ("barpc dsm . -o dsm.tif",)), StepEntry("review", "Look.", part="gauge"))
+    html = report_html(replace(block_run.record, next=steps), block_run.folder)
+    box = html[html.index('<div class="next">') : html.index("<nav")]
+    assert "<li>Use &lt;it&gt;. In this folder: <code>barpc dsm . -o dsm.tif</code></li>" in box
+    assert '<li>Look. <a href="#gauge">' in box
+    assert '<section id="gauge"' in html
+    gone = (replace(steps[1], part="accuracy"),)  # there are no check points
+    assert '<a href="#accuracy">' not in report_html(replace(block_run.record, next=gone), block_run.folder)
+    assert '<div class="next">' not in report_html(replace(block_run.record, next=()), block_run.folder)
+
+
+def test_the_file_holds_the_steps_and_gives_them_back(triplet):
+    summary, _ = triplet.adjusted()
+    assert Summary.read(json_form(summary)).next == summary.next
