@@ -131,6 +131,7 @@ def ground_map(files: RunFiles) -> str:
     placed = np.array([(point.lon, point.lat) for *_, point in points], dtype=np.float64).reshape(-1, 2)
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], placed]))
     lines, words, bar, taken = _graticule(plane)
+    triangles = [(x, y, 5.0) for x, y in plane(placed).tolist()]  # half their width
     told = () if summary.scene is None else summary.scene.explanations
     groups = [(one.sentence, np.array([one.box[:2], one.box[2:]])) for one in told if one.box is not None]
     drawn = _drawn(files)
@@ -149,7 +150,7 @@ def ground_map(files: RunFiles) -> str:
         groups=[(sentence, *plane(ends).ravel()[[0, 3, 2, 1]].tolist()) for sentence, ends in groups],
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
         pairs=_pair_lines(middles, files),
-        shown=_map_labels([(view, middles[view.name]) for view in named], taken),
+        shown=_map_labels([(view, middles[view.name]) for view in named], taken, triangles),
         marks=[(kind, point.name, x, y, up) for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)],
         summary=summary,
     )
@@ -169,11 +170,12 @@ OccupiedAreas = list[tuple[float, float, float]]  # places that words have on th
 
 
 def _map_labels(
-    places: Sequence[tuple[ViewEntry, Array]], taken: OccupiedAreas
+    places: Sequence[tuple[ViewEntry, Array]], taken: OccupiedAreas, marks: OccupiedAreas | None = None
 ) -> list[tuple[ViewEntry, str, float, float]]:
     """Return labels of images at positions (2,), without those that would cover others or occupied areas.
 
-    A name tells how many images have their middle in the same place.
+    Labels that would cover `marks` stand a line below or above, if there is room. A name tells how many images have
+    their middle in the same place.
     """
     taken, names, every = list(taken), [], np.array([place for _, place in places])
     for view, place in places:
@@ -184,10 +186,16 @@ def _map_labels(
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 3.6 * len(name)
         x = min(max(x, half), WIDTH - half)
-        if all(abs(x - u) > half + other or abs(y - v) > _LABEL_HEIGHT for u, v, other in taken):
+        if _has_room(x, y, half, taken):
+            rows = (y, y + 1.1 * _LABEL_HEIGHT, y - 1.1 * _LABEL_HEIGHT)
+            y = next((row for row in rows if _has_room(x, row, half, [*taken, *(marks or ())])), y)
             taken.append((x, y, half))
             names.append((view, name, x, y))
     return names
+
+
+def _has_room(x: float, y: float, half: float, taken: OccupiedAreas) -> bool:
+    return all(abs(x - u) > half + other or abs(y - v) > _LABEL_HEIGHT for u, v, other in taken)
 
 
 def _pair_lines(middles: Mapping[str, Array], files: RunFiles) -> list[tuple[PairEntry, float, Array, Array]]:
@@ -285,7 +293,8 @@ def residual_panels(
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    key = f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn at twice that scale."
+    shown = float(f"{longest:.2g}")  # two digits, and no power of ten for residuals of hundreds of pixels
+    key = f"Scale bar: {shown:g} px of a single residual; bold arrows are drawn at twice that scale."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
         key += "those that need review, then " * bool(first) + "those with the largest systematic part."

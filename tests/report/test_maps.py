@@ -217,6 +217,19 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
         )
 
 
+def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_them():
+    place, mark = [(a_view("V"), np.array([50.0, 50.0]))], (52.0, 49.0, 5.0)
+    rows = {
+        "free": [],
+        "below": [mark],
+        "above": [mark, (50.0, 66.0, 5.0)],
+        "nowhere": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
+    }
+    found = {key: [y for *_, y in maps._map_labels(place, [], marks)] for key, marks in rows.items()}
+    assert found == {"free": [50.0], "below": [pytest.approx(65.4)], "above": [pytest.approx(34.6)], "nowhere": [50.0]}
+    assert maps._map_labels(place, [(50.0, 66.0, 5.0), (50.0, 34.0, 5.0)], [mark])[0][3] == 50.0  # words are no room
+
+
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
     # seven pixels are half a line of names; what is farther is another place, whose name finds no room or finds some
     for away, shown in ((6.9, ["A + 2"]), (7.1, ["A"]), (14.1, ["A", "B + 1"])):
@@ -287,6 +300,12 @@ def test_a_mean_of_ten_or_more_above_three_times_its_error_is_systematic(num, me
 
 def panels(rows, views, when="after"):
     return residual_panels(views, seen(rows), when)
+
+
+@pytest.mark.parametrize(("size", "said"), [(149.0, "150"), (1234.0, "1200"), (0.0236, "0.024"), (13.2, "13")])
+def test_the_scale_of_residuals_is_written_without_powers_of_ten(size, said):
+    _, _, key = panels([(0, k, (60.0, 60.0), (0.0, 0.0), (size, 0.0), True) for k in range(20)], [a_view("A")])
+    assert key.startswith(f"Scale bar: {said} px of")
 
 
 def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
