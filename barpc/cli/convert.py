@@ -26,6 +26,7 @@ from barpc.fit.points import Sample, widened
 from barpc.pipeline.verify_outputs import READING_TOLERANCE, Reading, unverified, verify, verify_grid
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster
+from barpc.report.summary.words import counted
 from barpc.rpcio import (
     CARRIERS,
     FORMATS,
@@ -317,7 +318,22 @@ def _hand_off(
             readings += verify(written, rpc, size, camera.alt_range)
             reasons += _shadow_reasons(path, written) if window is None else []
     whole = images[0][2] is None
-    return _exit_code(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
+    code = _exit_code(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
+    if not wants_json():
+        tell(_agreement(len(images), readings))
+    return code
+
+
+def _agreement(num: int, readings: Sequence[Reading]) -> str:
+    """Return the number of images written and the largest difference of their readers, in a sentence."""
+    read = [reading for reading in readings if not reading.note]
+    written, total = f"{counted(num, 'image')} written", len(readings)
+    if not read:
+        return f"{written}, no reader opened them."
+    worst = max(reading.max_error for reading in read)
+    who = "all readers" if len(read) == total else f"{len(read)} of {total} readings"
+    agree = "agree to" if all(reading.passed for reading in read) else "differ from the camera by up to"
+    return f"{written}, {who} {agree} {worst:.1g} px."
 
 
 def _image_size(image: Path) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -11,17 +11,20 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
+from barpc.report.quality_checks import enu
 from barpc.report.records import json_form
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
-from barpc.report.summary.words import median
+from barpc.report.summary.words import median, metres
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import image_grid
+from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC
 
+_NODES = 3  # along each side of an image: places at which the motion of the ground is measured
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
 
 
@@ -30,7 +33,9 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
 
     Returns ``views`` in both: errors, and ``rpc_difference_px``, the largest distance between where the two runs' RPC
     files put the same ground points, as a whole and without each image's mean shift (null where one wrote none);
-    ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone; ``options`` that differ; ``lines``: sentences.
+    ``moved_enu_m``, the median motion of the ground from A to B, east, north, up (null where no place is in two
+    images); ``pairs`` in both; ``only_a``, ``only_b``: images of one run alone; ``options`` that differ; ``lines``:
+    sentences.
     InputError where a folder holds no finished run, or they have no image in common.
     """
     folders = (Path(folder_a), Path(folder_b))
@@ -51,6 +56,7 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
         "a": str(folder_a),
         "b": str(folder_b),
         "views": [_view(folders, (a[name], b[name])) for name in same],
+        "moved_enu_m": _scene_motion(folders, [(a[name], b[name]) for name in same], runs[0].altitude_m),
         "pairs": _compared_pairs(*runs),
         "only_a": [name for name in a if name not in same],
         "only_b": [name for name in b if name not in same],
@@ -113,6 +119,34 @@ def _rpc_difference(
     return whole, relative
 
 
+def _scene_motion(
+    folders: tuple[Path, Path], views: Sequence[tuple[ViewEntry, ViewEntry]], altitude: float | None
+) -> Array | None:
+    """Return the median motion (3,) of the ground from the first run to the second, east, north, up [m].
+
+    Ground points of a grid in each image are projected with the RPCs of the first run, and intersected with those of
+    the second, where two images or more show them.
+    """
+    rpcs = [[written_rpc(folder, view) for folder, view in zip(folders, pair, strict=True)] for pair in views]
+    both = [(pair[0].size, *found) for pair, found in zip(views, rpcs, strict=True) if None not in found]
+    if len(both) < 2 or altitude is None:
+        return None
+    sizes, old, new = zip(*both, strict=True)
+    with np.errstate(all="ignore"):
+        flat = [image_grid(size, (altitude, altitude), (_NODES, 1)) for size in sizes]
+        ground = np.concatenate([rpc.localize(*grid) for rpc, grid in zip(old, flat, strict=True)])
+        xy = np.stack([rpc.project(ground) for rpc in old])  # (N, P, 2)
+        seen = np.asarray(((xy >= 0.0) & (xy <= np.array(sizes)[:, None] - 1.0)).all(axis=2))
+    several = seen.sum(axis=0) > 1
+    if not several.any():
+        return None
+    ground, (view, point) = ground[several], np.nonzero(seen[:, several])
+    found = triangulate(new, view, point, xy[:, several][view, point], alt=altitude)
+    basis = enu_basis(ground[found.ok])
+    moved = np.einsum("pij,pj->pi", basis, found.points[found.ok] - ecef_from_ground(ground[found.ok]))
+    return np.asarray(np.median(moved, axis=0)) if len(moved) else None
+
+
 def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
     """Return the first RPC that can be read of those that a run wrote for a view, in its own folder."""
     for name in view.outputs:
@@ -164,6 +198,9 @@ def _comparison_lines(comparison: Mapping[str, Any]) -> list[str]:
             f"Their RPCs differ by up to {most['rpc_difference_px']:.3g} px ({most['name']}), "
             f"by {bend:.3g} px once the mean shift of each image is taken away."
         )
+    if comparison.get("moved_enu_m") is not None:
+        motion = comparison["moved_enu_m"]
+        lines.append(f"The scene moved by {enu(motion)}, {metres(float(np.linalg.norm(motion)))} in all, from A to B.")
     alone = {run: comparison[f"only_{run.lower()}"] for run in "AB"}
     lines += [f"In {run} alone: {', '.join(names)}." for run, names in alone.items() if names]
     options = comparison["options"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.cameras import open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import (
+    _agreement,
     _refuse_source_folder,
     _shadow_reasons,
     _tell_readings,
@@ -418,6 +420,17 @@ def test_what_readers_see_is_a_line_or_a_row_each(
     ]
 
 
+@pytest.mark.parametrize(("errors", "said"), [
+    ((1e-13, 8e-13, 0.0), "2 images written, all readers agree to 8e-13 px."),
+    ((1e-13, 0.25, 0.0), "2 images written, all readers differ from the camera by up to 0.2 px."),
+    ((1e-13, None, 3e-9), "2 images written, 2 of 3 readings agree to 3e-09 px."),
+    ((None,), "2 images written, no reader opened them."),
+])  # fmt: skip
+def test_a_hand_off_ends_with_the_largest_difference_of_all_readers(errors: Sequence[float | None], said: str) -> None:
+    seen = [Reading(Path("a"), "gdal", NAN if e is None else e, "no field" if e is None else "") for e in errors]
+    assert _agreement(2, seen) == said
+
+
 def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
     a, b = tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif"
     out = tmp_path / "out"
@@ -466,7 +479,9 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     assert asked == [(["scene.rpc.json", "scene.vrt", "scene_RPC.TXT"], (300, 200), alts, True)]
     assert read_rpc(out / "scene_RPC.TXT") == make_rpc()
     said = capsys.readouterr()
-    assert said.out == f"{out / 'scene.vrt'}: gdal 2.0e-06 px\n{out / 'scene_RPC.TXT'}: rpcm no field\n"
+    *lines, last = said.out.splitlines()
+    assert lines == [f"{out / 'scene.vrt'}: gdal 2.0e-06 px", f"{out / 'scene_RPC.TXT'}: rpcm no field"]
+    assert last == "1 image written, 1 of 2 readings differ from the camera by up to 2e-06 px."
     assert said.err.splitlines() == [
         "barpc: not tried: 3",
         f"barpc: exit code 3: The hand-off needs review. {out / 'scene.vrt'}: gdal reads it with an error of 2.0e-06 "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from barpc.base.errors import InputError
+from barpc.base.geodesy import metres_per_unit
 from barpc.cli import cli
 from barpc.report.compare import _compared_pairs, _comparison_lines, _view, compare_runs, flat_options
 from barpc.report.records import json_form
@@ -39,6 +41,36 @@ def test_a_shift_of_a_camera_is_found_and_told_from_a_change_of_its_shape(block_
     assert found["views"][3]["rpc_difference_px"] == pytest.approx(5.0, abs=1e-6)
     assert found["views"][3]["rpc_difference_without_shift_px"] < 1e-6
     assert "differ by up to 5 px (view_0003)" in " ".join(found["lines"])
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (3.0, -4.0, 12.0)])
+def test_the_motion_of_the_scene_is_told_in_metres_from_the_first_run_to_the_second(block_run, tmp_path, motion):
+    """RPCs whose ground is set elsewhere as a whole, whatever the summary says of it."""
+    shutil.copytree(block_run.folder, tmp_path / "other")
+    for view in block_run.views:
+        path = tmp_path / "other" / f"{view.name}_RPC.TXT"
+        rpc = read_rpc(path)
+        by = np.array(motion) / metres_per_unit(rpc.ground_offset)
+        write_rpc(replace(rpc, ground_offset=rpc.ground_offset + by), path, overwrite=True)
+    found = compare_runs(block_run.folder, tmp_path / "other")
+    assert found["moved_enu_m"] == pytest.approx(motion, abs=0.02)
+    back = compare_runs(tmp_path / "other", block_run.folder)["moved_enu_m"]
+    assert back == pytest.approx([-one for one in motion], abs=0.02)
+    said = next(line for line in found["lines"] if line.startswith("The scene moved by "))
+    if any(motion):
+        assert re.fullmatch(r"The scene moved by \+3\.0\d m east, -\S+ m north, \+1\S+ m up, 13\.0 m in all, .*", said)
+
+
+def test_of_rpcs_of_one_image_no_motion_of_the_scene_is_told(block_run, tmp_path):
+    views = block_run.summary["views"]
+    for k, some in enumerate((views[:1], [views[0], {**views[1], "outputs": {}}])):
+        folder = tmp_path / f"{k}"
+        shutil.copytree(block_run.folder, folder)
+        text = json.dumps({**block_run.summary, "views": some, "pairs": []})
+        (folder / "summary.json").write_text(text)
+        found = compare_runs(folder, folder)
+        assert found["moved_enu_m"] is None
+        assert "moved" not in " ".join(found["lines"])
 
 
 def test_options_and_images_of_one_run_alone_are_named(block_run, tmp_path):
