@@ -23,6 +23,8 @@ MIN_GAIN = 1.5  # A standard deviation that falls by less is not worth an input:
 NUM_GCPS = 3  # the fewest of which two can outvote a wrong one
 _PLACE = slice(0, 3)  # of the scene's motions: east, north, up
 _HEIGHTS = [MOTIONS.index(name) for name in ("up", "tilt east", "tilt north")]  # a DEM's level and slopes
+NEW_ANGLE = 20.0  # deg between a third image and both of a pair: of stereo, and of matching without loss
+_ALONE = 0.99  # share of the cameras in the height, above which its uncertainty is that of their directions
 _LINE = 160  # characters of a reservation that is not of an image
 
 _PARTS = {
@@ -40,13 +42,11 @@ def next_steps(summary: Summary) -> tuple[StepEntry, ...]:
 
     Parameters
     ----------
-    summary : Summary
-        Of a run, with its verdict.
+    summary : Summary, of a run with its verdict
 
     Returns
     -------
-    steps : tuple of StepEntry
-        Empty where nothing was written, nothing would help and nothing needs review.
+    steps : tuple of StepEntry, empty where nothing was written, nothing would help and nothing needs review
     """
     use = {"adjust": _hand_over, "check": _adjust, "match": _adjust_matched}[summary.kind]
     return (*use(summary), *_improve(summary), *_review(summary))
@@ -102,6 +102,10 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         if now[2] > MIN_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
             words.append(f"with a DEM of known vertical datum (--dem, --geoid): height to about {metres(then[2])}")
+    up = now[2] * _height_ratio(summary, scene)
+    if now[2] > MIN_GAIN * up:
+        found.append(ExpectedEntry("image", (None, None, float(up))))
+        words.append(f"with a third image {NEW_ANGLE:g} deg from both: height to about {metres(up)}")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
     if (now > MIN_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
@@ -110,6 +114,20 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
     if found:
         text = f"The scene's position is uncertain by {lengths(now)} (east, north, up; 1 sigma); {'; '.join(words)}."
         yield StepEntry("improve", text, expected=tuple(found), part="gauge")
+
+
+def _height_ratio(summary: Summary, scene: SceneEntry) -> float:
+    """Return the factor of the height's standard deviation by a third image of a pair; 1 where it does not apply.
+
+    Its variance goes with 1 / sum of the squared distances (B/H) of lines of sight over their number. Priors that a
+    pair alone has widened are too uncertain to predict from.
+    """
+    cameras = next((one.cameras for one in scene.datum if one.part == "up"), None) or 0.0
+    widened = max(view.prior_scale or 1.0 for view in summary.views) > MIN_GAIN
+    if len(summary.views) != 2 or not summary.pairs or cameras < _ALONE or widened:
+        return 1.0
+    apart, new = summary.pairs[0].base_to_height or np.nan, 2.0 * np.tan(np.radians(NEW_ANGLE / 2.0))
+    return float(np.nan_to_num(np.sqrt((apart**2 / 2.0) / ((apart**2 + 2.0 * new**2) / 3.0)), nan=1.0))
 
 
 def _covariance(scene: SceneEntry) -> Array | None:

@@ -8,7 +8,7 @@ import click
 import numpy as np
 import pytest
 
-from barpc import report
+from barpc import report, simulate
 from barpc.ba import Adjustment, adjust_tracks
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import AdjustOptions, RunOptions
@@ -23,7 +23,7 @@ from barpc.report.summary import LeftOutEntry, StepEntry
 from barpc.report.summary.words import CAUSES
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
-from barpc.simulate import SimulatedBlock, simulate_block
+from barpc.simulate import Look, SimulatedBlock, simulate_block
 
 from .made import a_gcp, a_pair, a_summary, a_view
 
@@ -107,7 +107,7 @@ def expected(summary: Summary) -> dict[str, tuple[float | None, ...]]:
 def test_a_dem_and_control_do_what_was_promised_of_them(case):
     plain, _ = case.adjusted()
     promised = expected(plain)
-    assert list(promised) == ["dem", "gcps"]
+    assert set(promised) - {"image"} == {"dem", "gcps"}
     with_dem, by_dem = case.adjusted(dem=Hills(5.0))
     up = promised["dem"][2]
     assert up is not None
@@ -120,6 +120,35 @@ def test_a_dem_and_control_do_what_was_promised_of_them(case):
     assert (np.abs(case.off(by_gcps)) < 4.0 * np.array(promised["gcps"], float)).all()
     # what was given is not asked for again, and what is left is told of the run as it is
     assert "dem" not in expected(with_dem)
+
+
+@pytest.mark.parametrize("between", [1.5, 6.0, 12.0, 20.0])
+def test_a_third_image_does_to_the_height_what_was_promised_of_it(monkeypatch, between):
+    """Of a pair of good angle a third one is not asked for."""
+    half, third = np.tan(np.radians([between / 2.0, 10.0])) * [1.0, 2.0]
+    slopes = [(-half, 0.0), (half, 0.0), (0.0, np.sqrt(third**2 - half**2))]
+    looks = [Look(np.degrees(np.arctan(np.hypot(*t))), np.degrees(np.arctan2(*t)) % 360.0) for t in slopes]
+    monkeypatch.setattr(simulate, "looks", lambda count, *_: looks[:count])
+    (pair, _), (triplet, _) = (Case(n, per_site=n, attitude=3e-6).adjusted() for n in (2, 3))
+    ratio = triplet.scene.sigma_enu_m[2] / pair.scene.sigma_enu_m[2]
+    promised = expected(pair).get("image")
+    if between == 20.0:
+        assert promised is None
+        assert ratio > 1 / OFF
+    else:
+        assert 1 / OFF < triplet.scene.sigma_enu_m[2] / promised[2] < OFF
+    assert "image" not in expected(triplet)
+
+
+def test_a_pair_that_widened_its_priors_is_too_uncertain_for_the_promise_of_an_image():
+    """What a pair learns of priors is three times what three images learn."""
+    pair, _ = Case(2, per_site=2, attitude=100e-6).adjusted()
+    assert max(view.prior_scale for view in pair.views) > 2.0
+    assert "image" not in expected(pair)
+    as_stated = replace(pair, views=tuple(replace(view, prior_scale=1.0) for view in pair.views))
+    narrow = replace(pair.pairs[0], base_to_height=0.1)
+    steps = next_steps(replace(as_stated, pairs=(narrow,)))
+    assert "image" in {one.source for step in steps for one in step.expected}
 
 
 def kinds(summary: Summary) -> list[str]:

@@ -58,7 +58,7 @@ class OutputEntry(Record):
 class ExpectedEntry(Record):
     """The standard deviation to expect with a further input, by the covariance."""
 
-    source: Literal["dem", "gcps"] = column("A DEM of known vertical datum; three GCPs of the accuracy assumed")
+    source: Literal["dem", "image", "gcps"] = column("A DEM of known vertical datum; a third image; three GCPs")
     sigma_enu_m: Vector = column("Standard deviation of the scene's position with it; null: not predicted", "m")
 
 
