@@ -320,11 +320,11 @@ def _hand_off(
     whole = images[0][2] is None
     code = _exit_code(readings, reasons, unverified([folder / name for name in names[0]]) if whole else ())
     if not wants_json():
-        tell(_agreement(len(images), readings))
+        tell(_readers_agreement(len(images), readings))
     return code
 
 
-def _agreement(num: int, readings: Sequence[Reading]) -> str:
+def _readers_agreement(num: int, readings: Sequence[Reading]) -> str:
     """Return the number of images written and the largest difference of their readers, in a sentence."""
     read = [reading for reading in readings if not reading.note]
     written, total = f"{counted(num, 'image')} written", len(readings)

@@ -24,7 +24,7 @@ from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC
 
-_NODES = 3  # along each side of an image: places at which the motion of the ground is measured
+_MOTION_NODES = 3  # along each side of an image: places at which the motion of the ground is measured
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
 
 
@@ -133,7 +133,7 @@ def _scene_motion(
         return None
     sizes, old, new = zip(*both, strict=True)
     with np.errstate(all="ignore"):
-        flat = [image_grid(size, (altitude, altitude), (_NODES, 1)) for size in sizes]
+        flat = [image_grid(size, (altitude, altitude), (_MOTION_NODES, 1)) for size in sizes]
         ground = np.concatenate([rpc.localize(*grid) for rpc, grid in zip(old, flat, strict=True)])
         xy = np.stack([rpc.project(ground) for rpc in old])  # (N, P, 2)
         seen = np.asarray(((xy >= 0.0) & (xy <= np.array(sizes)[:, None] - 1.0)).all(axis=2))

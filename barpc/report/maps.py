@@ -186,15 +186,15 @@ def _map_labels(
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 3.6 * len(name)
         x = min(max(x, half), WIDTH - half)
-        if _has_room(x, y, half, taken):
+        if _is_free(x, y, half, taken):
             rows = (y, y + 1.1 * _LABEL_HEIGHT, y - 1.1 * _LABEL_HEIGHT)
-            y = next((row for row in rows if _has_room(x, row, half, [*taken, *(marks or ())])), y)
+            y = next((row for row in rows if _is_free(x, row, half, [*taken, *(marks or ())])), y)
             taken.append((x, y, half))
             names.append((view, name, x, y))
     return names
 
 
-def _has_room(x: float, y: float, half: float, taken: OccupiedAreas) -> bool:
+def _is_free(x: float, y: float, half: float, taken: OccupiedAreas) -> bool:
     return all(abs(x - u) > half + other or abs(y - v) > _LABEL_HEIGHT for u, v, other in taken)
 
 

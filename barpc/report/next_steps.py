@@ -19,15 +19,15 @@ from barpc.report.summary import ExpectedEntry, StepEntry, Summary
 from barpc.report.summary.block import SceneEntry
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, metres
 
-MIN_GAIN = 1.5  # A standard deviation that falls by less is not worth an input: the prediction is as good as that
+LEAST_GAIN = 1.5  # A standard deviation that falls by less is not worth an input: the prediction is as good as that
 NUM_GCPS = 3  # the fewest of which two can outvote a wrong one
-_PLACE = slice(0, 3)  # of the scene's motions: east, north, up
-_HEIGHTS = [MOTIONS.index(name) for name in ("up", "tilt east", "tilt north")]  # a DEM's level and slopes
+_POSITION = slice(0, 3)  # of the scene's motions: east, north, up
+_DEM_MOTIONS = [MOTIONS.index(name) for name in ("up", "tilt east", "tilt north")]  # a DEM's level and slopes
 NEW_ANGLE = 20.0  # deg between a third image and both of a pair: of stereo, and of matching without loss
-_ALONE = 0.99  # share of the cameras in the height, above which its uncertainty is that of their directions
-_LINE = 160  # characters of a reservation that is not of an image
+_BY_CAMERAS = 0.99  # share of the cameras in the height, above which its uncertainty is that of their directions
+_MOST_CHARACTERS = 160  # characters of a reservation that is not of an image
 
-_PARTS = {
+_REPORT_PARTS = {
     **dict.fromkeys(("no_overlap", "untied", "few", "none", "few_gcps", "gap"), "map"),
     **dict.fromkeys(("contradicted", "systematic", "rejected", "wrong_matches", "place", "beside"), "random"),
     **dict.fromkeys(("held_out", "left", "moving_objects"), "random"),
@@ -48,7 +48,7 @@ def next_steps(summary: Summary) -> tuple[StepEntry, ...]:
     -------
     steps : tuple of StepEntry, empty where nothing was written, nothing would help and nothing needs review
     """
-    use = {"adjust": _hand_over, "check": _adjust, "match": _adjust_matched}[summary.kind]
+    use = {"adjust": _hand_over, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
     return (*use(summary), *_improve(summary), *_review(summary))
 
 
@@ -74,7 +74,7 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
     yield StepEntry("use", f"{start} {listed(files, NAMED)}{best}.", tuple(commands))
 
 
-def _adjust(summary: Summary) -> Iterator[StepEntry]:
+def _adjust_checked(summary: Summary) -> Iterator[StepEntry]:
     """Yield the adjustment of cameras that disagree."""
     if any(view.cause == "disagrees" for view in summary.views):
         yield StepEntry("use", "The cameras disagree: adjust them.", ("barpc adjust IMAGE... -o adjusted",))
@@ -90,24 +90,24 @@ def _adjust_matched(summary: Summary) -> Iterator[StepEntry]:
 
 
 def _improve(summary: Summary) -> Iterator[StepEntry]:
-    """Yield the inputs that lower a standard deviation of the scene's position by more than `MIN_GAIN`."""
-    scene, covariance = summary.scene, None if summary.scene is None else _covariance(summary.scene)
+    """Yield the inputs that lower a standard deviation of the scene's position by more than `LEAST_GAIN`."""
+    scene, covariance = summary.scene, None if summary.scene is None else _scene_covariance(summary.scene)
     # of GCPs in use that do not agree the covariance is not that of the scene
     if scene is None or covariance is None or any(gcp.status == "contradicts" for gcp in summary.gcps):
         return
-    now = np.sqrt(np.diag(covariance))[_PLACE]
+    now = np.sqrt(np.diag(covariance))[_POSITION]
     options, found, words = summary.options or {}, list[ExpectedEntry](), list[str]()
     if not (options.get("dem") or options.get("reference")):
         then = _sigma_with(covariance, *_dem_observations(options))
-        if now[2] > MIN_GAIN * then[2]:
+        if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
             words.append(f"with a DEM of known vertical datum (--dem, --geoid): height to about {metres(then[2])}")
     up = now[2] * _height_ratio(summary, scene)
-    if now[2] > MIN_GAIN * up:
+    if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))
         words.append(f"with a third image {NEW_ANGLE:g} deg from both: height to about {metres(up)}")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
-    if (now > MIN_GAIN * then).any():
+    if (now > LEAST_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
         accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
         words.append(f"with {NUM_GCPS} GCPs accurate to {accuracy} (--gcp): to about {lengths(then)}")
@@ -123,14 +123,14 @@ def _height_ratio(summary: Summary, scene: SceneEntry) -> float:
     pair alone has widened are too uncertain to predict from.
     """
     cameras = next((one.cameras for one in scene.datum if one.part == "up"), None) or 0.0
-    widened = max(view.prior_scale or 1.0 for view in summary.views) > MIN_GAIN
-    if len(summary.views) != 2 or not summary.pairs or cameras < _ALONE or widened:
+    widened = max(view.prior_scale or 1.0 for view in summary.views) > LEAST_GAIN
+    if len(summary.views) != 2 or not summary.pairs or cameras < _BY_CAMERAS or widened:
         return 1.0
     apart, new = summary.pairs[0].base_to_height or np.nan, 2.0 * np.tan(np.radians(NEW_ANGLE / 2.0))
     return float(np.nan_to_num(np.sqrt((apart**2 / 2.0) / ((apart**2 + 2.0 * new**2) / 3.0)), nan=1.0))
 
 
-def _covariance(scene: SceneEntry) -> Array | None:
+def _scene_covariance(scene: SceneEntry) -> Array | None:
     """Return the covariance (10, 10) of the scene's motions [m^2]; None where it is not known."""
     found = np.full((len(MOTIONS), len(MOTIONS)), np.nan)
     for mode in scene.weakest_modes:
@@ -143,7 +143,7 @@ def _covariance(scene: SceneEntry) -> Array | None:
 def _sigma_with(covariance: Array, rows: Array, variance: Array) -> Array:
     """Return standard deviations (3,) east, north, up [m] after observations `rows` (n, 10) of given variance (n,)."""
     gain = np.linalg.solve(rows @ covariance @ rows.T + np.diag(variance), rows @ covariance)
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance - covariance @ rows.T @ gain), 0.0))[_PLACE])
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance - covariance @ rows.T @ gain), 0.0))[_POSITION])
 
 
 def _dem_observations(options: Mapping[str, object]) -> tuple[Array, Array]:
@@ -151,7 +151,7 @@ def _dem_observations(options: Mapping[str, object]) -> tuple[Array, Array]:
     adjust = options.get("adjust")
     given = adjust.get("dem_bias_sigma") if isinstance(adjust, Mapping) else None
     bias = float(given or KNOWN_BIAS)
-    return np.eye(len(MOTIONS))[_HEIGHTS], np.full(len(_HEIGHTS), bias**2)
+    return np.eye(len(MOTIONS))[_DEM_MOTIONS], np.full(len(_DEM_MOTIONS), bias**2)
 
 
 def _gcp_observations(summary: Summary, scene: SceneEntry) -> tuple[Array, Array]:
@@ -188,12 +188,12 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         label = CAUSES[views[0].cause].label if views[0].cause in CAUSES else STATUS_WORDS[views[0].status]
         rest = len(views) - len(alike)
         more = f", then at {counted(rest, 'more image')}" if rest else ""
-        part = _PARTS.get(views[0].cause or "", "images")
+        part = _REPORT_PARTS.get(views[0].cause or "", "images")
         yield StepEntry("review", f"Look at {listed(alike, NAMED)} ({label}){more}.", part=part)
     elif summary.left_out:
         names = listed([one.path for one in summary.left_out], NAMED)
         yield StepEntry("review", f"Check the files that were left out: {names}.")
     elif summary.reasons:
         of_control = any(gcp.status not in ("used", "not seen") for gcp in summary.gcps)
-        text = textwrap.shorten(f"Review: {summary.reasons[0]}", _LINE, placeholder=" ...")
+        text = textwrap.shorten(f"Review: {summary.reasons[0]}", _MOST_CHARACTERS, placeholder=" ...")
         yield StepEntry("review", text, part="gauge" if of_control or value_of(summary, "scene.dem") else "decisions")

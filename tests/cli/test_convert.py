@@ -18,7 +18,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.cameras import open_camera
 from barpc.cli import convert as module
 from barpc.cli.convert import (
-    _agreement,
+    _readers_agreement,
     _refuse_source_folder,
     _shadow_reasons,
     _tell_readings,
@@ -428,7 +428,7 @@ def test_what_readers_see_is_a_line_or_a_row_each(
 ])  # fmt: skip
 def test_a_hand_off_ends_with_the_largest_difference_of_all_readers(errors: Sequence[float | None], said: str) -> None:
     seen = [Reading(Path("a"), "gdal", NAN if e is None else e, "no field" if e is None else "") for e in errors]
-    assert _agreement(2, seen) == said
+    assert _readers_agreement(2, seen) == said
 
 
 def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from barpc.cli import cli
 from barpc.cli.terminal import print_summary
 from barpc.export import TARGETS
 from barpc.report import Run, Summary
-from barpc.report.next_steps import _PARTS, next_steps
+from barpc.report.next_steps import _REPORT_PARTS, next_steps
 from barpc.report.page import _QUESTIONS, report_html
 from barpc.report.records import json_form
 from barpc.report.summary import LeftOutEntry, StepEntry
@@ -290,8 +290,8 @@ def test_a_check_of_cameras_that_agree_has_no_next_step():
 
 
 def test_parts_are_those_of_the_report_and_causes_those_there_are():
-    assert set(_PARTS) <= set(CAUSES)
-    assert set(_PARTS.values()) <= set(_QUESTIONS)
+    assert set(_REPORT_PARTS) <= set(CAUSES)
+    assert set(_REPORT_PARTS.values()) <= set(_QUESTIONS)
 
 
 def test_the_terminal_ends_with_the_steps_and_the_folder_that_was_written(triplet, capsys):
