@@ -104,11 +104,11 @@ def test_the_report_shows_the_same_window_before_and_after(surface, copied):
     assert before.nmad_m > 2.0 * after.nmad_m
     assert after.share > 0.4
     page = (copied / "report.html").read_text(encoding="utf-8")
-    assert "What do they make of the ground?" in page
-    assert page.count("by the delivered cameras, lit") == page.count("by the corrected cameras, lit") == 2
+    assert "Which ground do they reconstruct?" in page
+    assert page.count("from the delivered cameras, lit") == page.count("from the corrected cameras, lit") == 2
     assert f"differ by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
     assert page.count('class="swipe"') == 1
-    assert "img_01 (left) and img_03 (right) on the surface by the corrected cameras" in page
+    assert "img_01 (left) and img_03 (right) draped over the surface from the corrected cameras" in page
     assert len(page) < 2_000_000
     (copied / "tables/surface.json").write_text("[]")
     with pytest.raises(InputError, match=r"surface\.json: damaged"):

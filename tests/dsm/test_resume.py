@@ -96,10 +96,10 @@ def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_pa
     # another run in the same folder does not show it
     old = (folder / "tables" / SURFACE).read_bytes()
     adjust(rendered.paths[1:], folder, overwritten())
-    assert "What do they make of the ground?" not in (folder / "report.html").read_text(encoding="utf-8")
+    assert "Which ground do they reconstruct?" not in (folder / "report.html").read_text(encoding="utf-8")
     (folder / "tables" / SURFACE).write_bytes(old)
     assert run("report", folder) == 0
-    assert "What do they make of the ground?" not in (folder / "report.html").read_text(encoding="utf-8")
+    assert "Which ground do they reconstruct?" not in (folder / "report.html").read_text(encoding="utf-8")
 
 
 def overwritten():

@@ -225,7 +225,7 @@ def test_a_run_makes_its_surface_as_one_of_its_own_files(rendered, tmp_path, cap
     call = "dsm", folder, "-o", folder / "dsm.tif"
     assert run(*call, "-q") == 0
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "What do they make of the ground?" in page
+    assert "Which ground do they reconstruct?" in page
     assert 'class="swipe"' in page
     assert {"dsm.tif", "tables/surface.json"} <= own_files(folder)
     assert {path.name for path in folder.iterdir() if "unfinished" in path.name} == set()
