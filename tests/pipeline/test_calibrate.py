@@ -147,13 +147,17 @@ def test_what_is_not_of_the_images_is_refused(calibration: Path, line: Sensor, t
     rng = np.random.default_rng(12)
     paths = files(scene(any_looks(3, rng), line, rng, 500, size=SIZE), tmp_path / "new")
     text = json.loads(calibration.read_text())
-    mirrored = {**text, "edges": [3999.0 - e for e in text["edges"][::-1]], "steps_px": text["steps_px"][::-1]}
-    coeffs = -np.array(text["coefficients_px"])[::-1] - np.sum(text["steps_px"], axis=0)
-    mirrored["coefficients_px"] = coeffs.tolist()
+    signs = np.array(
+        [-1.0, 1.0]
+    )  # columns count from the other side: their displacements turn round, not those of rows
+    steps, coeffs = np.array(text["steps_px"]), np.array(text["coefficients_px"])
+    mirrored = {**text, "edges": [3999.0 - e for e in text["edges"][::-1]], "steps_px": (-signs * steps[::-1]).tolist()}
+    mirrored["coefficients_px"] = (signs * (coeffs[::-1] + steps.sum(axis=0))).tolist()
     one, other = read_calibration(calibration), tmp_path / "mirrored.cal"
     other.write_text(json.dumps(mirrored))
     cols = np.arange(0.0, 4000.0, 7)
-    np.testing.assert_allclose(read_calibration(other).spline.at(cols), -one.spline.at(3999.0 - cols), atol=1e-6)
+    wanted = signs * one.spline.at(3999.0 - cols)
+    np.testing.assert_allclose(read_calibration(other).spline.at(cols), wanted, atol=1e-6)
     with pytest.raises(InputError, match="is not of these images"):
         run(paths, "mirrored", calibration=(str(other),))
     assert not (tmp_path / "new/mirrored/summary.json").exists()
