@@ -11,33 +11,31 @@ from typing import Any
 import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
-from barpc.ba.apart import ForeignCamera, Parts, Solver, find_apart, without_moving
 from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.constraints.terrain import Terrain
+from barpc.ba.control.snooping import image_test
 from barpc.ba.evidence.scan import neighbours_alike
-from barpc.ba.judging.following import follow, without_strips
-from barpc.ba.judging.judge import Finding, left_over, standing_out
-from barpc.ba.judging.snooping import image_test
-from barpc.ba.judging.solution import CLEARLY, MUCH_BETTER, Solution, solve_block
-from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.resection import resect
 from barpc.ba.result import Adjustment
 from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
+from barpc.ba.select.anomalies import left_over
+from barpc.ba.select.foreign_camera import ForeignCamera, Solver
+from barpc.ba.select.models import Model, select_model
+from barpc.ba.select.parts import Parts
+from barpc.ba.solution import Solution, solve_block
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
-from barpc.base.options import AUTO, AdjustOptions
+from barpc.base.options import AdjustOptions
 from barpc.base.statistics import CRITICAL, ITERATIONS, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
-
-_Chosen = tuple[Solution, float | None, Parts]
-"""What is solved, what the model in space leaves where another was chosen [px], and its observations."""
 
 
 def adjust_tracks(
@@ -115,13 +113,14 @@ def _solved_adjustment(
     """Return the block solved by the model that the data choose, held by heights too where there are some."""
     given = parts.inner, parts.outer
     try:
-        (found, in_space, parts), apart = _select_model(parts, options, solve)
+        model = select_model(parts, options, solve)
+        found, parts, apart = model.found, model.parts, model.foreign
         heights = None
         if altimetry is not None:
             found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
         found.heights.warn()
         _warn(found.outcome)
-        whole = replace(_adjustment(found, parts, options, in_space, common), altimetry=heights)
+        whole = replace(_adjustment(model, found, options, common), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
@@ -132,21 +131,6 @@ def _solved_adjustment(
         ) from error
 
 
-def _select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[_Chosen, ForeignCamera | None]:
-    """Return the block by the model that the data choose, and the view it was solved without or that may be wrong."""
-    first, apart, without = _first(parts, options, solve)
-    if apart is not None and apart.may_be_its_own and first is not None:
-        # what its rows and columns explain, bent, makes it no other image's
-        chosen = _choose_model(first, parts, options, solve)
-        if chosen[2].keeps(chosen[0], apart.view):
-            return chosen, None
-    if apart is not None and apart.clear:
-        parts = parts.without_view(apart.view)
-    start = first if without is None else without
-    assert start is not None
-    return _choose_model(start, parts, options, solve), apart
-
-
 def _warn(outcome: Outcome) -> None:
     """Warn of what the last solve could not do; what is tried on the way to it may fail."""
     if not outcome.minimum.settled:
@@ -155,33 +139,6 @@ def _warn(outcome: Outcome) -> None:
     if outcome.prior.failed:
         message = "the accuracy of the cameras is taken as it is given: the normal equations are too weak to learn it"
         warnings.warn(message, BarpcWarning, stacklevel=4)
-
-
-def _first(
-    parts: Parts, options: AdjustOptions, solve: Solver
-) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
-    """Return the block solved with the model to start with, and without a view whose RPC is not its own where there
-    is one; one of the two at least.
-
-    What goes on from an earlier block is not asked that.
-    """
-    block, first, failed = parts.inner, None, None
-    try:
-        first = solve(block, parts.outer, options)
-    except (AdjustError, np.linalg.LinAlgError) as error:
-        failed = error
-    goes_on = first is not None and first.goes_on
-    apart, without = (None, None) if goes_on else find_apart(first, block, parts.outer, options, solve)
-    if without is not None or first is not None:
-        return first, apart, without
-    assert failed is not None
-    if apart is None:
-        raise failed
-    names = ", ".join(block.names[v] for v in apart.views)
-    raise AdjustError(
-        f"{failed}. Without any one of {names} the other views agree: check that their RPCs are of these images, and "
-        "leave the wrong one out"
-    ) from failed
 
 
 def _with_apart(
@@ -220,48 +177,10 @@ def _with_apart(
     return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
 
 
-def _choose_model(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> _Chosen:
-    """Return the block, of which one model is solved, by that which the data choose, without ties that move.
-
-    An affine in the image where it is much better; and what the model in space leaves then [px].
-    """
-    given = options.model != AUTO or options.drift is not None or first.goes_on
-    found, in_image = first, None if given else _solve_image_affine(first, parts, options, solve)
-    judges = first.problem.cameras.unknowns.geometric and not first.goes_on
-    if judges and (in_image is None or not _is_calm(in_image, parts.inner, options.noise_floor)):
-        found, parts, judged = without_moving(found, parts, options, solve)
-        found = without_strips(found, judged, parts.inner, parts.outer, options)
-    if found.outcome is not first.outcome:  # else the same would be solved and found again
-        in_image = None if given else _solve_image_affine(found, parts, options, solve)
-    chosen, in_space = (found, None) if in_image is None else (in_image, found.after.whole_rms)
-    if judges:
-        followed = follow(found, parts.inner, parts.outer, options)
-        if chosen is found or followed.after.error < MUCH_BETTER * chosen.after.error:
-            return followed, None, parts
-    return chosen, in_space, parts
-
-
-def _solve_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
-    """Solve the block with an affine in every image, where something is left for it and that is much better."""
-    skew = found.is_skew
-    if not (skew or found.has_trend):
-        return None
-    tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
-    better = tried.after.error < (CLEARLY if skew else MUCH_BETTER) * found.after.error
-    # it leaves the tilts of the scene open: not for what no adjustment is asked for
-    return tried if better and tried.after.whole_rms < found.after.whole_rms - NOISE_FLOOR else None
-
-
-def _is_calm(found: Solution, block: Block, floor: float) -> bool:
-    """Return whether nothing is left of which a part of an image, or what moves, might be the cause."""
-    return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
-
-
-def _adjustment(
-    found: Solution, parts: Parts, options: AdjustOptions, in_space: float | None, common: CommonErrors | None
-) -> Adjustment:
+def _adjustment(model: Model, found: Solution, options: AdjustOptions, common: CommonErrors | None) -> Adjustment:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
-    block, outcome, final = parts.inner, found.outcome, found.final
+    parts, outcome, final = model.parts, found.outcome, found.final
+    block = parts.inner
     covariance = outcome.minimum.covariance(found.problem.free)
     if common is not None:
         state = final.params, final.points, outcome.weight
@@ -301,7 +220,7 @@ def _adjustment(
         moving=parts.block.in_order(parts.group > 0)[ties],
         left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_neighbour_correlation(block, outcome, is_tie),
-        in_space_rms=in_space,
+        in_space_rms=model.in_space_rms,
         two_groups=two_groups(found.problem.structure, outcome.residual, outcome.by_point, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, found.seen),

@@ -22,10 +22,10 @@ from barpc.ba.constraints.registration import (
     displacement,
     register,
 )
-from barpc.ba.judging.solution import Solution, finished
 from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust.heldout import is_better
 from barpc.ba.robust.rounds import Rounds
+from barpc.ba.solution import Solution, finished
 from barpc.ba.solving.covariance import Covariance
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions

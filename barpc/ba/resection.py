@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from barpc.ba.constraints.block import Block
-from barpc.ba.judging.solution import Solution
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.robust.weights import geman_mcclure
+from barpc.ba.solution import Solution
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
 from barpc.base.statistics import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
-from barpc.ba.apart import ForeignCamera
 from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.gauge import GaugeReport
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.control.snooping import ControlTest
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.judging.judge import Finding
-from barpc.ba.judging.snooping import ControlTest
 from barpc.ba.parameters.priors import EarlierScene
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.robust.variances import PriorTest
+from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.ba.solving.covariance import Covariance
+from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import MANY

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.apart import ForeignCamera
-from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.control.snooping import ControlTest
+from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY

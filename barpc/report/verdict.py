@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
-from barpc.ba.apart import FOREIGN_CAMERA
 from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.select.foreign_camera import FOREIGN_CAMERA
+from barpc.ba.terms import TERMS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
@@ -35,7 +36,7 @@ from barpc.report.quality_checks import (
 from barpc.report.ranking import flagged
 from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
-from barpc.report.summary.block import EXPLANATION_WORDS, explanations, held_out_places, left_entries
+from barpc.report.summary.block import explanations, held_out_places, left_entries
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
@@ -170,7 +171,7 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     for rival in filter(None, dict.fromkeys(rivals)):
         yield (
-            f"Moving objects explain the tie points that move together hardly better than {EXPLANATION_WORDS[rival]}: "
+            f"Moving objects explain the tie points that move together hardly better than {TERMS[rival].NOUN}: "
             "check where these tie points lie."
         )
 

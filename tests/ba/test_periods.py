@@ -1,4 +1,4 @@
-"""Swings of the rows: found with their period, never by chance, and nothing where rows wander."""
+"""Periods of the rows: found with their period, never by chance, and nothing where rows wander."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence import periods
-from barpc.ba.evidence.periods import price_of_period, swings
+from barpc.ba.evidence.periods import price_of_period, find_periods
 from barpc.base.statistics import SURE
 
 
@@ -22,7 +22,7 @@ def test_a_swing_is_found_with_its_period_in_its_image(period: float, rows: floa
     view, row, size, off = ties(1, rows)
     phase = 2.0 * np.pi * row / period
     off += (view == 1) * 0.5 * np.stack([0.6 * np.sin(phase + 1.0), 0.8 * np.sin(phase + 1.0)])
-    found = swings(view, row, size, np.ones(len(view)), off)
+    found = find_periods(view, row, size, np.ones(len(view)), off)
     assert found[0].view == 1
     # of a frequency the standard deviation is sqrt(6 / (n snr)) / pi waves of the image: 0.1 of one is three times that
     assert rows / found[0].period == pytest.approx(rows / period, abs=0.1)
@@ -34,7 +34,7 @@ def test_a_swing_is_found_with_its_period_in_its_image(period: float, rows: floa
 def test_thirty_observations_that_swing_are_enough(count: int, told: bool) -> None:
     row = np.random.default_rng(3).uniform(0.0, 1000.0, count)
     off = 4.0 * np.sin(2.0 * np.pi * row / 200.0 + np.array([[0.5], [0.5]]))
-    found = swings(np.zeros(count, dtype=int), row, np.full((2, 1), 1000.0), np.ones(count), off)
+    found = find_periods(np.zeros(count, dtype=int), row, np.full((2, 1), 1000.0), np.ones(count), off)
     assert [one.period for one in found] == ([pytest.approx(200.0, rel=0.02)] if told else [])
 
 
@@ -44,7 +44,7 @@ def test_chance_swings_nowhere() -> None:
     for seed in range(60):
         view, row, size, off = ties(seed, 3000.0)
         off[1] = 0.3 * off[0] if seed % 2 else off[1]  # of a pair: one direction alone is seen
-        found = swings(view, row, size, np.ones(len(view)), off, 0.0)
+        found = find_periods(view, row, size, np.ones(len(view)), off, 0.0)
         gains.append(found[0].gain if found else 0.0)
     assert np.mean(np.array(gains) > SURE) < 0.04
     assert np.mean(np.array(gains) > 0.0) > 0.1  # and is not far too high
@@ -54,8 +54,8 @@ def test_wrong_observations_have_no_say_and_few_rows_none() -> None:
     view, row, size, off = ties(2)
     wrong = np.random.default_rng(5).uniform(size=len(view)) < 0.3
     swung = np.where(wrong, 50.0 * np.sin(2.0 * np.pi * row / 150.0), 0.0) + off * ~wrong
-    assert not any(one.gain > SURE for one in swings(view, row, size, 1.0 - wrong, swung * ~wrong))
-    assert not swings(view, row / 100.0, size / 100.0, np.ones(len(view)), off)
+    assert not any(one.gain > SURE for one in find_periods(view, row, size, 1.0 - wrong, swung * ~wrong))
+    assert not find_periods(view, row / 100.0, size / 100.0, np.ones(len(view)), off)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -64,7 +64,7 @@ def test_rows_that_wander_gain_far_less_as_a_swing_than_they_are_off(seed: int) 
     view, row, size, off = ties(seed)
     walk = np.cumsum(np.random.default_rng(seed + 50).normal(size=300))
     off[0] += (view == 1) * 0.5 * np.interp(row, np.linspace(0.0, 9000.0, 300), (walk - walk.mean()) / walk.std())
-    found = swings(view, row, size, np.ones(len(view)), off)
+    found = find_periods(view, row, size, np.ones(len(view)), off)
     explained = 0.5 * 1500 * 0.25
     assert not found or found[0].gain < 0.4 * explained
 

@@ -26,7 +26,7 @@ _BIN = _SHORTEST / _FREQUENCY_OVERSAMPLING  # rows summed: a tenth of the shorte
 
 
 @dataclass(frozen=True)
-class Swing:
+class Period:
     """A period that stands out."""
 
     view: int
@@ -40,9 +40,10 @@ def price_of_period(rows: float, views: int) -> float:
     return float(np.log(max(_FREQUENCY_OVERSAMPLING * rows / _SHORTEST, 1.0) * views))
 
 
-def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE) -> list[Swing]:
-    """Find the period that stands out most in every view, the best first; none that gains less than `least`
-    [nats].
+def find_periods(
+    view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
+) -> list[Period]:
+    """Find the period that stands out most in every view, the best first; none that gains less than `least` [nats].
 
     Parameters
     ----------
@@ -61,7 +62,7 @@ def swings(view: IntArray, row: Array, size: Array, right: Array, off: Array, le
             clipped = np.clip(off[:, mine], -OUTLIER, OUTLIER)
             best = _Rows(row[mine], rows, right[mine], clipped).largest(costs + least)
             if best is not None:
-                found.append(Swing(v, best[0], best[1] - costs))
+                found.append(Period(v, best[0], best[1] - costs))
     return sorted(found, key=lambda one: -one.gain)
 
 

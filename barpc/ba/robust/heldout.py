@@ -20,7 +20,7 @@ from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.base.statistics import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURELY
+from barpc.base.statistics import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURE, SURELY
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
@@ -168,6 +168,15 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
     cost = [(h.residual**2).sum(axis=0) / (other.error * block.sigma) ** 2 for h in (one, other)]
     less = np.bincount(point, geman_mcclure(cost[1] / CRITICAL**2)[0] - geman_mcclure(cost[0] / CRITICAL**2)[0])
     return bool(less.mean() > SURELY * less.std() / np.sqrt(len(index)))
+
+
+def is_admitted(tried: HeldOut, before: HeldOut, block: Block, evidence: float = 0.0) -> bool:
+    """Return whether a model with more unknowns, or fewer observations, is taken over another.
+
+    With evidence of all observations for it [nats] unless the check tracks of a block are met worse; without, where
+    they are met better.
+    """
+    return not is_better(before, tried, block) if evidence > SURE else is_better(tried, before, block)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.apart import FOREIGN_CAMERA, ForeignCamera
 from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.evidence.scan import ImageRegion
-from barpc.ba.judging.explanations import FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER
-from barpc.ba.judging.judge import Finding
+from barpc.ba.select.foreign_camera import FOREIGN_CAMERA, ForeignCamera
+from barpc.ba.terms import TERMS, Transient
+from barpc.ba.terms.term import Finding
 from barpc.base.errors import listed
 from barpc.base.geodesy import wrap_longitude
 from barpc.report.outcome import Run
@@ -35,25 +35,7 @@ MODES = {
     "bend north": "heights may be bent: by {0} from the middle of the scene to its northern and southern edges",
 }
 """Motion of the scene -> its sentence."""
-_EXPLANATION_SENTENCES = {
-    STRIP: "{axis} {first:.0f}-{last:.0f} of {image} are displaced by {size:.2f} px",
-    FADE: "rows of {image} are displaced by {size:.2f} px at row {origin:.0f}, decaying in {length:.0f} rows",
-    TRANSIENT: "rows at the {end} of all images are displaced by up to {size:.2f} px, decaying in {length:.0f} rows",
-    WANDER: "rows of {image} have a low-frequency displacement of {size:.2f} px",
-    SWING: "rows of {image} have a sinusoidal displacement of {least}{size:.2f} px with a period of {period:.0f} rows",
-    MOVING: "{share:.0f} % of the tie points{side} move together ({cause}), by {metres:.2g} m from {between[0]} to "
-    "{between[1]} apart from an effect of height, and were excluded{control}{larger}",
-}
 _MINORITY = 1 / 3  # of the tie points: twice as many stand still; of more either part may be the one that moved
-EXPLANATION_WORDS = {
-    STRIP: "displaced rows or columns of an image",
-    FADE: "a decaying displacement of the rows of an image",
-    TRANSIENT: "a decaying displacement at one end of all images",
-    WANDER: "a low-frequency displacement of the rows of an image",
-    SWING: "a sinusoidal displacement of the rows of an image",
-    MOVING: "moving objects",
-}
-"""Explanation -> its noun."""
 
 
 class ModeEntry(Record):
@@ -134,7 +116,7 @@ class ExplanationEntry(Record):
 
     PAGE: ClassVar = "sentence gain gap runner_up"
 
-    name: str = column("Its kind", enum=[*_EXPLANATION_SENTENCES, FOREIGN_CAMERA])
+    name: str = column("Its kind", enum=[*TERMS, FOREIGN_CAMERA])
     sentence: str = column("The same as a sentence", head="explanation of residuals", minLength=1)
     image: str | None = column("View; null where it concerns several")
     gain: float = column("Logarithm of its evidence over that of the model without it", "nats", "gain", ".0f")
@@ -299,7 +281,7 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         what = "many tie points of {} are wrong, or its RPC" if apart.look.as_stated else "the RPC of {}"
         sentence = f"{what.format(image)} does not match the image: {strangeness(apart)}"
         found.append(ExplanationEntry(FOREIGN_CAMERA, sentence, image, apart.gain, apart.gap, other))
-    settling = [one for one in adjustment.findings if one.kind == TRANSIENT]
+    settling = [one for one in adjustment.findings if one.kind == Transient.NAME]
     found += [_explanation_entry(one, adjustment) for one in adjustment.findings if one not in settling[1:]]
     return tuple(found)
 
@@ -310,14 +292,14 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
     # two images only determine a relative displacement
     of_pair = len(names) == 2 and one.motion is None
     image, others = names[one.view], tuple(names[v] for v in ((1 - one.view,) if of_pair else one.or_of))
-    of_all = one.motion is not None or one.kind == TRANSIENT
-    alike = [each for each in adjustment.findings if each.kind == TRANSIENT] if one.kind == TRANSIENT else [one]
+    of_all = one.motion is not None or one.kind == Transient.NAME
+    alike = [each for each in adjustment.findings if each.kind == one.kind] if of_all else [one]
     size = max(float(np.hypot(*each.size)) for each in alike)
     fields: dict[str, Any] = {"size_px": size, "period": one.period, "candidates": None if of_all else others or None}
     # two images do not determine displacements along their epipolar lines
     words: dict[str, Any] = {"size": size, "least": "at least " if len(names) == 2 else "", **fields}
     words["image"] = " or ".join([image, *others])
-    if others and one.kind in (STRIP, FADE):  # places are those of the first
+    if others and TERMS[one.kind].LOCAL:  # places are those of the first
         words["image"] = f"{image} (or the same ground in {' or '.join(others)})"
     if one.motion is not None:
         box = one.motion.box
@@ -337,7 +319,7 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
         axis, start, stop, origin, rate = one.where
         words |= {"origin": origin, "length": 1.0 / max(abs(rate), 1e-9), "end": "beginning" if rate > 0.0 else "end"}
         fields["axis"] = words["axis"] = AXES[axis]
-        if one.kind == TRANSIENT:
+        if one.kind == Transient.NAME:
             fields = {"axis": AXES[1], "size_px": size}
         else:
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
@@ -345,7 +327,7 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
             words |= fields
     numbers = one.gain, one.gap, one.runner_up or None
     return ExplanationEntry(
-        one.kind, _EXPLANATION_SENTENCES[one.kind].format(**words), None if of_all else image, *numbers, **fields
+        one.kind, TERMS[one.kind].SENTENCE.format(**words), None if of_all else image, *numbers, **fields
     )
 
 

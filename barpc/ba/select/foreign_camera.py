@@ -16,23 +16,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block
+from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.mixture import fit_mixture
-from barpc.ba.evidence.scan import Interval, scan
-from barpc.ba.judging.judge import Finding, Selection, around, judge
-from barpc.ba.judging.moving import Motion, MovingGroup, members
-from barpc.ba.judging.solution import Solution
 from barpc.ba.resection import Placed, RpcDiagnosis, diagnose_rpc, resect
-from barpc.ba.robust.heldout import is_better, measure
+from barpc.ba.select.parts import lost_shares
+from barpc.ba.select.search import linearised_among
+from barpc.ba.solution import Solution
 from barpc.base.errors import AdjustError
-from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array
 from barpc.base.options import GEOMETRIC, AdjustOptions
-from barpc.base.statistics import CRITICAL, LARGEST, LEVEL, MUCH_NOISE, RIVALS, SMALL, SURE, TRIED
-from barpc.scene import BoolArray, IntArray, connected_groups
+from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SMALL, SURE, TRIED
+from barpc.scene import connected_groups
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +38,6 @@ _TELLING = 3  # views: without one a pair is left, which agrees about much; so e
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]
 """What is solved, what measures it, and how -> the block solved."""
-_COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +99,7 @@ class LeaveOneOut:
     @property
     def usual(self) -> float:
         """The share of their tie points that the others lose."""
-        return float(np.median(np.delete(_lost(self.found, self.block), self.view)))
+        return float(np.median(np.delete(lost_shares(self.found, self.block), self.view)))
 
     @property
     def strange(self) -> bool:
@@ -128,7 +124,7 @@ class LeaveOneOut:
         return float(seen * (own * np.log(own / usual)).sum() - np.log(len(self.block.views)))
 
 
-def find_apart(
+def find_foreign_camera(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> tuple[ForeignCamera | None, Solution | None]:
     """Find the view whose RPC is not its own, where a block shows one, and the block solved without it.
@@ -141,7 +137,7 @@ def find_apart(
     asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
     if num < 3 or unknowns > LARGEST or asked_for_less:
         return None, None
-    lost = np.ones(num) if first is None else _lost(first, block)
+    lost = np.ones(num) if first is None else lost_shares(first, block)
     gone = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))
     asked = np.argsort(-lost, kind="stable")
     if first is not None:
@@ -193,15 +189,6 @@ def _odd(found: Solution, block: Block) -> int | None:
     return int(odd[0])
 
 
-def _lost(found: Solution, block: Block) -> Array:
-    """Return the share (N,) of each view's tie points that were cut; of a view without any all."""
-    ties = block.use & (block.point < block.num_tracks)
-    had, kept = (
-        np.bincount(block.view[rows], minlength=len(block.views)) for rows in (ties, ties & found.outcome.inlier)
-    )
-    return np.asarray(1.0 - kept / np.maximum(had, 1))
-
-
 def _leave_one_view_out(
     views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> Iterator[tuple[int, Block, Solution]]:
@@ -215,7 +202,9 @@ def _leave_one_view_out(
         except (AdjustError, np.linalg.LinAlgError) as error:
             logger.info("without %s: %s", block.names[v], error)
             continue
-        if np.delete(_lost(found, others), v).max() < 0.5 and agrees(found):  # the few left of many agree by choice
+        if np.delete(lost_shares(found, others), v).max() < 0.5 and agrees(
+            found
+        ):  # the few left of many agree by choice
             yield v, others, found
 
 
@@ -267,147 +256,9 @@ def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
     size = np.array([view.size for view in block.views], dtype=np.float64)
     area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
     problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
-    known = around(replace(left.found.outcome, problem=problem), left.block, np.arange(len(left.block.views)))
+    known = linearised_among(replace(left.found.outcome, problem=problem), left.block, np.arange(len(left.block.views)))
     if known is None:
         return -ties * float(np.log(area))
     linear, _ = known
     covered = sum(tracks.rows.size for tracks in linear.tracks)
     return fit_mixture(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """Observations (K,) of a block, each in one part: solved, held out, or moving."""
-
-    block: Block
-    kept_out: BoolArray  # (K,)
-    group: IntArray  # (K,) number of the group that moved from 1 on, 0: of none
-
-    @cached_property
-    def inner(self) -> Block:
-        """Observations that are solved."""
-        return self.block.without(self.kept_out | (self.group > 0))
-
-    @cached_property
-    def outer(self) -> Block:
-        """Observations that measure the result."""
-        return self.block.without(~self.kept_out | (self.group > 0))
-
-    @cached_property
-    def apart(self) -> Block:
-        """Observations that move."""
-        return self.block.without(self.group == 0)
-
-    def without_view(self, view: int) -> Parts:
-        """Return the parts without all observations of one view."""
-        of_it = self.block.view == view
-        return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
-
-    def less(self, found: Solution, one: MovingGroup) -> Parts:
-        """Return the parts with one more group taken out."""
-        number, group, block = self.group.max(initial=0) + 1, self.group.copy(), self.block
-        still = group == 0
-        group[still & ~self.kept_out] = number * one.member
-        # held-out tracks, and control points on it, whose place is none of both dates
-        of_gcps = (block.point >= block.num_tracks) & (block.point < block.num_known)
-        for rows in (still & self.kept_out, still & of_gcps):
-            group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
-        return replace(self, group=group)
-
-    def is_tied(self) -> bool:
-        """Return whether every view keeps enough observations and the views stay connected as they were."""
-        block, inner = self.block, self.inner
-        kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
-        enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
-        return enough and _groups(inner) == _groups(block)
-
-    def keeps(self, found: Solution, view: int) -> bool:
-        """Return whether a solution keeps half as many of a view's tie points as of another's, and no group moves.
-
-        Where ties move it may be those of the view that do.
-        """
-        kept = 1.0 - _lost(found, self.inner)
-        return not self.group.any() and bool(kept[view] >= 0.5 * np.median(np.delete(kept, view)))
-
-    def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand."""
-        block, gone = self.block, self.group > 0
-        if not gone.any():
-            return []
-        rows = gone.copy()
-        rows[~self.kept_out & ~gone] = inlier & (self.inner.point < block.num_tracks)
-        size = np.array([view.size for view in block.views], dtype=np.float64).T
-        none = np.zeros((2, int(rows.sum())))
-        found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none, none[0])
-        sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
-        return [replace(one, moves=True) for one in sure if one.share > 0.5]
-
-    def motion(self, number: int, one: MovingGroup, points: Array) -> Motion:
-        """Return the motion of a group, of the points (P, 3) [m] of all tracks."""
-        placed = self.block.point[self.block.point < self.block.num_tracks]
-        placed = placed[np.isfinite(points[placed, 0])]
-        every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
-        of_group = np.intersect1d(every, of_group)
-        ground, all_of = ground_from_ecef(points[of_group]), ground_from_ecef(points[every])
-        center = float(all_of[0, 0])
-        place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))
-        low, high = np.quantile(place, (LEVEL, 1.0 - LEVEL), axis=0)
-        middle = np.quantile(whole, (LEVEL, 1.0 - LEVEL), axis=0).mean(axis=0)  # a wrong match may lie anywhere
-        sides = [
-            names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
-            for axis, names in enumerate(_COMPASS_SIDES)
-        ]
-        west, east = (float(wrap_longitude(lon)) for lon in (low[0], high[0]))
-        box = west, float(low[1]), east, float(high[1])
-        share = len(of_group) / max(len(every), 1)
-        side = "-".join(one_side for one_side in sides[::-1] if one_side)
-        gcps = np.unique(self.block.point[(self.group == number) & (self.block.point >= self.block.num_tracks)])
-        names = tuple(self.block.gcps.names[g - self.block.num_tracks] for g in gcps.tolist())
-        first, second = (self.block.views[v].date for v in one.between)
-        return Motion(one.metres, one.between, share, box, side, names, (first, second))
-
-
-def _groups(block: Block) -> int:
-    """Count the groups into which views fall."""
-    rows = np.flatnonzero(block.use)
-    rows = rows[np.lexsort((block.view[rows], block.point[rows]))]
-    same = np.flatnonzero(np.diff(block.point[rows]) == 0)
-    pairs = np.unique(np.column_stack([block.view[rows[same]], block.view[rows[same + 1]]]), axis=0)
-    return len(connected_groups(len(block.views), [(int(i), int(j)) for i, j in pairs]))
-
-
-def without_moving(
-    found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
-) -> tuple[Solution, Parts, Selection]:
-    """Solve the block again without groups of ties that move, and find what explains the rest.
-
-    `Solution.findings` has both.
-
-    Refused where tracks that took no part, and do not move, are met worse, or the views do not hang together any more.
-    """
-    # who wants least squares has no observation that may be wrong; a model too small bends all images
-    noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
-    too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
-    if options.loss == "linear" or too_small:
-        return found, parts, Selection()
-    groups: list[Finding] = []
-    while True:
-        judged = judge(found.outcome, parts.inner, options.noise_floor)
-        findings = judged.findings
-        one = findings[-1] if findings else None
-        if one is None or one.moved is None:
-            break
-        findings = findings[:-1]
-        # what moves may be what the model does not follow, or the little that is left of what the cameras will
-        if options.is_plain or any(row.gain > one.gain for row in findings):
-            break
-        less = parts.less(found, one.moved)
-        if len(groups) == RIVALS or not less.is_tied():
-            break
-        tried = solve(less.inner, less.outer, options)
-        if is_better(measure(found.problem, found.final.params, less.outer), tried.after, less.outer):
-            break
-        found, parts = tried, less
-        groups.append(one)
-    judged = replace(judged, findings=findings)
-    return replace(found, findings=(*groups, *findings)), parts, judged

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.special import chdtri
 
-from barpc.ba.judging.agreement import Agreement
+from barpc.ba.control.agreement import Agreement
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import solve_transposed

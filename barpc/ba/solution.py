@@ -11,9 +11,8 @@ from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block, first_state, mak
 from barpc.ba.constraints.ground import PointConstraints, staying
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.constraints.terrain import Terrain
-from barpc.ba.judging.agreement import UNCONSTRAINED_SIGMA, Agreement, agreement, offsets_of
-from barpc.ba.judging.judge import Finding
-from barpc.ba.judging.snooping import ControlTest, control_test
+from barpc.ba.control.agreement import UNCONSTRAINED_SIGMA, Agreement, agreement, offsets_of
+from barpc.ba.control.snooping import ControlTest, control_test
 from barpc.ba.parameters.priors import DRIFT_SIGMA, NOISE_FLOOR
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.consensus import agreeing
@@ -23,6 +22,7 @@ from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure
+from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions

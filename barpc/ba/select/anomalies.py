@@ -1,0 +1,114 @@
+"""Tests of the residuals of a solved block: intervals, periods and correlated noise that stand out.
+
+Observations that were cut are tested with those that were kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from barpc.ba.constraints.block import Block
+from barpc.ba.evidence.correlated_noise import shared_errors
+from barpc.ba.evidence.periods import Period, find_periods
+from barpc.ba.evidence.scan import Interval, scan
+from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
+from barpc.ba.robust.weights import Observations
+from barpc.base.geodesy import Array
+from barpc.base.statistics import OUTLIER, SURE
+from barpc.scene import BoolArray, IntArray
+
+
+def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """Find the intervals of images in which more ties were cut, or are displaced, than elsewhere and chance
+    allow.
+
+    A mean below `floor` [px] is none.
+    """
+    if floor not in outcome.standing_out:
+        outcome.standing_out[floor] = _standing_out(outcome, block, floor)
+    return outcome.standing_out[floor]
+
+
+def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    rows, off = _whitened(outcome, block)
+    right = outcome.inlier[rows].astype(np.float64)  # of few ties some that were cut make a mean by chance
+    pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
+    found = scan(block.view[rows], block.xy[:, rows], image_sizes(block), 1.0 - right, off, right, floor / pixel)
+    return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
+
+
+def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """Return the intervals that stand out at the end, with the offsets of the ties that were cut there.
+
+    As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
+    """
+    found = standing_out(outcome, block, floor)
+    if not all(
+        one.by_share for one in found
+    ):  # noise that neighbours share makes means of them, and is none of an image's part
+        by_neighbours = correlated_noise_gain(outcome, block)
+        found = [one for one in found if one.by_share or one.gain > by_neighbours]
+    if not any(one.by_share for one in found):
+        return found
+    state, weight = outcome.minimum.state, block.use / block.sigma
+    residual = retriangulate_rejected(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
+    off = np.hypot(*residual)
+    cut = (block.point < block.num_tracks) & block.use & ~outcome.inlier & np.isfinite(off)
+    inside = [
+        cut & (block.view == one.view) & (block.xy[one.axis] >= one.start) & (block.xy[one.axis] < one.stop)
+        for one in found
+    ]
+    return [
+        replace(one, apart=float(np.median(off[rows])) if rows.any() else 0.0)
+        for one, rows in zip(found, inside, strict=True)
+    ]
+
+
+def periods_of(outcome: Outcome, block: Block) -> list[Period]:
+    """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
+    rows, off = _whitened(outcome, block)
+    return find_periods(
+        block.view[rows], block.xy[1, rows], image_sizes(block), _confirmed_observations(outcome, block)[rows], off
+    )
+
+
+def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
+    """Return by how much noise that neighbours share explains the ties kept better than noise of each alone [nats]."""
+    rows, off = _whitened(outcome, block)
+    return correlated_log_ratio(
+        block.view[rows], block.xy[:, rows], image_sizes(block), off, outcome.inlier[rows], block.point[rows]
+    )
+
+
+def correlated_log_ratio(
+    view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray
+) -> float:
+    """Return what noise that neighbours share explains [nats], of ties (k,) off by (2, k) standard deviations.
+
+    A track of n views leaves 2 n - 3 of its 2 n residuals free.
+    """
+    right = right & (np.hypot(*off) < OUTLIER)
+    free = 1.0 - 1.5 * len(np.unique(track[right])) / max(int(right.sum()), 1)
+    return free * float(shared_errors(view[right], place[:, right], size, off[:, right]).sum())
+
+
+def _confirmed_observations(outcome: Outcome, block: Block) -> Array:
+    """Return 1 for observations (K,) of points that others tell: what was cut is seen as well as the rest."""
+    right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
+    return (right[block.point] >= 2).astype(np.float64)
+
+
+def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
+    """Return the observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
+    is_tie = (block.point < block.num_tracks) & block.use
+    freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(outcome.inlier.astype(np.float64))
+    spread = block.sigma * outcome.noise * np.sqrt(0.5 * freedom)
+    rows = is_tie & np.isfinite(outcome.residual).all(axis=0)
+    return rows, outcome.residual[:, rows] / spread[rows]
+
+
+def image_sizes(block: Block) -> Array:
+    """Return the sizes (2, N) of the images, columns and rows."""
+    return np.array([view.size for view in block.views], dtype=np.float64).T

@@ -1,0 +1,349 @@
+"""A beam search for the terms of a block: the term of most evidence is taken, then the next, beside its rivals.
+
+Evidence is the gain of the marginal likelihood of all observations [nats] less the price of the choice. Up to `RIVALS`
+combinations are searched side by side; correlated noise, which needs no term, is the rival of all.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from barpc.ba.evidence.linearised import Linear
+from barpc.ba.evidence.mixture import LIKELIHOOD_TOLERANCE, MixtureFit, fit_mixture, off_from_right
+from barpc.ba.evidence.periods import Period, find_periods
+from barpc.ba.evidence.scan import Interval, scan
+from barpc.ba.select.anomalies import correlated_log_ratio
+from barpc.ba.terms import IN_IMAGES, TERMS, LowFrequency, MovingObjects, Sinusoid, proposed
+from barpc.ba.terms.term import Finding, Residuals, Term
+from barpc.base.geodesy import Array
+from barpc.base.statistics import BACKFITTING, RIVALS, STANDS, SURE, TRIED
+from barpc.scene import BoolArray
+
+logger = logging.getLogger(__name__)
+
+_SEEN = 2.5  # floors: sinusoids and motions that are taken; sound crops show sinusoids of 1.8, by correlated noise
+_Tried = tuple[Term, MixtureFit, float]
+"""A term, the fit with it, and the evidence that it gains [nats]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The terms taken, and the cameras and observations with them."""
+
+    findings: tuple[Finding, ...] = ()
+    step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
+    right: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability that an observation is right
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    term: Term
+    gain: float
+    gap: float
+    runner_up: str
+    or_of: tuple[int, ...]
+    before: Residuals
+
+    @property
+    def name(self) -> tuple[str, int]:
+        """Kind and view of the term."""
+        return self.term.NAME, self.term.view
+
+
+@dataclass(frozen=True, eq=False)
+class _SearchState:
+    """A combination of terms."""
+
+    seen: Residuals
+    followed: MixtureFit  # with the terms that are estimated with the cameras
+    taken: tuple[_Taken, ...] = ()
+    ended: bool = False  # nothing may be taken beside them
+
+    @property
+    def gain(self) -> float:
+        """Evidence gained by all terms."""
+        return sum(row.gain for row in self.taken)
+
+    @property
+    def moves(self) -> bool:
+        """Whether moving ground is the last term."""
+        return bool(self.taken) and self.taken[-1].term.group is not None
+
+    @property
+    def gain_beside_motion(self) -> float:
+        """Evidence gained by the terms before moving ground; by all where there is none."""
+        return self.gain - (self.taken[-1].gain if self.moves else 0.0)
+
+    def may_pass(self, best: _SearchState) -> bool:
+        """Return whether more terms, each gaining less than the last, may explain more than another that ended."""
+        left = RIVALS + len(best.taken) - 1 - len(self.taken)
+        return self.gain + left * self.taken[-1].gain > best.gain
+
+    def adds_to(self, best: _SearchState, beside: list[_Tried]) -> bool:
+        """Return whether its last term gains as much beside the best: it is no rival then."""
+        last, one = self.taken[-1], self.taken[-1].term
+        same = [row.name for row in self.taken[:-1]] == [row.name for row in best.taken[:-1]]
+        gains = [row[2] for row in beside if row[0].NAME == one.NAME and not row[0].differs(one)]
+        return same and max(gains, default=0.0) > last.gain - SURE
+
+    def added(self, tried: list[_Tried]) -> _SearchState:
+        """Return the state with the first of the terms tried; the others are its rivals."""
+        first = tried[0]
+        same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
+        one, made, gain = min(same, key=lambda row: row[0].share(self.seen))  # of two as good, the smaller part
+        others = [row for row in tried if row[0] is not one and row[0].differs(one)]
+        other = max(((row[0].NAME, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
+        close = [row[0] for row in others if row[2] > gain - SURE]
+        or_of = tuple(sorted({row.view for row in close if isinstance(row, Sinusoid) and isinstance(one, Sinusoid)}))
+        logger.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.NAME, one.view, one.where, gain, *other)
+        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
+        extra = np.concatenate([self.seen.extra, one.columns], axis=1)
+        seen = replace(self.seen, base=made, extra=extra, sigma=np.append(self.seen.sigma, one.sigma))
+        followed = made if one.FOLLOWED else self.followed
+        return _SearchState(seen, followed, taken, not one.FOLLOWED or len(taken) == TRIED)
+
+    def without_noise(self) -> _SearchState:
+        """Return the state with the first terms alone, where correlated noise explains as much as all after them."""
+        for n, row in enumerate(self.taken):
+            if sum(one.gain for one in self.taken[n:]) <= _by_neighbours(row.before):
+                return _SearchState(row.before, row.before.base, self.taken[:n])
+        return self
+
+    def simplified(self) -> _SearchState:
+        """Return the state with simpler terms where these explain as much beside all others."""
+        state = self
+        for n, row in enumerate(self.taken):
+            seen, plain = state.seen, row.term.simpler(state.seen)
+            if plain is None or state.moves:
+                continue
+            at = slice(*(sum(len(one.term.sigma) for one in state.taken[: n + k]) for k in (0, 1)))
+            extra = seen.extra.copy()
+            extra[:, at] = plain.columns
+            found = fit_mixture(seen.linear, extra, seen.sigma, seen.base)
+            if found.evidence - plain.price > seen.base.evidence - row.term.price:
+                taken = (*state.taken[:n], replace(row, term=plain), *state.taken[n + 1 :])
+                state = replace(state, seen=replace(seen, base=found, extra=extra), followed=found, taken=taken)
+        return state
+
+    def findings(self, margin: float) -> Iterator[Finding]:
+        """Yield the records of the terms; `margin` is by how much the combination gains over its rival."""
+        stop = 0
+        for row in self.taken:
+            start, stop = stop, stop + len(row.term.sigma)
+            unknowns = self.seen.base.extra[start:stop]
+            # a term that was not the best by itself is beside the others: by what these gain together
+            gap = row.gap if row.gap > 0.0 else margin
+            yield from row.term.findings(
+                self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=row.or_of
+            )
+
+
+def _of_one_image(one: Term, other: Term) -> bool:
+    """Return whether two terms may be a part of an image and its complement."""
+    return one is other or (one.view == other.view and one.LOCAL and other.LOCAL)
+
+
+def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
+    """Return the residuals (2, K) of a fit with terms of columns `extra`, in stated standard deviations."""
+    return np.asarray(linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma)
+
+
+def _by_neighbours(seen: Residuals) -> float:
+    """Return the evidence for noise that neighbours share, beside the terms taken [nats]."""
+    found, linear = seen.base, seen.linear
+    off, _ = off_from_right(linear, _residuals(found, linear, seen.extra), found.right)
+    track = np.full(len(linear.view), -1)
+    for n, tracks in enumerate(linear.tracks):
+        track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
+    right = (track >= 0) & (found.right > 0.5)
+    # what exceeds the stated errors of matchers is no noise of theirs
+    return correlated_log_ratio(linear.view, seen.place, seen.size, off, right, track)
+
+
+class TermSearch:
+    """A search for terms at the residuals of a block.
+
+    Parameters
+    ----------
+    seen : Residuals
+    first : list of Interval
+        Intervals that stand out before the first term.
+    floor, sigma : float, least displacement that is looked for and standard deviation of observations [px]
+    """
+
+    def __init__(self, seen: Residuals, first: list[Interval], floor: float, sigma: float) -> None:
+        self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma
+        self.seen, self.taken = seen, tuple[_Taken, ...]()
+        self.group: list[Term] = []  # searched for once
+
+    def run(self) -> Selection:
+        """Return all terms that are taken."""
+        first, ended = self._grown([_SearchState(self.start, self.start.base)])
+        states = first
+        while not ended:
+            states, ended = self._grown(states)
+        if first[0].moves and states[0].gain_beside_motion < first[0].gain:
+            # the terms beside moving ground explain less than it does alone: all compete again without it
+            states = first[:1]
+        margin = states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
+        best = states[0].without_noise().simplified()
+        if not best.taken:
+            return Selection()
+        base = best.seen.base if all(row.term.FOLLOWED for row in best.taken) else best.followed
+        return Selection(tuple(best.findings(margin)), base.step, base.right)
+
+    def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
+        """Return the best combinations with one more term, and whether they are the last."""
+        best, grown, beside = states[0], list[_SearchState](), list[_Tried]()
+        for state in states:
+            if state.ended or (best.ended and not state.may_pass(best)):
+                grown.append(state)
+                continue
+            if state is not best and state.adds_to(best, beside):
+                continue
+            self.seen, self.taken = state.seen, state.taken
+            tried = [row for row in self._tried() if row[2] > SURE]
+            if not tried and state is best:  # it explains all
+                return states, True
+            beside = tried if state is best else beside
+            for n in [0, *_rivals(tried)] if tried else []:
+                grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
+            grown += [] if tried else [replace(state, ended=True)]
+        kept: list[_SearchState] = []
+        for state in sorted(grown, key=lambda state: -state.gain):
+            if not any({row.name for row in state.taken} == {row.name for row in one.taken} for one in kept):
+                kept.append(state)
+        kept = kept[:RIVALS]
+        return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
+
+    def _tried(self) -> list[_Tried]:
+        """Return the terms that stand out beside those taken, with their gains; the best first."""
+        seen = self.seen
+        out, periods = self._standing_out(seen.base, seen.extra)
+        # in a pair more wrong matches at an end explain those cut there as well, and nothing stands out beside them
+        out = out or ([] if self.taken else self.first)
+        made = self._with([], self._worth_more(list(proposed(seen, out, periods))))
+        made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
+        if (out or self.group) and not self._leaves_nothing(made):
+            made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
+        least = self.floor * _SEEN
+        return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)
+
+    def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
+        """Return the intervals and periods that stand out beside a fit with terms of columns `extra` (2, e, K)."""
+        seen, linear = self.seen, self.seen.linear
+        rows = linear.taking_part
+        wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
+        all_off, known = off_from_right(linear, _residuals(found, linear, extra), found.right)
+        off, told = all_off[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
+        floor = self.floor / self.sigma / found.noise
+        out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
+        return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, told, off)[:RIVALS]
+
+    def _leaves_nothing(self, made: list[_Tried]) -> bool:
+        """Return whether nothing stands out beside the best term that is followed: no rival is needed then."""
+        if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
+            return False
+        one, found, _ = made[0]
+        return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
+
+    def _moving(self, out: list[Interval], made: list[_Tried]) -> list[_Tried]:
+        """Return moving ground, searched for once, and parts of images that hold the same observations."""
+        self.group = self.group or list[Term](MovingObjects.propose(self.seen, out[0]))
+        found = self._with([], self.group)
+        rows = self.seen.linear.taking_part
+        sure = [row for row in found if row[2] > SURE]
+        return self._refined(self._with(found, [one for row in sure for one in self._members(row[1], rows)]))
+
+    def _refined(self, made: list[_Tried]) -> list[_Tried]:
+        """Return the terms, best first, with ends, periods and lengths refined where these may gain most."""
+        kinds = [kind for kind in TERMS.values() if kind.LOCAL]
+        local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
+        # where one is sure already, one that is not waits for the next round
+        least = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
+        return self._sorted(
+            self._refine(one, found)
+            if gain > least and (one in local or not (one.LOCAL or one.group))
+            else (one, found)
+            for one, found, gain in made
+        )
+
+    def _worth_more(self, offered: list[Term]) -> list[Term]:
+        """Return the terms that, by a sample of tracks, may gain most, alone or as the largest of several."""
+        few = self.seen.few
+        if few is self.seen.linear or len(offered) < 3:
+            return offered
+        base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
+        gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
+        least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
+        return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
+
+    def _members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
+        """Yield the parts of images that hold a moving group: displaced rows move on the ground, too."""
+        seen, none = self.seen, np.zeros((2, int(rows.sum())))
+        places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
+        best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
+        intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
+        return proposed(seen, intervals, [], [kind for kind in IN_IMAGES if kind is not LowFrequency])
+
+    def _with(self, made: list[_Tried], more: list[Term]) -> list[_Tried]:
+        """Return the terms tried so far and more, the best first."""
+        return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
+
+    def _sorted(self, made: Iterable[tuple[Term, MixtureFit]]) -> list[_Tried]:
+        base = self.seen.base.evidence
+        return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
+
+    def _refine(self, one: Term, found: MixtureFit) -> tuple[Term, MixtureFit]:
+        for _ in range(BACKFITTING):
+            others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
+            better, made = found, one
+            for shape in one.shapes(self.seen, self._fit):
+                again = shape.refined(self.seen, found, others)
+                # a term that stays as it was gains no more than another did
+                if better.evidence < found.evidence + LIKELIHOOD_TOLERANCE or not _stands(again, one):
+                    fitted = self._fit(again, base=found)
+                    better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
+            more = better.evidence - found.evidence
+            one, found = made, better
+            if more < LIKELIHOOD_TOLERANCE:
+                break
+        return one, found
+
+    def _fit(self, one: Term, linear: Linear | None = None, base: MixtureFit | None = None) -> MixtureFit:
+        seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
+        extra = np.concatenate([seen.extra, one.columns], axis=1)
+        return fit_mixture(linear or seen.linear, extra, sigma, base or seen.base, one.group)
+
+
+def _stands(one: Term, before: Term) -> bool:
+    """Return whether a term is where it was, with a prior about as wide."""
+    return one.where == before.where and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
+
+
+def _rivals(tried: list[_Tried]) -> list[int]:
+    """Return the best terms of other kinds or views that are followed, and may win with some beside."""
+    found: dict[tuple[str, int], int] = {}
+    for n, (one, _, gain) in enumerate(tried):
+        if one.FOLLOWED and one.differs(tried[0][0]) and gain > tried[0][2] / RIVALS:
+            found.setdefault((one.NAME, one.view), n)
+    return list(found.values())[: RIVALS - 1]
+
+
+def _uncovered(intervals: list[Interval]) -> list[Interval]:
+    """Return the intervals without those that a better one covers."""
+    out: list[Interval] = []
+    for one in intervals:
+        if not any(_same(one, other) for other in out):
+            out.append(one)
+    return out
+
+
+def _same(one: Interval, other: Interval) -> bool:
+    common = min(one.stop, other.stop) - max(one.start, other.start)
+    either = max(one.stop, other.stop) - min(one.start, other.start)
+    return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either

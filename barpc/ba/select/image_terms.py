@@ -1,0 +1,193 @@
+"""Models with additional parameters in the images: terms that a search found, splines over the rows, detector steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.constraints.block import Block, make_problem
+from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters
+from barpc.ba.robust.heldout import is_admitted, is_better
+from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
+from barpc.ba.select.anomalies import correlated_noise_gain, standing_out
+from barpc.ba.select.beam import Selection
+from barpc.ba.select.parts import Parts
+from barpc.ba.solution import MUCH_BETTER, Solution, finished
+from barpc.ba.terms import TERMS, Sinusoid
+from barpc.ba.terms.detectors import find_edges
+from barpc.ba.terms.term import Finding
+from barpc.base.geodesy import Array
+from barpc.base.options import AUTO, OFF, AdjustOptions
+from barpc.base.statistics import FEW, LARGEST, SURE
+
+_SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
+_TWICE = 2  # times that detectors are searched for, and that denser splines may be no better
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Additional parameters, with what is known of them."""
+
+    waves: AdditionalParameters
+    start: Array | None = None  # (N, waves.size) estimates to start from
+    drift: int | None = None  # degree of the drift beside them; None: as before
+
+
+def with_terms(found: Solution, selected: Selection, parts: Parts, options: AdjustOptions) -> Solution:
+    """Solve the block with the terms in images that a search selected.
+
+    Refused where check tracks are met worse, or no better than with splines and detectors. A further degree of the
+    drift that was solved before is tested again beside the terms.
+    """
+    terms = [one for one in selected.findings if TERMS[one.kind].FOLLOWED]
+    if not terms or options.jitter == OFF or options.is_plain:
+        return found
+    outer = parts.outer
+    at, layout = _at_selection(found, selected, parts.inner), _layout_of(terms, len(parts.inner.views))
+    tried = _solve_with(at, parts, options, layout)
+    if "drift" in found.asked:
+        less = found.problem.cameras.unknowns.drift - 1
+        plain = _solve_with(at, parts, options, replace(layout, drift=less))
+        tried = tried if is_admitted(tried.after, plain.after, outer) else replace(plain, asked={})
+    without = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
+    if not is_admitted(tried.after, found.after, outer, sum(one.gain for one in terms)):
+        return without
+    # rows of one image that wander have competed with these already; what all images have in common has not: detectors,
+    # or a platform that shakes
+    shaken = len({one.view for one in terms}) == len(parts.inner.views)
+    # of sinusoids the last image may be what the others are seen against
+    waves = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
+    if not (shaken or waves) and not any(one.where is not None and one.where[0] == 0 for one in terms):
+        return tried
+    smooth = with_splines(found, parts, options)
+    left = [
+        sum(one.gain for one in standing_out(of.outcome, parts.inner, options.noise_floor)) for of in (smooth, tried)
+    ]
+    calm = smooth is not found and left[0] <= left[1]
+    # of parts of few images the fewer unknowns stay, where the others are not surely better
+    first, second = (tried, smooth) if shaken else (smooth, tried)
+    if not calm or is_better(first.after, second.after, outer) == shaken:
+        return tried
+    return without if shaken or waves else found
+
+
+def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
+    """Solve the block with splines over the rows and detector steps, where options or residuals ask for them.
+
+    Knots are set twice as dense until no correlated residuals are left, the observations are too few, or check tracks
+    are met no better.
+    """
+    block = parts.inner
+    given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
+    best, misses = found, 0
+    for count in _spline_counts(block, options, found.has_waves):
+        if misses == _TWICE or not (best.has_waves or (asked and best is found)):
+            break
+        layout = _Layout(AdditionalParameters(count, _given_edges(block, options)))
+        if options.detectors:
+            tried = _solve_with(found, parts, options, layout)
+        else:
+            tried = _with_edges(_solve_with(found, parts, options, layout, once=True), parts, options)
+        better = given or (asked and best is found) or is_admitted(tried.after, best.after, parts.outer)
+        best, misses = (tried, 0) if better else (best, misses + 1)
+    if best is found or not (given or asked or _explains(best, found, block)):
+        return found
+    return replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
+
+
+def _explains(tried: Solution, found: Solution, block: Block) -> bool:
+    """Return whether additional parameters explain most of the correlation of neighbours, or much is gained.
+
+    The errors of check tracks are correlated with those of their neighbours: they do not tell cameras from noise.
+    """
+    left, before = (correlated_noise_gain(one.outcome, block) for one in (tried, found))
+    return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
+
+
+def _at_selection(found: Solution, selected: Selection, block: Block) -> Solution:
+    """Return the block at a search's end: its cameras, and the observations that are right with them."""
+    outcome, is_tie = found.outcome, block.point < block.num_tracks
+    inlier = np.where(is_tie, block.use & (selected.right > 0.5), outcome.inlier)
+    ended = outcome.minimum.state
+    moved = replace(ended, params=ended.params + selected.step)
+    return replace(found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved)))
+
+
+def _layout_of(terms: list[Finding], views: int) -> _Layout:
+    """Return the additional parameters of terms: parts of images, and periods, a view; started from their estimates."""
+    own = [
+        [[one for one in terms if one.view == v and (one.period is None) == of_parts] for v in range(views)]
+        for of_parts in (True, False)
+    ]
+    most = [max(map(len, of_kind)) for of_kind in own]
+    places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)
+    moved, swung = np.zeros((views, 2, most[0])), np.zeros((views, 2, 2, most[1]))
+    for v, (of_parts, of_periods) in enumerate(zip(*own, strict=True)):
+        for n, one in enumerate(of_parts):
+            assert one.where is not None
+            places[v, n], moved[v, :, n] = one.where, one.unknowns
+        for n, one in enumerate(of_periods):
+            assert one.period is not None
+            periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
+    params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
+    return _Layout(AdditionalParameters(0, np.zeros((views, 0)), places, periods), params)
+
+
+def _with_edges(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
+    """Return the block, of which one pass was solved with splines, with detector steps where residuals show them.
+
+    The steps found show others: they are searched for again.
+    """
+    waves, block = found.problem.cameras.unknowns.waves, parts.inner
+    assert waves is not None
+    for _ in range(_TWICE if found.has_waves else 0):
+        outcome = found.outcome
+        sigma = block.sigma * outcome.noise
+        edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
+        if edges.shape[1] <= waves.edges.shape[1]:
+            break
+        waves = AdditionalParameters(waves.count, edges)
+        found = _solve_with(found, parts, options, _Layout(waves))
+    return found if waves.edges.size else _solve_with(found, parts, options, _Layout(waves))
+
+
+def _given_edges(block: Block, options: AdjustOptions) -> Array:
+    return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
+
+
+def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
+    """Return the numbers of splines to try, the fewest first, as many as the observations of a view hold."""
+    rows = max(view.size[1] for view in block.views)
+    if options.jitter == OFF or options.is_plain:
+        return [0] if options.detectors else []
+    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
+    if options.spacing:
+        return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), MIN_SPLINES)]
+    most = min(most, LARGEST // (2 * len(block.views)))
+    wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
+    dense = np.unique(np.clip(wanted, MIN_SPLINES, most)).tolist() if has_waves and most >= MIN_SPLINES else []
+    return dense or [0] * bool(options.detectors)
+
+
+def _solve_with(found: Solution, parts: Parts, options: AdjustOptions, layout: _Layout, once: bool = False) -> Solution:
+    """Return the block solved with additional parameters from where it ended; every observation may come back."""
+    block, waves, start = parts.inner, layout.waves, layout.start
+    outcome, ended, unknowns = found.outcome, found.outcome.minimum.state, found.problem.cameras.unknowns
+    if unknowns.waves is not None:  # terms that were found stay
+        waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
+    drift = unknowns.drift if layout.drift is None else layout.drift
+    bent = make_problem(block, options, unknowns.center, None, drift, waves)
+    params, first = np.zeros_like(bent.camera_prior.mean), bent.cameras.unknowns.in_waves.start
+    params[:, :first] = ended.params[:, :first]
+    if start is not None:
+        params[:, first:] = start
+    elif unknowns.waves is not None:
+        params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
+    weight, known = block.use / block.sigma, outcome.inlier
+    if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these
+        count = np.bincount(block.point[known], minlength=bent.structure.num_points)
+        weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
+    there, _ = retriangulate_rejected(bent, replace(ended, params=params), outcome.residual, known, weight)
+    outcome = Rounds(bent, block, there, found.heights, block.use, outcome).run(once)
+    return finished(found, bent, block, parts.outer, options, outcome)

@@ -1,0 +1,152 @@
+"""The model of a block: the simplest, unless the data choose another.
+
+Proposed one after the other: without a foreign camera, without moving ground, with terms in the images, splines and
+detectors, an affine in every image. Evidence is that of all observations; check tracks, drawn before, have a veto, and
+decide alone where no evidence is at hand (`is_admitted`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from barpc.ba.constraints.block import Block
+from barpc.ba.parameters.priors import NOISE_FLOOR
+from barpc.ba.robust.heldout import is_admitted, measure
+from barpc.ba.select.anomalies import standing_out
+from barpc.ba.select.beam import Selection
+from barpc.ba.select.foreign_camera import ForeignCamera, Solver, find_foreign_camera
+from barpc.ba.select.image_terms import with_splines, with_terms
+from barpc.ba.select.parts import Parts
+from barpc.ba.select.search import search_terms
+from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
+from barpc.ba.terms.term import Finding
+from barpc.base.errors import AdjustError
+from barpc.base.options import AUTO, AdjustOptions
+from barpc.base.statistics import MUCH_NOISE, RIVALS
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A block solved by the model that the data choose."""
+
+    found: Solution
+    parts: Parts
+    in_space_rms: float | None = None  # [px] of check tracks with the model in space, where an affine was chosen
+    foreign: ForeignCamera | None = None  # the view that it was solved without, or that may be wrong
+
+
+def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Model:
+    """Return the block by the model that the data choose.
+
+    Raises
+    ------
+    AdjustError
+        There is no solution.
+    """
+    first, foreign, without = _first(parts, options, solve)
+    if foreign is not None and foreign.may_be_its_own and first is not None:
+        # terms in its rows and columns may explain it: then it is no other image's
+        chosen = _select_beside(first, parts, options, solve)
+        if chosen.parts.keeps(chosen.found, foreign.view):
+            return chosen
+    if foreign is not None and foreign.clear:
+        parts = parts.without_view(foreign.view)
+    start = first if without is None else without
+    assert start is not None
+    return replace(_select_beside(start, parts, options, solve), foreign=foreign)
+
+
+def _first(
+    parts: Parts, options: AdjustOptions, solve: Solver
+) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
+    """Return the block by the first model, and without a foreign camera where there is one; one of the two at least.
+
+    A block that goes on from an earlier one is not searched for foreign cameras.
+    """
+    block, first, failed = parts.inner, None, None
+    try:
+        first = solve(block, parts.outer, options)
+    except (AdjustError, np.linalg.LinAlgError) as error:
+        failed = error
+    goes_on = first is not None and first.goes_on
+    foreign, without = (None, None) if goes_on else find_foreign_camera(first, block, parts.outer, options, solve)
+    if without is not None or first is not None:
+        return first, foreign, without
+    assert failed is not None
+    if foreign is None:
+        raise failed
+    names = ", ".join(block.names[v] for v in foreign.views)
+    raise AdjustError(
+        f"{failed}. Without any one of {names} the other views agree: check that their RPCs are of these images, and "
+        "leave the wrong one out"
+    ) from failed
+
+
+def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Model:
+    """Return the model beside foreign cameras."""
+    given = options.model != AUTO or options.drift is not None or first.goes_on
+    found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
+    searched = first.problem.cameras.unknowns.geometric and not first.goes_on
+    if searched and (affine is None or not _is_calm(affine, parts.inner, options.noise_floor)):
+        found, parts, selected = _without_moving_ground(found, parts, options, solve)
+        found = with_terms(found, selected, parts, options)
+    if found.outcome is not first.outcome:  # else the same would be solved and found again
+        affine = None if given else _with_image_affine(found, parts, options, solve)
+    if searched:
+        smooth = with_splines(found, parts, options)
+        if affine is None or smooth.after.error < MUCH_BETTER * affine.after.error:
+            return Model(smooth, parts)
+    return Model(found, parts) if affine is None else Model(affine, parts, found.after.whole_rms)
+
+
+def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
+    """Solve the block with an affine in every image, where residuals are systematic and it is much better."""
+    skew = found.is_skew
+    if not (skew or found.has_trend):
+        return None
+    tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
+    better = tried.after.error < (CLEARLY if skew else MUCH_BETTER) * found.after.error
+    # it leaves the tilts of the scene open: not for less than an adjustment is asked for
+    return tried if better and tried.after.whole_rms < found.after.whole_rms - NOISE_FLOOR else None
+
+
+def _is_calm(found: Solution, block: Block, floor: float) -> bool:
+    """Return whether no residuals are left that terms of an image, or moving ground, might explain."""
+    return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
+
+
+def _without_moving_ground(
+    found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
+) -> tuple[Solution, Parts, Selection]:
+    """Solve the block without groups of tie points that move, and search the terms beside.
+
+    `Solution.findings` has both.
+    """
+    # least squares has no observation that may be wrong; a model too small bends all images
+    noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
+    too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
+    if options.loss == "linear" or too_small:
+        return found, parts, Selection()
+    groups: list[Finding] = []
+    while True:
+        selected = search_terms(found.outcome, parts.inner, options.noise_floor)
+        *findings, last = selected.findings or (None,)
+        if last is None or last.moved is None:
+            findings = list(selected.findings)
+            break
+        # what moves may be an error that the model does not follow, or the little that is left of one that it will
+        if options.is_plain or any(row.gain > last.gain for row in findings):
+            break
+        less = parts.less(found, last.moved)
+        if len(groups) == RIVALS or not less.is_tied():
+            break
+        tried = solve(less.inner, less.outer, options)
+        before = measure(found.problem, found.final.params, less.outer)
+        if not is_admitted(tried.after, before, less.outer, last.gain):
+            break
+        found, parts = tried, less
+        groups.append(last)
+    selected = replace(selected, findings=tuple(findings))
+    return replace(found, findings=(*groups, *findings)), parts, selected

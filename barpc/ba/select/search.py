@@ -1,0 +1,110 @@
+"""Terms that explain the residuals of a solved block, found among all of its observations, those that were cut too."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from barpc.ba.constraints.block import Block
+from barpc.ba.evidence.linearised import Linear, array_elements, linearise
+from barpc.ba.evidence.mixture import fit_mixture
+from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
+from barpc.ba.select.anomalies import image_sizes, periods_of, standing_out
+from barpc.ba.select.beam import Selection, TermSearch
+from barpc.ba.solving.solve import State
+from barpc.ba.terms.moving_ground import GroundMotion
+from barpc.ba.terms.term import Residuals
+from barpc.base.statistics import KEPT, LARGEST, SAMPLE, SMALL
+from barpc.scene import IntArray
+
+logger = logging.getLogger(__name__)
+
+MAX_OBSERVATIONS = KEPT
+"""Observations of the largest block that is searched."""
+_NEAREST = 12  # views that are searched together
+
+
+def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
+    """Find the terms of a block beside its cameras, the first taken first; none where no residuals stand out.
+
+    In a block of more unknowns than `SMALL` each image that stands out is searched among those with which it shares
+    most tracks: moving objects compete there, and are not taken.
+    """
+    size, views = outcome.problem.free.size, np.arange(len(block.views))
+    if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:
+        return Selection()
+    asks = [one.view for one in standing_out(outcome, block, floor)]
+    if not asks or size > SMALL:
+        asks += [one.view for one in periods_of(outcome, block)]
+    if size <= SMALL:
+        return _searched_among(outcome, block, floor, views) if asks else Selection()
+    found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
+    done: set[int] = set()
+    for view in dict.fromkeys(asks):
+        if view not in done:
+            views = _neighbour_views(block, view)
+            done.update(views.tolist())
+            one = _searched_among(outcome, block, floor, views)
+            if one.findings and one.findings[-1].moved is None:
+                found = _with_findings(found, one, views, np.flatnonzero(np.isin(block.view, views)))
+    return found if found.findings else Selection()
+
+
+def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
+    """Search the tie points that some views have in common; views and observations are renumbered."""
+    found = linearised_among(outcome, block, views)
+    if found is None:
+        return Selection()
+    linear, state = found
+    rows, ground = np.flatnonzero(np.isin(block.view, views)), GroundMotion.of(outcome.problem, state)
+    linear, ground = linear.among(views), ground.part(rows)
+    nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
+    number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
+    number[views] = np.arange(len(views))
+    try:
+        base, few = fit_mixture(linear), linear.thinned(SAMPLE)
+        seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
+        first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
+        return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
+    except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
+        logger.warning("the residuals of the tie points are not explained: %s", error)
+        return Selection()
+
+
+def _neighbour_views(block: Block, view: int) -> IntArray:
+    """Return a view and those that share most tracks with it, in their order."""
+    ties = block.use & (block.point < block.num_tracks)
+    of_view = np.zeros(block.num_points, dtype=bool)
+    of_view[block.point[ties & (block.view == view)]] = True
+    shared = np.bincount(block.view[ties & of_view[block.point]], minlength=len(block.views))
+    shared[view] = len(ties) + 1
+    nearest = np.argsort(-shared, kind="stable")[:_NEAREST]
+    return np.sort(nearest[shared[nearest] > 0])
+
+
+def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: IntArray) -> Selection:
+    """Return a selection with that among some views added, for observations at `rows`."""
+    step, right = all_of.step.copy(), all_of.right.copy()
+    new = ~step[views].any(axis=1)
+    step[views[new]] = one.step[new]
+    right[rows] = one.right
+    findings = (
+        replace(row, view=int(views[row.view]), or_of=tuple(int(views[v]) for v in row.or_of)) for row in one.findings
+    )
+    return Selection((*all_of.findings, *findings), step, right)
+
+
+def linearised_among(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
+    """Linearise the tie points among some views of a block at its solution; None where they are too many."""
+    problem = outcome.problem
+    use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
+    unknowns = problem.free.size // len(block.views) * len(views)
+    if unknowns > SMALL or array_elements(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
+        return None
+    state, _ = retriangulate_rejected(
+        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
+    )
+    low, high = block.alt_range
+    return linearise(problem, state, use, block.sigma, high - low), state

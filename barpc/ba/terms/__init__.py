@@ -1,0 +1,43 @@
+"""What residuals show beside the cameras: one term a file, with its columns, prior, price, refinement and words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from barpc.ba.evidence.periods import Period
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.terms.decay import Decay
+from barpc.ba.terms.low_frequency import LowFrequency
+from barpc.ba.terms.moving_objects import MovingObjects
+from barpc.ba.terms.sinusoid import Sinusoid
+from barpc.ba.terms.step import Step
+from barpc.ba.terms.term import Residuals, Term
+from barpc.ba.terms.transient import Transient
+
+__all__ = ["IN_IMAGES", "TERMS", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
+
+TERMS: dict[str, type[Term]] = {
+    term.NAME: term for term in (Step, Decay, Transient, LowFrequency, Sinusoid, MovingObjects)
+}
+"""Name -> term, in the order in which they are proposed."""
+IN_IMAGES = Step, Decay, Transient, LowFrequency
+"""Those that are proposed where an interval of an image stands out."""
+
+
+def proposed(
+    residuals: Residuals,
+    intervals: list[Interval],
+    periods: list[Period],
+    kinds: Sequence[type[Term]] = IN_IMAGES,
+) -> Iterator[Term]:
+    """Yield the terms that intervals and periods propose; those of a whole image, or of the block, once."""
+    for period in periods:
+        yield Sinusoid.of(residuals, period)
+    known = set[tuple[object, ...]]()
+    for interval in intervals:
+        for kind in kinds:
+            place = (interval.axis, interval.start, interval.stop) if kind.LOCAL else ()
+            key = (kind.NAME, *(() if kind.OF_BLOCK else (interval.view, *place)))
+            if key not in known and kind.may_be(residuals, intervals):
+                known.add(key)
+                yield from kind.propose(residuals, interval)

@@ -1,0 +1,50 @@
+"""Moving objects: the tie points of a part of the ground move between views: a cloud, water, a glacier, a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from barpc.ba.evidence.mixture import MixtureFit
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.terms import moving_ground
+from barpc.ba.terms.term import Finding, Residuals, Term
+from barpc.base.geodesy import Array
+
+
+class MovingObjects(Term):
+    """Displacements on the ground, one a view, of a group of tie points whose share is free in each cell."""
+
+    NAME: ClassVar[str] = "moving_objects"
+    NOUN: ClassVar[str] = "moving objects"
+    SENTENCE: ClassVar[str] = (
+        "{share:.0f} % of the tie points{side} move together ({cause}), by {metres:.2g} m from {between[0]} to "
+        "{between[1]} apart from an effect of height, and were excluded{control}{larger}"
+    )
+    OF_BLOCK: ClassVar[bool] = True
+
+    @classmethod
+    def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
+        """Return the most likely group."""
+        linear = residuals.linear
+        one = moving_ground.proposal(linear, residuals.ground, residuals.base, residuals.extra, residuals.sigma)
+        if one is None:
+            return []
+        none, cost = np.zeros((2, 0, len(linear.view))), moving_ground.price_of_group(linear, one.cell)
+        return [cls(-1, none, np.zeros(0), cost, group=one)]
+
+    def amplitude(self, found: MixtureFit) -> float:
+        """Return the root mean square displacement of the group [px]; infinite where nothing is of it."""
+        gone = found.moving > 0.5
+        if self.group is None or not gone.any():
+            return np.inf
+        away = np.einsum("cmk,m->ck", self.group.by_move[:, :, gone], found.move)
+        return float(np.sqrt((away**2).sum(axis=0).mean()))
+
+    def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
+        """Yield its record, with the members of the group."""
+        assert self.group is not None
+        group = moving_ground.group_of(residuals.linear, residuals.ground, self.group, residuals.base)
+        yield Finding(self.NAME, self.view, None, np.zeros(2), unknowns=unknowns, moved=group, **said)
