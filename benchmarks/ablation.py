@@ -9,8 +9,9 @@ observations that were cut, the stated sigma of the scene's place. For each cons
 `same` where no figure of any world changes by a bit; `fails` where a run ends in an error (a size that others must
 match). A constant that is an argument's default is not reached.
 
-    python -m benchmarks.ablation barpc.ba.judging              # all numbers of a room
+    python -m benchmarks.ablation barpc.ba.select               # all numbers of a room
     python -m benchmarks.ablation barpc.ba --only _SURE SURE --worlds local:0 swing:0 --factors 0.5 2
+    python -m benchmarks.ablation --mechanisms                  # each way of explaining residuals switched off
 """
 
 from __future__ import annotations
@@ -46,6 +47,57 @@ WORLDS = (
 )  # fmt: skip
 """One of a kind that takes seconds."""
 NOISE = 0.1  # px, of the tie points of every world
+
+
+MOVED = (
+    "local:0", "local:2", "local:4", "local:6", "local:7", "swing:1", "swing:3", "wander:2", "foreign:0",
+    "foreign:2", "two:1", "agile:0", "priors:1", "biased:1", "control:1", "glacier:0", "glacier:2", "fault:1",
+    "fault:2", "lost:0", "lost:2", "slide:1", "cloud:1", "dem:0", "plane:0",
+)  # fmt: skip
+"""Worlds of every family, for whole mechanisms."""
+_NEVER: dict[str, Any] = {
+    "restart from a consensus": ("solution._is_suspect", lambda *_: False),
+    "drift of a higher degree": ("solution._with_more_drift", lambda first, *_: first),
+    "control that distorts": ("solution._without_distorting_control", lambda found, *_: found),
+    "foreign camera": ("select.models.find_foreign_camera", lambda *_: (None, None)),
+    "search of terms": ("select.models.search_terms", lambda *_: importlib.import_module(_BEAM).Selection()),
+    "veto of check tracks": ("select.models.is_admitted select.image_terms.is_admitted", lambda *_: True),
+    "terms in the images": ("select.models.with_terms", lambda found, *_: found),
+    "splines and detectors": ("select.models.with_splines select.image_terms.with_splines", lambda found, *_: found),
+    "detectors": ("select.image_terms.find_edges", lambda problem, *_: np.zeros((problem.structure.num_views, 0))),
+    "affine in the image": ("select.models._with_image_affine", lambda *_: None),
+    "correlated noise": ("select.beam.correlated_log_ratio select.anomalies.correlated_log_ratio", lambda *_: 0.0),
+    "rivals side by side": ("select.beam._rivals", lambda _: []),
+    "parts that hold a moving group": ("select.beam.TermSearch._members", lambda *_: []),
+    "simpler terms": ("terms.decay.Decay.simpler", lambda *_: None),
+    "alternatives of a low frequency": ("terms.low_frequency.LowFrequency.alternatives", lambda *_: []),
+    "steps": ("terms.step.Step.propose", lambda *_: []),
+    "decays": ("terms.decay.Decay.propose", lambda *_: []),
+    "transients": ("terms.transient.Transient.propose", lambda *_: []),
+    "low frequencies": ("terms.low_frequency.LowFrequency.propose", lambda *_: []),
+    "sinusoids": ("select.beam.find_periods select.anomalies.find_periods", lambda *_: []),
+    "moving objects": ("terms.moving_objects.MovingObjects.propose", lambda *_: []),
+}
+"""A mechanism -> the functions of `barpc.ba` that it stands in, and what they are replaced by."""
+_BEAM = "barpc.ba.select.beam"
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """One of `_NEVER`."""
+
+    name: str
+
+    def set(self, _factor: float) -> None:
+        """Switch it off, in this process."""
+        places, instead = _NEVER[self.name]
+        for place in places.split():
+            *modules, last = f"barpc.ba.{place}".split(".")
+            owner = modules[-1] if modules[-1][0].isupper() else None
+            target = importlib.import_module(".".join(modules[:-1] if owner else modules))
+            target = getattr(target, owner) if owner else target
+            assert hasattr(target, last), place
+            setattr(target, last, instead)
 
 
 @dataclass(frozen=True)
@@ -106,7 +158,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def figures(task: tuple[Constant | None, float, tuple[str, ...]]) -> list[dict[str, Any]] | str:
+def figures(task: tuple[Constant | Mechanism | None, float, tuple[str, ...]]) -> list[dict[str, Any]] | str:
     """What every world is left with, in a process of its own; an error's name."""
     constant, factor, worlds = task
     if constant is not None:
@@ -128,8 +180,14 @@ def _figures(world: World) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         said = solver(world)
-    left = judge(world, said.adjusted).left
-    return {"left": left, "cut": said.rejected / len(world.tracks), "sigma": said.sigma, "seconds": said.seconds}
+    judged = judge(world, said.adjusted)
+    return {
+        "left": judged.left,
+        "shape": judged.shape,
+        "cut": said.rejected / len(world.tracks),
+        "sigma": said.sigma,
+        "seconds": said.seconds,
+    }
 
 
 def row(found: list[dict[str, Any]] | str, base: list[dict[str, Any]], worlds: tuple[str, ...]) -> dict[str, Any]:
@@ -161,17 +219,46 @@ def line(constant: Constant, factor: float, got: dict[str, Any]) -> str:
     return f"{head} {got['px']:+.2f} ({got['world']}) | {got['cut']:+.4f} | {got['sigma']:.3f} | {got['cpu']:.2f} |"
 
 
+def ablate_mechanisms(names: list[str], worlds: tuple[str, ...], workers: int) -> None:
+    """Print a row a mechanism: CPU beside all of them, and the worlds that end otherwise, px and m of shape."""
+    for world in worlds:
+        made(world)
+    tasks = [(None, 1.0, worlds), *((Mechanism(name), 1.0, worlds) for name in names)]
+    print("| without | CPU | worse | better |\n|---|---|---|---|", flush=True)
+    with multiprocessing.get_context("fork").Pool(workers, maxtasksperchild=1) as pool:
+        base: Any = None
+        for n, got in enumerate(pool.imap(figures, tasks)):
+            if n == 0:
+                base = got
+                continue
+            if isinstance(got, str) or isinstance(base, str):
+                print(f"| {names[n - 1]} | | fails: {got if isinstance(got, str) else base} | |", flush=True)
+                continue
+            cells: list[list[str]] = [[], []]
+            for world, a, b in zip(worlds, got, base, strict=True):
+                for key, unit, floor in (("left", "px", 0.01), ("shape", "m", 0.1)):
+                    more, less = max(a[key], b[key]), min(a[key], b[key])
+                    if more > 1.2 * less + floor:
+                        cells[int(a[key] < b[key])].append(f"{world} {b[key]:.3g} -> {a[key]:.3g} {unit}")
+            cpu = sum(a["seconds"] for a in got) / sum(b["seconds"] for b in base)
+            print(f"| {names[n - 1]} | {cpu:.2f} | {'; '.join(cells[0])} | {'; '.join(cells[1])} |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("package", help="such as barpc.ba.judging")
+    parser.add_argument("package", nargs="?", default="barpc.ba", help="such as barpc.ba.select")
     parser.add_argument("--only", nargs="+", help="names of constants")
-    parser.add_argument("--worlds", nargs="+", default=WORLDS, help="FAMILY:SEED")
+    parser.add_argument("--worlds", nargs="+", default=(), help="FAMILY:SEED")
+    parser.add_argument("--mechanisms", action="store_true", help="switch off each way of explaining residuals")
     parser.add_argument("--factors", nargs="+", type=float, default=(0.5, 2.0))
     parser.add_argument("-j", type=int, default=1, help="worker processes")
     parser.add_argument("--json", type=Path, help="rows so far, written after each; gone on from")
     args = parser.parse_args()
-    worlds = tuple(args.worlds)
+    worlds = tuple(args.worlds or (MOVED if args.mechanisms else WORLDS))
+    if args.mechanisms:
+        ablate_mechanisms([name for name in _NEVER if not args.only or name in args.only], worlds, args.j)
+        return
     wanted = [c for c in constants(args.package) if not args.only or c.name in args.only]
     tasks = [(c, f, worlds) for c in wanted for f in args.factors]
     known = json.loads(args.json.read_text()) if args.json and args.json.exists() else {}

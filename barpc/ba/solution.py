@@ -150,15 +150,12 @@ def solve_block(
         again = Rounds(problem, block, state, heights, agree).run()
         if again.noise < CLEARLY * outcome.noise and again.inlier.sum() > 0.5 * agree.sum():
             outcome = again
-    drift, asked = problem.cameras.unknowns.drift, dict[str, SmoothTest]()
+    drift = problem.cameras.unknowns.drift
+    asked = dict[str, SmoothTest]()
     if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * NOISE_FLOOR).any():
-        bent = make_problem(block, options, problem.cameras.unknowns.center, None, drift + 1)
-        ended, weight = outcome.minimum.state, block.use / block.sigma
-        there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
-        there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-        tried = Rounds(bent, block, there, heights, outcome.inlier).run()
-        if tried.inlier.sum() > 0.5 * outcome.inlier.sum():  # the few left of many agree with anything
-            asked, problem, outcome = {"drift": outcome.smooth}, bent, tried
+        less = outcome
+        problem, outcome = _with_more_drift((problem, less), block, options, heights)
+        asked = {} if outcome is less else {"drift": less.smooth}
     if block.gcps.names and agreed is None:
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)
@@ -171,6 +168,21 @@ def solve_block(
         if free is None or not found.heights.has_control
         else _without_distorting_control(found, free, block, outer, options)
     )
+
+
+def _with_more_drift(
+    solved: tuple[Problem, Outcome], block: Block, options: AdjustOptions, heights: PointConstraints
+) -> tuple[Problem, Outcome]:
+    """Return the block solved with a drift of one degree more; as it was where few of its observations agree then."""
+    problem, outcome = solved
+    unknowns = problem.cameras.unknowns
+    more = make_problem(block, options, unknowns.center, None, unknowns.drift + 1)
+    ended, weight = outcome.minimum.state, block.use / block.sigma
+    there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
+    there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
+    tried = Rounds(more, block, there, heights, outcome.inlier).run()
+    # the few left of many agree with anything
+    return (more, tried) if tried.inlier.sum() > 0.5 * outcome.inlier.sum() else solved
 
 
 def _check_inliers(outcome: Outcome, block: Block) -> None:

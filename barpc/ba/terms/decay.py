@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from barpc.ba.evidence.mixture import MixtureFit, first_guess
+from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.terms.step import Part, Step, open_ended
 from barpc.ba.terms.term import Residuals, Term
@@ -19,11 +19,6 @@ LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # of the decay, over an image
 
 class Decaying(Term):
     """A term whose displacement decays exponentially along the rows."""
-
-    def first_cost(self, residuals: Residuals) -> float:
-        """Return the change of the sum of what all tracks are off by, by a sample of them, over the noise."""
-        precision = self.sigma**-2.0
-        return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
         """Return the term with the rate that its derivative asks for, and as it is."""
