@@ -132,9 +132,9 @@ def _solved_adjustment(
 
 
 def _warn(outcome: Outcome) -> None:
-    """Warn of what the last solve could not do; what is tried on the way to it may fail."""
+    """Warn where the last solve did not settle, or its priors were not learnt."""
     if not outcome.minimum.settled:
-        message = f"the adjustment did not settle in {ITERATIONS} steps: look at what is left before its result is used"
+        message = f"the adjustment did not settle in {ITERATIONS} steps: check its residuals before its result is used"
         warnings.warn(message, BarpcWarning, stacklevel=4)
     if outcome.prior.failed:
         message = "the accuracy of the cameras is taken as it is given: the normal equations are too weak to learn it"
@@ -233,7 +233,7 @@ def _adjustment(model: Model, found: Solution, options: AdjustOptions, common: C
 def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
     """Return the points (P, 3) [m], NaN where nothing was kept, and the residuals of all observations before and after.
 
-    Of those that took no part and those that move by points triangulated anew.
+    Those of check tie points and of moving groups are of points triangulated anew.
     """
     outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
     moved = [measure(found.problem, params, parts.apart) for params in cameras]
@@ -254,7 +254,7 @@ def _neighbour_correlation(block: Block, outcome: Outcome, is_tie: BoolArray) ->
 
 
 def _reported_findings(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
-    """Yield the findings without what the judge worked with."""
+    """Yield the findings as they are reported, with the place and size of a motion."""
     number = 0
     for one in findings:
         if one.moved is None:
@@ -293,9 +293,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Report the motion and the accuracy of the scene's place, and what holds it; an earlier run keeps its
-    own scene.
-    """
+    """Report the motion and accuracy of the scene and their sources; an earlier run keeps its own scene."""
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _datum_report(found, block, covariance)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)

@@ -1,4 +1,4 @@
-"""Altimetry as control: heights without image coordinates hold the block where its surface lies on them.
+"""Altimetry as control: heights without image coordinates constrain the block where its surface agrees with them.
 
 The block is solved without them first. The motion that brings the surface of its tie points onto the heights is found
 where most of them agree (`barpc.ba.constraints.registration`), and held, with its covariance, at the tie points. Tilts,
@@ -50,7 +50,7 @@ class AltimetryTest:
 def hold_by_altimetry(
     found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
 ) -> tuple[Solution, AltimetryTest]:
-    """Return the block held by heights too, or as it was where these contradict each other or other control."""
+    """Return the block constrained by heights too; unchanged where these contradict each other or other control."""
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
     near, many = np.zeros(0, dtype=np.int64), len(given.sigma)
@@ -105,7 +105,7 @@ def _is_held(found: Solution, block: Block) -> bool:
 
 
 def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
-    """Return the reason why heights must not hold the block; empty where they may."""
+    """Return the reason why heights must not be used; empty where they may."""
     if registered.near.sum() < FEWEST or (registered.is_most and registered.agree.sum() < FEWEST):
         return f"at least {FEWEST} heights on the tie points' surface are needed"
     if not registered.is_most:
@@ -113,7 +113,7 @@ def _why_not(registered: Registration, known: Array, is_held: bool) -> str:
     together = known[:3, :3] + registered.covariance[:3, :3]
     off = registered.motion[:3]
     if is_held and float(off @ np.linalg.solve(together, off)) > CRITICAL**2:
-        return "they contradict the control that holds the scene"
+        return "they contradict the other control"
     return ""
 
 

@@ -252,7 +252,7 @@ class LineCurve:
 
     @cached_property
     def bent(self) -> Array:
-        """(n, n) What takes a constant and a slope off the unknowns: splines make both exactly."""
+        """(n, n) Projector of the unknowns off a constant and a slope, both of which splines contain exactly."""
         lines = np.stack(
             [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
         )

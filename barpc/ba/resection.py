@@ -1,4 +1,4 @@
-"""A view placed by itself: its camera against the points that the other views agree on, and what its RPC looks like."""
+"""Resection of one view by the points that the other views agree on, and a diagnosis of its RPC."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Placed:
         return np.asarray(self.squared <= 2.0 * limit * limit)
 
     def contradicted(self, limit: float) -> float:
-        """Return the share of observations beyond a number of standard deviations, rows wandering allowed."""
+        """Return the share of observations beyond a number of standard deviations and a smooth displacement of rows."""
         return float(self._far(limit).mean())
 
     def is_coherent(self, limit: float) -> bool:
@@ -68,8 +68,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class RpcDiagnosis:
-    """What would make a view's RPC as good as stated: nothing needed, nothing found, an offset, other
-    heights, swapped axes.
+    """A diagnosis of a view's RPC: as accurate as stated, by an offset, other heights or swapped axes, or not at all.
 
     Where it is, and more than half of its tie points contradict the others', these may be wrong as well as it.
     """

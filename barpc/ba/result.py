@@ -1,4 +1,4 @@
-"""What an adjustment hands back, what a later run starts from, and how well a pair of its views knows heights."""
+"""The result of an adjustment, the prior of a later run, and the height accuracy of pairs of views."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Adjustment:
     inlier : (K,)
         Observations that were kept.
     held_out : (K,)
-        Observations that took no part, to be measured on; their residuals are those of points triangulated anew.
+        Observations of check tie points; their residuals are those of points triangulated anew.
     held_out_rms, held_out_noise : (N,)
         Root mean square residual [px] of every view's held-out observations, from their median, and over the
         stated one; NaN without any.
@@ -73,7 +73,7 @@ class Adjustment:
     gauge : GaugeReport
         Shift of the scene, its standard deviation, the weakest modes.
     datum : mapping
-        Source (`barpc.ba.constraints.gauge.SOURCES`) -> its share (10,) in what is known of the scene's `MOTIONS`.
+        Source (`barpc.ba.constraints.gauge.SOURCES`) -> its share (10,) of the information on the scene's `MOTIONS`.
     prior : PriorTest
         Comparison of the corrections with the priors given, and the priors learnt.
     told : (N,)
@@ -85,11 +85,11 @@ class Adjustment:
     findings : tuple of Finding
         Explanations of tie points beside the cameras' errors as stated, the first taken first.
     moving : (K,)
-        Observations of ties that were found to move together; they took no part.
+        Observations of tie points that were found to move together; they were excluded.
     left : tuple of Interval
         Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
     alike : (N,)
-        Evidence that neighbours among a view's rejected tie points lie off in the same direction, which wrong
+        Evidence that neighbours among a view's rejected tie points are displaced in the same direction, which wrong
         matches do
         not (`barpc.ba.evidence.scan.neighbours_alike`) [nats].
     in_space_rms : float or None
@@ -98,7 +98,7 @@ class Adjustment:
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
-        Tracks held in height because their rays meet under too small an angle.
+        Tracks constrained in height because their convergence angle is too small.
     terrain : TerrainTest or None
         Result of holding tie points to a terrain; None without one.
     altimetry : AltimetryTest or None
@@ -106,9 +106,9 @@ class Adjustment:
     left_out : tuple of str
         Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
     apart : Apart or None
-        A view whose RPC is not its own: the others were adjusted without it, it alone against their points, or not at
-        all. Its points, residuals and observations kept are by these; in the covariance it is as its prior. Where it
-        may be one of several, nothing was done.
+        A view whose RPC does not match the image: the others were adjusted without it, it alone against their points,
+        or not at all. Its points, residuals and observations kept are by these; in the covariance it is as its prior.
+        Where it may be one of several, nothing was done.
     control : ControlTest or None
         Ground control points against each other and the cameras.
     gcp_w, reference_w : (M,), (R,)

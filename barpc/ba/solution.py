@@ -1,4 +1,4 @@
-"""A block solved with one model: where it started, how the rounds ended, what is left."""
+"""A block solved with one model: its start, the rounds of rejection, and its residuals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A block solved with one model: its start, its rounds, and what is left."""
+    """A block solved with one model: its start, its rounds, and its residuals."""
 
     problem: Problem  # as it was solved last
     state: State  # where it started: delivered cameras, points triangulated with them
@@ -97,7 +97,7 @@ class Solution:
 
     @property
     def has_trend(self) -> bool:
-        """Whether something is left that another model may follow: smooth, or in what was cut."""
+        """Whether systematic residuals are left that another model may explain: smooth, or of rejected observations."""
         left = bool(self.outcome.smooth.found(_TREND).any())
         return left or self.after.error > MUCH_NOISE * self.outcome.noise
 
@@ -198,7 +198,7 @@ def _check_inliers(outcome: Outcome, block: Block) -> None:
 def _without_distorting_control(
     found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions
 ) -> Solution:
-    """Return the block held by control; as it was `free` of it where tracks that took no part are met worse with it."""
+    """Return the block constrained by control; that `free` of it where residuals of check tie points grow by it."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
     # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
@@ -211,7 +211,7 @@ def _without_distorting_control(
 
 
 def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
-    """Return the control points that agree at an outcome that none of them holds, and what holds points."""
+    """Return the control points that agree at an outcome without control, and the constraints on points."""
     count, first = len(block.gcps.names), block.num_tracks
     mine = (block.point >= first) & (block.point < block.num_known)
     lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas

@@ -1,1 +1,1 @@
-"""What holds a block: observations, points, heights, earlier runs; where it starts, and how its place is known."""
+"""Constraints of a block: observations, points, heights, earlier runs; its start, and the accuracy of its position."""

@@ -1,6 +1,4 @@
-"""Tracks and GCPs as one block of observations sorted by view, checked for what cannot be adjusted; and what it starts
-from: the problem, points where the delivered cameras put them, what holds those.
-"""
+"""Tracks and GCPs as one block of observations sorted by view, and its start by the delivered cameras."""
 
 from __future__ import annotations
 
@@ -280,7 +278,7 @@ def first_state(
 def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: Array) -> Relief:
     """Return the DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
 
-    What the cameras let expect of how these lie to it is first-order: points move by -V^-1 A^T B with the cameras.
+    Their expected distance from it is of first order in the cameras: points move by -V^-1 A^T B with the cameras.
     """
     assert heights.dem is not None
     structure, sigma = problem.structure, problem.camera_prior.sigma

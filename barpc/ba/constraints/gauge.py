@@ -1,10 +1,10 @@
-"""What the observations cannot tell: the scene's shift, tilt, turn and bending, the weakest first; and what holds them.
+"""The datum of a block: shift, tilt, turn and bending of the scene, the weakest first, and their constraints.
 
 A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
 best-fitting tilts, turn, scale, twist and bending are linear in dp: ten numbers with a covariance.
 
 Of all changes of cameras and points that move the scene in one of its motions, one is the most probable: the cheapest.
-What each source pays of its cost is its share of what is known of the motion. Tie points have none: they tie cameras
+What each source pays of its cost is its share of the information on the motion. Tie points have none: they tie cameras
 and points to each other, and what bends between them is paid for those who hold on to the Earth.
 """
 
@@ -172,7 +172,7 @@ def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
 def datum_shares(
     covariance: Covariance, by_unknown: Array, problem: Problem, state: State, weight: Array, known: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Return the share (10,) that each source has in what is known of the scene's motions; NaN where no free
+    """Return the share (10,) of each source in the information on the scene's motions; NaN where no free
     camera tells.
 
     Parameters
@@ -214,7 +214,7 @@ def _point_shares(
     points: Array,
     kinds: Mapping[str, BoolArray],
 ) -> Mapping[str, BoolArray]:
-    """Add what the places of known points and heights pay; the points (P,) of each kind that are held."""
+    """Add the cost of moving known points and heights; the points (P,) of each kind that are held."""
     held = {kind: np.zeros(len(rows), dtype=bool) for kind, rows in kinds.items()}
     prior, count = problem.point_prior, unknowns.shape[2]
     if prior is None:
@@ -245,7 +245,7 @@ def _add_observation_shares(
     moves: tuple[Array, Array],
     held: Mapping[str, BoolArray],
 ) -> None:
-    """Add what the observations of known points pay, and those of tie points in fixed views, by moves of both."""
+    """Add the cost of moving the observations of known points, and of tie points in fixed views."""
     structure, (unknowns, points) = problem.structure, moves
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
     known = np.any(list(held.values()), axis=0)

@@ -1,4 +1,4 @@
-"""What is known of points: GCPs, a terrain, and heights for tracks that the rays alone do not fix."""
+"""Priors on points: GCPs, a terrain, and heights for tracks that rays alone do not determine."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def terrain_heights(
     Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
     is as much at the scene's edges. Points where the terrain is unknown are left out.
     The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors. Points that are
-    `level` (Q,) are held in height alone.
+    `level` (Q,) are constrained in height alone.
     """
     ground = ground_from_ecef(points[index])
     alt = terrain(ground[:, 0], ground[:, 1])
@@ -92,7 +92,7 @@ def terrain_heights(
 
 
 def _believed_heights(ground: Array, index: IntArray, believed: RegularisedDem, common_sigma: Array) -> PointPrior:
-    """Return the points `index` (Q,) at ground points (Q, 3) held to what is believed of a DEM.
+    """Return the constraints of points `index` (Q,), at ground points (Q, 3), to a DEM of estimated accuracy.
 
     All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
     scene's edges.
@@ -202,7 +202,7 @@ class PointConstraints:
 
     @property
     def is_judged(self) -> bool:
-        """Whether the tie points decide how far the DEM is believed."""
+        """Whether the tie points decide the weight of the DEM."""
         given = self.dem is None or self.reference is not None
         return not given and self.options.learn_priors
 
@@ -253,14 +253,14 @@ class PointConstraints:
 
     @property
     def _bias(self) -> float:
-        """What a terrain may be wrong by as a whole [m]."""
+        """Standard deviation of an offset of a whole terrain [m]."""
         if self.reference is not None:
             return float(self.reference.bias[2])
         return self.options.dem_bias_sigma or (KNOWN_BIAS if self._is_known is True else DEM_BIAS)
 
     @property
     def _is_known(self) -> bool | None:
-        """Whether it is known what a DEM's heights count from; None of a function."""
+        """Whether the vertical datum of a DEM is known; None of a function."""
         return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
@@ -287,11 +287,11 @@ class PointConstraints:
         return replace(found, gains=tuple(map(float, believed.gains)), **judged)
 
     def warn(self) -> None:
-        """Warn that tracks are held in height without a DEM."""
+        """Warn that tracks are constrained in height without a DEM."""
         count = int(self.weak[self.tracks].sum())
         if count and self.dem is None:
             message = (
                 f"{count} of {len(self.tracks)} tracks are seen under less than "
-                f"{self.options.min_convergence:g} deg: without a DEM they are held in height"
+                f"{self.options.min_convergence:g} deg: without a DEM they are constrained in height"
             )
             warnings.warn(message, BarpcWarning, stacklevel=3)

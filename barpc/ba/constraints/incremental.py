@@ -215,7 +215,7 @@ class BlockPrior:
         return matrix if self.less is None else np.asarray(matrix - self.less.T @ self.less)
 
     def marginal(self, names: Collection[str]) -> BlockPrior:
-        """Return what the block knows of some of its views, in its order: all others are eliminated.
+        """Return the marginal information on some of its views, in its order: all others are eliminated.
 
         Raises
         ------
@@ -268,9 +268,9 @@ class BlockPrior:
         return Rest(self, index, lambda b: cholesky.solve(b) + root @ (root.T @ b)), information
 
     def joined(self, later: BlockPrior) -> BlockPrior:
-        """Return the whole block with what a later run found: of some of its views, and of new ones, which come behind.
+        """Return the whole block updated by a later run: some of its views, and new ones after them.
 
-        Old views that took no part move with their neighbours, as their covariance says.
+        Old views without new tie points move with their neighbours, as their covariance says.
 
         Parameters
         ----------
@@ -339,7 +339,7 @@ def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Bloc
 
 
 def _is_scene(scene: EarlierScene, size: int) -> bool:
-    """Return whether the motions of a scene by so many unknowns are what they can be."""
+    """Return whether the motions of a scene have the shapes that so many unknowns ask for."""
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))

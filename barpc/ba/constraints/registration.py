@@ -179,7 +179,7 @@ def register(surface: TieSurface, given: GivenHeights, radius: float, before: Ar
 def _converged_motion(
     surface: TieSurface, given: GivenHeights, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """Return the motion (7,) that reweighted steps end at, and the noise over what is stated, learnt if None."""
+    """Return the motion (7,) after reweighted steps, and the noise over its stated size, estimated if None."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
         seen = _SurfaceMisfit.of(surface, given, motion, radius)
@@ -342,8 +342,8 @@ def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> 
 
 
 def _inflation(place: Array, forms: Array, alone: Array, surface: TieSurface) -> Array:
-    """Return the factors (7,) of standard deviations: what neighbours share, by groups of growing size (a
-    sandwich estimate).
+    """Return the factors (7,) of standard deviations by correlated errors: a sandwich estimate over
+    groups of growing size.
 
     `forms` (n, 7) are the weighted residuals by the motions, `alone` (7,) the variances of their sums if each were
     independent.

@@ -1,11 +1,11 @@
-"""How much of a DEM's relief is believed: scale by scale, as far as the tie points' own heights show it.
+"""The weight of a DEM's relief: scale by scale, as far as the tie points' own heights confirm it.
 
 A DEM is h = t + e, terrain and errors. Where its small slopes are errors, least squares that take them for the
 terrain's find a place where the errors happen to fit, and believe it. What may pull is the best guess of the terrain
 given the DEM: the sum of gain x band over bands of scales, gain = var t / (var t + var e), for what the terrain has
 beyond it has nothing to do with its slopes. The gains are those of a regression of the tie points' heights on the
 bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu, Measurement Error in Nonlinear Models, 2006,
-chapter 4). What is left of single heights, and how far neighbours share it, is taken from the residuals.
+chapter 4). The residuals of single heights, and their correlation, are taken from the residuals.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def _bend_slopes(at: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RegularisedDem:
-    """Heights and slopes that are believed of a DEM at n points."""
+    """Heights and slopes of a regularised DEM at n points."""
 
     alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
     slopes: Array  # (n, 2) of the terrain towards east and north
@@ -163,7 +163,7 @@ class Relief:
     posts: Array | None = None  # (P, 4) numbers of the DEM's posts about the points, where it has some
 
     def beyond(self, bias: float) -> Array:
-        """Return level and slopes (3,) above the DEM as delivered, over what cameras and a `bias` [m] allow."""
+        """Return level and slopes (3,) above the DEM as delivered, over their standard deviations."""
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
@@ -208,7 +208,7 @@ class Relief:
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> RegularisedDem | None:
-    """Estimate what to believe of a DEM at the points `index` (n,), at (n, 3); None where too few heights
+    """Estimate the accuracy of a DEM at the points `index` (n,), at (n, 3); None where too few heights
     tell.
 
     Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
@@ -269,7 +269,7 @@ def _compared(
     """Return the heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion
     and a bend (n, m).
 
-    Where hills are too few to be told from what errors happen to be, no slope is believed: as many as the slopes show,
+    Where hills are too few to be distinguished from errors, no slope is used: as many as the slopes show,
     and as the DEM has `independent` heights at most.
     """
     from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
@@ -305,8 +305,7 @@ def _least_squares_fit(design: Array, values: Array) -> Array:
 
 
 def _summed(at: Array, pull: Array) -> float:
-    """Return the number of points at places (n, 2) that are worth one, by their pulls (n, 2) to the east and
-    north.
+    """Return the number of points at places (n, 2) that count as one, by their pulls (n, 2) to the east and north.
 
     Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
     """

@@ -1,6 +1,6 @@
 """Which control points agree with each other, found before any of them moves a camera.
 
-The block is solved by its tie points alone; control points are seen in it, and their places hold nothing. What the
+The block is solved by its tie points alone; control points are seen in it, and their places are no constraint. What the
 block says of a point minus its given place is d = U a + n: the block's free motions (a, standard normal; a shift of
 any size is one of them) and what is the point's own, n, whitened to unit variance: the stated accuracy of its place and
 that of its rays. A set S of points agrees as well as its evidence says, the density of d with the motions integrated
@@ -50,7 +50,7 @@ class Agreement:
     alike : bool
         Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
     torn : (2,)
-        Residuals of tie points that took no part, without control and with it [px, RMS], where control that agrees with
+        Residuals of check tie points, without control and with it [px, RMS], where control that agrees with
         itself would raise them, so that none is used; else empty.
     """
 
@@ -87,7 +87,7 @@ class Offsets:
 
 
 def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
-    """Estimate the offsets of control points at a solution in which they hold nothing.
+    """Estimate the offsets of control points at a solution without control.
 
     Parameters
     ----------

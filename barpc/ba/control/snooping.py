@@ -36,7 +36,7 @@ class ControlTest:
     Parameters
     ----------
     used : (G,)
-        Points that hold the block; the others were found wrong.
+        Points that were used; the others were found wrong.
     residual : (G, 3)
         Place of a point by all others minus its given place, east, north, up [m], in the directions that they
         tell of; NaN where there is none.
@@ -78,7 +78,7 @@ class ControlTest:
 
     @property
     def torn(self) -> tuple[float, ...]:
-        """Residuals of held-out tie points without and with control [px], where that is why none is used."""
+        """Residuals of check tie points without and with control [px], where control distorts the block."""
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
@@ -204,7 +204,7 @@ def image_test(
 
 
 def _take_off(left: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
-    """Subtract what the cameras' uncertainty explains of the observations that wait, and let them go."""
+    """Subtract the part of the cameras' uncertainty from the waiting observations, and clear them."""
     if not waiting:
         return
     index, parts = zip(*waiting, strict=True)

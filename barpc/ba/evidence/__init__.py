@@ -1,1 +1,1 @@
-"""What ties show beside the cameras: stretches, periods, steps, and the evidence for what explains them."""
+"""Residuals of tie points: scans for intervals, periods and correlated noise, and the evidence of a mixture."""

@@ -1,8 +1,8 @@
-"""Errors that neighbouring ties share: a rival of all that is said of cameras, ground and matches.
+"""Correlated errors of neighbouring tie points: a rival of all explanations by cameras, ground and matches.
 
 Templates overlap, suns, shadows and seasons pull many matches the same way. The noise of ties of one cell of an image
-is then alike. What follows it as a strip, a swing or a cloud is bent by it, so whatever explains ties has to gain more
-than noise of which a part is common to a cell.
+is then alike. A correction that follows it as a step, a sinusoid or a cloud is bent by it, so whatever explains ties
+has to gain more than noise of which a part is common to a cell.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Arra
     Parameters
     ----------
     view, place, off : (k,), (2, k), (2, k)
-        Views of ties, where they lie [px] and what they are off by there, in any unit; without what is wrong.
+        Views of tie points, their places [px] and residuals there, in any unit; without wrong ones.
     size : (2, N), of the images [px]
 
     Returns

@@ -47,13 +47,13 @@ class TrackGroup:
         return found.reshape(len(values), len(self.subsets), 3)
 
     def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
-        """Return the values (T, 2n) less what ground points absorb, summed over subsets by their weights (T, S)."""
+        """Return the values (T, 2n) less the part that ground points absorb, weighted over subsets (T, S)."""
         parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
         seen: Array = np.repeat(weight @ self.subsets, 2, axis=1)
         return np.asarray(seen * values - parts[:, 0])
 
     def weight(self, weight: Array) -> Array:
-        """Return the projectors (T, 2n, 2n) off what ground points absorb, summed by weights (T, S) of subsets."""
+        """Return the projectors (T, 2n, 2n) off the motions of ground points, weighted over subsets (T, S)."""
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)

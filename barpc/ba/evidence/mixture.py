@@ -183,7 +183,7 @@ class _Expected:
         return np.asarray(gone / np.maximum(still + gone, 1e-300))
 
     def pull(self, tracks: TrackGroup) -> Array:
-        """Return the residuals (T, 2n), less what ground points follow, as far as they are right."""
+        """Return the residuals (T, 2n), less the part that ground points absorb, by their probability."""
         return tracks.weighed(self.values, self.followed, self.of_subset)
 
 
@@ -224,7 +224,7 @@ def _expect(
 
 
 def _of_subsets(tracks: TrackGroup, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
-    """Return the log-likelihoods (T, S) if a subset is right, their squares, and what they are made of."""
+    """Return the log-likelihoods (T, S) if a subset is right, and their squares, values and absorbed parts."""
     n = tracks.rows.shape[1]
     values = tracks.of(residual)
     followed = tracks.followed(values)
@@ -331,7 +331,7 @@ class Mixture:
         return MixtureFit(evidence, step, extra, self.noise, self.eps, seen.right, move, seen.moving, scatter)
 
     def scores(self, new: Array, cell: IntArray, cells: int) -> tuple[Array, Array, Array]:
-        """Return what unknowns that move the observations of one cell each by `new` (2, m, K) [px] would gain.
+        """Return the score statistics of unknowns that move the observations of one cell each by `new` (2, m, K) [px].
 
         At the present unknowns: curvature (C, m, m) and pull (C, m) of each cell's, the pull less what cameras and
         the others follow, and (C, P, m) by what root of curvature they are followed.
@@ -361,7 +361,7 @@ class Mixture:
         return curvature / self.noise**2, own - taken, followed
 
     def _noise(self, seen: _Expectations, known: float) -> bool:
-        """Return the noise, and what is wrong, as they are seen; whether the noise stands."""
+        """Return the noise and the shares of wrong observations, estimated anew; whether the noise stands."""
         still = seen.kinds[0]
         found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), LEAST_NOISE)
         cold = self.noise <= found
@@ -422,7 +422,7 @@ class Mixture:
         return [self.noise] if self.group is None else [self.noise, self.moved.noise]
 
     def _has_changed(self, seen: _Expectations) -> bool:
-        """Return whether what views and unknowns rest on is another part of the observations than the curvature's."""
+        """Return whether the weights of views and unknowns have changed since the curvature was summed."""
         sums, further = [], self.precision[self.linear.precision.size :]
         for kind, squared, noise in zip(seen.kinds, self.squared, self._noises, strict=True):
             of_views = np.bincount(self.linear.view, kind.right, minlength=self.linear.views)

@@ -1,4 +1,4 @@
-"""Whether the rows of an image swing with one period: a periodogram of what ties are off by along them.
+"""Sinusoidal displacements of the rows of an image: a periodogram of the residuals along them.
 
 The score test of a cosine and a sine in each coordinate (Lomb 1976, Scargle 1982) at all frequencies at once, by the
 fast Fourier transform of residuals summed over few rows. Noise alone exceeds x with the probability (1 + x) exp(-x);
@@ -27,7 +27,7 @@ _BIN = _SHORTEST / _FREQUENCY_OVERSAMPLING  # rows summed: a tenth of the shorte
 
 @dataclass(frozen=True)
 class Period:
-    """A period that stands out."""
+    """A significant period."""
 
     view: int
     period: float  # [px]
@@ -43,7 +43,7 @@ def price_of_period(rows: float, views: int) -> float:
 def find_periods(
     view: IntArray, row: Array, size: Array, right: Array, off: Array, least: float = SURE
 ) -> list[Period]:
-    """Find the period that stands out most in every view, the best first; none that gains less than `least` [nats].
+    """Find the most significant period of every view, the best first; none that gains less than `least` [nats].
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ Of ties that took part, all intervals of rows and columns are scanned by two sta
 likelihood ratio: of the share of observations that are wrong (Kulldorff 1997, "A spatial scan statistic"), and of a
 displacement that all observations of the interval have in common.
 
-Of ties that took no part (`met_worse`: what one median hides), rows, columns and cells of each image, halved again and
+Of check tie points (`met_worse`: one median hides much), rows, columns and cells of each image, halved again and
 again, are tested against the rest of their image. That no place is worse than another is the one assumption, so that
 neither how much ties scatter nor how many are wrong matters. Two tests, each bounded over all places (Bonferroni): of
 how many lie far off by the same, which wrong matches do not (exact, hypergeometric), and of what the near ones have in
@@ -34,7 +34,7 @@ MIN_EXTENT_RATIO = (
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of an image that stands out."""
+    """A significant interval of an image."""
 
     view: int
     axis: int  # 0: columns, 1: rows
@@ -56,7 +56,7 @@ def price(views: int) -> float:
 def scan(
     view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
 ) -> list[Interval]:
-    """Find the interval that stands out most, by each statistic, in every view's columns and rows; the best
+    """Find the most significant interval, by each statistic, in every view's columns and rows; the best
     first.
 
     Parameters
@@ -104,8 +104,8 @@ def _displacements(
     """Return the gain [nats] (N, intervals) by which a displacement of an interval explains residuals, and
     its size.
 
-    The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. What
-    stands out beside a step is its middle; the step itself is what explains it.
+    The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. Beside
+    a step its middle is significant; the step itself explains it.
     """
     at = view * BINS + bin_
     sums = [np.bincount(at, row, views * BINS) for row in (told, *(told * off))]
@@ -184,7 +184,7 @@ def _share_log_ratios(bins: Array) -> Array:
 
 @dataclass(frozen=True)
 class ImageRegion:
-    """Rows, columns or a cell of an image in which held-out tie points are met worse than in the rest."""
+    """Rows, columns or a cell of an image in which residuals of check tie points are larger than in the rest."""
 
     view: int
     columns: tuple[float, float] | None  # from, to [px]; None: all

@@ -1,1 +1,1 @@
-"""What is estimated: rotations, translations, drifts and splines of the cameras, and what is expected of them."""
+"""The unknowns of the cameras: rotations, translations, drifts and splines, with their priors."""

@@ -1,11 +1,9 @@
-"""What rotations, translations and drifts leave in the images: splines over the rows, steps between detectors, strips,
-swings.
+"""Additional parameters in the images: splines over the rows, steps between detectors, displaced parts, sinusoids.
 
 All are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
 drift can do is not theirs, so that their prior does not loosen it: splines are orthogonal to its polynomials of the
-row, steps to a shift and a scale of the columns. A strip of rows or columns is moved as a whole, and all
-rows of an image swing with a period that is known. How large all of them
-are in a view is learnt (`barpc.ba.robust.variances`).
+row, steps to a shift and a scale of the columns. A part of the rows or columns is displaced as a whole, and all rows of
+an image with a known period. How large all of them are in a view is learnt (`barpc.ba.robust.variances`).
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope a
 
 @dataclass(frozen=True, eq=False)
 class AdditionalParameters:
-    """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, strips and swings."""
+    """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, parts and sinusoids."""
 
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
@@ -40,7 +38,7 @@ class AdditionalParameters:
 
     @cached_property
     def _of_splines(self) -> Array:
-        """(M, m) orthonormal coefficients of what is orthogonal to the polynomials, the slowest first."""
+        """(M, m) orthonormal coefficients of the complement of the polynomials, the slowest first."""
         if not self.count:
             return np.zeros((0, 0))
         u = np.linspace(-1.0, 1.0, SAMPLE, dtype=np.float64)
@@ -62,7 +60,7 @@ class AdditionalParameters:
 
     @property
     def parts(self) -> tuple[int, int, int, int]:
-        """Numbers of unknowns of one coordinate: splines, steps, strips, swings (cosines, then sines)."""
+        """Numbers of unknowns of one coordinate: splines, steps, parts, sinusoids (cosines, then sines)."""
         return (
             self._of_splines.shape[1],
             self._of_steps.shape[1],
@@ -77,7 +75,7 @@ class AdditionalParameters:
 
     @property
     def kinds(self) -> tuple[slice, ...]:
-        """The unknowns of splines, steps, strips and swings: those of the columns, then those of the rows."""
+        """The unknowns of splines, steps, parts and sinusoids: those of the columns, then those of the rows."""
         stops = 2 * np.cumsum((0, *self.parts))
         return tuple(map(slice, stops[:-1].tolist(), stops[1:].tolist()))
 
@@ -87,9 +85,7 @@ class AdditionalParameters:
 
     @cached_property
     def bands(self) -> Array:
-        """Groups of unknowns (size,) expected to be about as large: half an octave of waves, steps, strips,
-        or swings.
-        """
+        """Groups of unknowns (size,) expected to be about as large: half an octave of waves, steps, parts, sinusoids."""
         m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + float(DRIFTS))
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
@@ -103,7 +99,7 @@ class AdditionalParameters:
         """Return the number of parts of an image of so many rows over which an error shared by neighbours
         counts anew.
 
-        A swing takes the mean of one in each half of its waves, and of each coordinate.
+        A sinusoid takes the mean of one in each half of its waves, and of each coordinate.
         """
         known = np.isfinite(self.periods)
         waves = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
@@ -179,6 +175,6 @@ class AdditionalParameters:
 
 
 def _complement(vectors: Array) -> Array:
-    """Return an orthonormal basis (n, n - k) of what is orthogonal to vectors (n, k)."""
+    """Return an orthonormal basis (n, n - k) of the complement of vectors (n, k)."""
     q: Array = np.asarray(la.qr(vectors)[0], dtype=np.float64)
     return q[:, vectors.shape[1] :]

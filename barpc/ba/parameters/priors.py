@@ -1,4 +1,4 @@
-"""What is expected of cameras and points before any is known, as whitened residual blocks.
+"""Priors on cameras and points, as whitened residual blocks.
 
 Every block gives residuals and their derivative, divided by sigma. All of them are linear in the unknowns; the tie
 observations, which are not, are in `problem`.
@@ -80,7 +80,7 @@ class JointPrior:
         return float((params.ravel()[self.index] - self.mean) @ (self.gradient(params) + self.slope))
 
     def without(self, information: Array, gradient: Array, params: Array) -> JointPrior:
-        """Return what is left where observations are taken off: information (n, n), and gradient (n,) at params."""
+        """Return the information (n, n), and gradient (n,) at params, without some observations."""
         slope = information @ (params.ravel()[self.index] - self.mean) - gradient
         return replace(self, information=self.information - information, slope=self.slope + slope)
 
@@ -131,7 +131,7 @@ class PointPrior:
 
 
 def stated_accuracy(view: View) -> float:
-    """Return the horizontal accuracy of a view as delivered [m]: what its RPC states where usable, else 7.5 m."""
+    """Return the horizontal accuracy of a view as delivered [m]: that stated in its RPC where usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
     return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
 

@@ -1,1 +1,1 @@
-"""What is kept: weights, cuts, accuracies that are learnt, and what tracks that took no part say."""
+"""Robust estimation: weights, rejection, estimated accuracies, and the residuals of check tie points."""

@@ -24,7 +24,7 @@ from barpc.sensor.curve import cross
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose epipolar offsets fall into two groups; the pair cannot tell which is right."""
+    """A pair of views whose epipolar offsets fall into two groups; the pair does not determine which is right."""
 
     views: tuple[int, int]  # the pair
     share: float  # part of the matches in the smaller group
@@ -109,7 +109,7 @@ def agreeing(
 
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Return the offset across the epipolar line (Q,) [px]: what no move of the point takes away."""
+    """Return the offset across the epipolar line (Q,) [px], which no motion of the point absorbs."""
     offset = np.empty(len(first))
     for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)

@@ -1,4 +1,4 @@
-"""What takes no part in the solve, and measures it: known check points, and tie points that are kept out.
+"""Check points and check tie points, which are kept out of the adjustment and measure it.
 
 Survivors of a rejection agree because the others were cut. A tenth of the tracks, drawn from all alike, is kept out
 before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all: their figures are
@@ -89,7 +89,7 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """Measure the observations of a block that took no part in a problem, under cameras of unknowns (N, q)."""
+    """Measure the check observations of a block under cameras of unknowns (N, q) of a problem."""
     views = len(block.views)
     if not len(block.view):
         unknown = np.full(views, np.nan)
@@ -173,8 +173,8 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 def is_admitted(tried: HeldOut, before: HeldOut, block: Block, evidence: float = 0.0) -> bool:
     """Return whether a model with more unknowns, or fewer observations, is taken over another.
 
-    With evidence of all observations for it [nats] unless the check tracks of a block are met worse; without, where
-    they are met better.
+    With evidence of all observations for it [nats] unless residuals of the check tracks of a block grow; without, where
+    these shrink.
     """
     return not is_better(before, tried, block) if evidence > SURE else is_better(tried, before, block)
 

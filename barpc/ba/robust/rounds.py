@@ -1,4 +1,4 @@
-"""Rounds of solving: robust with a shrinking scale, then a cut, then least squares on what is left."""
+"""Rounds of solving: robust with a shrinking scale, then rejection, then least squares on the rest."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Outcome:
 class Rounds:
     """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
 
-    Outliers are judged by what is left of their residuals once the smooth part of every view is taken away: a
+    Outliers are judged by their residuals less the smooth part of every view: a
     camera that the unknowns cannot follow yet does not make its tie points wrong. Where a solve with fewer unknowns
     is `known`, it told them: robust rounds would let go of what the further unknowns are to follow.
     """
@@ -123,7 +123,7 @@ class Rounds:
                 return outcome
 
     def _search(self) -> None:
-        """Run the robust rounds, under priors wide enough for what is not expected."""
+        """Run the robust rounds, under priors widened for unexpected corrections."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         given = self.state, self.residual, self.projected
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
@@ -193,7 +193,7 @@ class Rounds:
             self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
-        """Return the least squares of what is used; a second pass follows the first robust one always, and is exact."""
+        """Return the least squares of the observations in use; the second pass, which always comes, is exact."""
         again = self.passes > 1 or self.goes_on
         tolerance = TOLERANCE if again or not self.robust else STANDS
         noise = self.noise if self.options.estimate_noise else 1.0
@@ -211,7 +211,7 @@ class Rounds:
         return replace(found, state=self.state, ahead=None)
 
     def _estimate_noise(self) -> SmoothTest:
-        """Return the noise, and what no camera can follow, by the residuals of the observations in use."""
+        """Return the noise, and the systematic residuals, of the observations in use."""
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
@@ -245,8 +245,7 @@ class Rounds:
 
 
 def downweighting(block: Block, heights: PointConstraints) -> Array:
-    """Return the factors (P,) on the noise of a point's observations: a control point that holds nothing ties
-    nothing.
+    """Return the factors (P,) on the noise of a point's observations: an unused control point has no weight.
 
     Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
     for so much only. Points that are seen in an image without tie points are what ties that.
@@ -273,7 +272,7 @@ def _robust(
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
     The noise is a median that counts observations by
     their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
-    what is stated, or a few that fit by chance would be left.
+    the stated noise, or a few that fit by chance would be left.
     """
     loss, (state, residual, projected) = LOSSES[options.loss], start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0

@@ -1,4 +1,4 @@
-"""What is smooth in the residuals of a view: judged before anything is cut, and tested at the end.
+"""The smooth part of the residuals of a view, fitted before any rejection and tested at the end.
 
 Noise and wrong matches scatter; what a camera model cannot follow (jitter, optics, a crop that was turned) is a
 smooth function of the image. An outlier test that does not know the difference takes the second for the first. So
@@ -110,7 +110,7 @@ class SmoothTest:
         return np.maximum(self.rms, self.shared) / np.sqrt(self.redundancy)
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
-        """Return the views (N,) with a smooth part above `least` [px] that is significant."""
+        """Return the views (N,) with a significant smooth part above `least` [px]."""
         return np.asarray((self.rms > least) & (self.significance < level))
 
 
@@ -191,7 +191,7 @@ class Smooth:
     def test_neighbours(
         self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
     ) -> SmoothTest:
-        """Test the same with what neighbours share, in views in which something was fitted, of a redundancy (N,)."""
+        """Test the correlation of neighbours too, in views with a fit, of a redundancy (N,)."""
         kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
         shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
         last = view[1:]

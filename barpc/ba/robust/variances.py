@@ -4,7 +4,7 @@ A prior's standard deviation is a guess. What the observations say about it is t
 determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
 determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). Where the
 sum is larger than chance allows, some prior was too narrow: that of one view, if its correction alone explains it
-(every view that would is held possible: three in a row along the flight cannot tell which), else that of all.
+(every view that would is held possible: three in a row along the flight do not determine which), else that of all.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Around:
         return -0.5 * (cost + volume), start + step, covariance
 
     def posterior(self, prior: CameraPrior) -> _Posterior:
-        """Return what is known of every view under other priors."""
+        """Return the information on every view under other priors."""
         evidence, params, covariance = self.under(prior)
         free = self.problem.free.reshape(params.shape)
         return _Posterior(evidence, params - prior.mean, covariance.of_views(), prior.sigma, free, covariance)
@@ -95,7 +95,7 @@ def _log_variance(sigma: Array, free: BoolArray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Posterior:
-    """What is known of every view under some priors: other priors of a view are an update of rank q."""
+    """The information on every view under some priors: other priors of a view are an update of rank q."""
 
     evidence: float  # logarithm, but for a constant
     offset: Array  # (N, q) unknowns minus their priors' means
@@ -107,7 +107,7 @@ class _Posterior:
     updates: tuple[tuple[Array, Array], ...] = ()
 
     def _change(self, sigma: Array) -> Array:
-        """Return what the precisions of the priors change by (N, q) to other standard deviations (N, q)."""
+        """Return the change (N, q) of the precisions of the priors to other standard deviations (N, q)."""
         return np.where(self.free, 1.0 / sigma**2 - 1.0 / self.sigma**2, 0.0)
 
     def alone(self, sigma: Array) -> tuple[Array, Array, Array]:
@@ -165,7 +165,7 @@ class _Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """The priors of a block and what may be learnt about them."""
+    """The priors of a block and those of them that may be estimated."""
 
     given: CameraPrior  # with the standard deviations as they were given
     unknowns: Unknowns  # which unknown is what
@@ -223,7 +223,7 @@ class Variances:
             return problem.camera_prior, nothing
 
     def _learnt(self, problem: Problem, minimum: Minimum, widened: bool, exact: bool) -> tuple[CameraPrior, PriorTest]:
-        """Return what `learnt` does, of a problem whose constants' priors were `widened` or not."""
+        """Return the result of `learnt` for a problem whose constants' priors were `widened` or not."""
         if self.learn_waves:
             self = self._going_on(problem.camera_prior.sigma)
         around = _Around(problem, minimum)
@@ -287,7 +287,7 @@ class Variances:
         return np.asarray(self._before(slice(1, 3)) + np.array([[squares, freedom], [count, 0.0]]))
 
     def _before(self, rows: int | slice) -> Array:
-        """Return rows of what an earlier block showed; zeros without one."""
+        """Return the rows of an earlier block; zeros without one."""
         return np.asarray((np.zeros((3 + self._degrees, 2)) if self.shown is None else self.shown)[rows])
 
     def _showing(self, params: Array, known: Array) -> Array:

@@ -143,7 +143,7 @@ class Observations:
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
     def told_by(self, weight: Array) -> Array:
-        """Return what tie points of weights (K,) [1/px] tell of each view, or told before (N,) [1/px^2]."""
+        """Return the information of tie points of weights (K,) [1/px] on each view, or that before (N,) [1/px^2]."""
         return np.maximum(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0], self.told)
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
@@ -162,7 +162,7 @@ class Observations:
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 
     def tied(self, use: BoolArray) -> BoolArray:
-        """Return `use` without the observations whose point is left without a second one (or a prior)."""
+        """Return `use` without the only observations of points, but those with a prior."""
         structure = self.structure
         count = np.bincount(structure.point[use], minlength=structure.num_points)
         return use & ((count >= 2) | self.has_prior)[structure.point]

@@ -1,1 +1,1 @@
-"""The model of a block: which terms, beside the cameras, its residuals ask for, and what is kept apart from it."""
+"""Model selection: terms beside the cameras, foreign cameras and moving ground."""

@@ -1,6 +1,6 @@
-"""Tests of the residuals of a solved block: intervals, periods and correlated noise that stand out.
+"""Tests of the residuals of a solved block: significant intervals, periods and correlated noise.
 
-Observations that were cut are tested with those that were kept.
+Rejected observations are tested with the others.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval
 
 
 def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return the intervals that stand out at the end, with the offsets of the ties that were cut there.
+    """Return the significant intervals at the end, with the residuals of the rejected tie points there.
 
     As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
     """
@@ -67,7 +67,7 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 
 
 def periods_of(outcome: Outcome, block: Block) -> list[Period]:
-    """Find the periods with which the rows of images swing more than chance allows, at most one an image."""
+    """Find significant periods of the rows of images, at most one an image."""
     rows, off = _whitened(outcome, block)
     return find_periods(
         block.view[rows], block.xy[1, rows], image_sizes(block), _confirmed_observations(outcome, block)[rows], off
@@ -75,7 +75,7 @@ def periods_of(outcome: Outcome, block: Block) -> list[Period]:
 
 
 def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
-    """Return by how much noise that neighbours share explains the ties kept better than noise of each alone [nats]."""
+    """Return the evidence for correlated over independent noise of the inliers [nats]."""
     rows, off = _whitened(outcome, block)
     return correlated_log_ratio(
         block.view[rows], block.xy[:, rows], image_sizes(block), off, outcome.inlier[rows], block.point[rows]
@@ -85,7 +85,7 @@ def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
 def correlated_log_ratio(
     view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray
 ) -> float:
-    """Return what noise that neighbours share explains [nats], of ties (k,) off by (2, k) standard deviations.
+    """Return the evidence for correlated noise [nats] in residuals (2, k) of tie points, in standard deviations.
 
     A track of n views leaves 2 n - 3 of its 2 n residuals free.
     """
@@ -95,7 +95,7 @@ def correlated_log_ratio(
 
 
 def _confirmed_observations(outcome: Outcome, block: Block) -> Array:
-    """Return 1 for observations (K,) of points that others tell: what was cut is seen as well as the rest."""
+    """Return 1 for observations (K,) of points with two inliers, rejected ones among them; else 0."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 

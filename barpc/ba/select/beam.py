@@ -171,7 +171,7 @@ class TermSearch:
     ----------
     seen : Residuals
     first : list of Interval
-        Intervals that stand out before the first term.
+        Significant intervals before the first term.
     floor, sigma : float, least displacement that is looked for and standard deviation of observations [px]
     """
 
@@ -221,7 +221,7 @@ class TermSearch:
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Tried]:
-        """Return the terms that stand out beside those taken, with their gains; the best first."""
+        """Return the terms that gain beside those taken, with their gains; the best first."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain those cut there as well, and nothing stands out beside them
@@ -234,7 +234,7 @@ class TermSearch:
         return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)
 
     def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
-        """Return the intervals and periods that stand out beside a fit with terms of columns `extra` (2, e, K)."""
+        """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K)."""
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
@@ -245,7 +245,7 @@ class TermSearch:
         return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, told, off)[:RIVALS]
 
     def _leaves_nothing(self, made: list[_Tried]) -> bool:
-        """Return whether nothing stands out beside the best term that is followed: no rival is needed then."""
+        """Return whether no residuals are significant beside the best term: it needs no rival then."""
         if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
             return False
         one, found, _ = made[0]

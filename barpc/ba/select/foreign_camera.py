@@ -1,4 +1,4 @@
-"""What is set apart: a view whose RPC is not its own, and groups of ties that moved (`Parts`, `without_moving`).
+"""Foreign cameras: a view whose RPC does not match the image.
 
 Such a view is found by leaving views out, then placed by what the others see.
 
@@ -7,8 +7,8 @@ block. Its mark: without it the others agree to the noise, with it they do not. 
 solved without each of its views; where the others agree then, the one left out is placed alone against their points
 (`barpc.ba.resection`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
 another image and stays as delivered. If they agree, though the block had to let go of them, or though the priors
-leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more than half
-agree and the rest does not, parts of its image lie off (`barpc.ba.judging.judge`), and the camera is its own.
+leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more
+than half agree and the rest does not, parts of its image are displaced (`barpc.ba.select.search`).
 """
 
 from __future__ import annotations
@@ -70,8 +70,9 @@ class ForeignCamera:
 
     @property
     def may_be_its_own(self) -> bool:
-        """Whether it sees the place and is left as it is: its rows and columns may be bent. Few tie points tell nothing
-        of that, and splines would follow them anywhere.
+        """Whether it shows the scene and was not corrected: terms of its rows and columns may explain it.
+
+        Not by few tie points, which splines would follow anywhere.
         """
         return (
             self.clear
@@ -127,7 +128,7 @@ class LeaveOneOut:
 def find_foreign_camera(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> tuple[ForeignCamera | None, Solution | None]:
-    """Find the view whose RPC is not its own, where a block shows one, and the block solved without it.
+    """Find the view whose RPC does not match its image, where there is one, and the block solved without it.
 
     `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
     tells of one view. Measured on the observations of `outer`.
@@ -182,7 +183,7 @@ def agrees(found: Solution) -> bool:
 
 
 def _odd(found: Solution, block: Block) -> int | None:
-    """Return the one view that is farther off than stated by the priors, no control point in it; else None."""
+    """Return the one view whose correction exceeds its prior, without control points in it; else None."""
     odd = np.flatnonzero(found.outcome.prior.odd)
     if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
         return None
@@ -249,7 +250,7 @@ def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
     """Return the logarithm of the evidence of all ties of a block, of which those without one view are
     explained.
 
-    Others lie anywhere in their images, as what is wrong does here: how far off a strange camera sees is not known. A
+    Others lie anywhere in their images, as wrong ones do here: how far off a strange camera sees is not known. A
     part that is too large to be judged explains nothing.
     """
     ties = int((block.use & (block.point < block.num_tracks)).sum())

@@ -27,7 +27,7 @@ _TWICE = 2  # times that detectors are searched for, and that denser splines may
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Additional parameters, with what is known of them."""
+    """Additional parameters, with estimates to start from."""
 
     waves: AdditionalParameters
     start: Array | None = None  # (N, waves.size) estimates to start from
@@ -37,8 +37,8 @@ class _Layout:
 def with_terms(found: Solution, selected: Selection, parts: Parts, options: AdjustOptions) -> Solution:
     """Solve the block with the terms in images that a search selected.
 
-    Refused where check tracks are met worse, or no better than with splines and detectors. A further degree of the
-    drift that was solved before is tested again beside the terms.
+    Refused where residuals of check tie points grow, or are no smaller than with splines and detectors. A further
+    degree of the drift that was solved before is tested again beside the terms.
     """
     terms = [one for one in selected.findings if TERMS[one.kind].FOLLOWED]
     if not terms or options.jitter == OFF or options.is_plain:

@@ -27,10 +27,10 @@ _NEAREST = 12  # views that are searched together
 
 
 def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
-    """Find the terms of a block beside its cameras, the first taken first; none where no residuals stand out.
+    """Find the terms of a block beside its cameras, the first taken first; none where no residuals are significant.
 
-    In a block of more unknowns than `SMALL` each image that stands out is searched among those with which it shares
-    most tracks: moving objects compete there, and are not taken.
+    In a block of more unknowns than `SMALL` each image with significant residuals is searched among those with
+    which it shares most tracks: moving objects compete there, and are not taken.
     """
     size, views = outcome.problem.free.size, np.arange(len(block.views))
     if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:

@@ -1,1 +1,1 @@
-"""How a block is solved: who sees what, its normal equations and their factors, the minimum and its covariance."""
+"""The solution of a block: its structure, normal equations and their factors, the minimum and its covariance."""

@@ -94,7 +94,7 @@ class Covariance:
         return self._columns(self._places(np.array([j])), of_full)[self._places(np.array([i]))]
 
     def _of_shared(self, view: int | None = None) -> Array:
-        """Return the rows (q, k) of a view in what errors in common do; of none the covariances (N, q, q) by these."""
+        """Return the rows (q, k) of a view in common errors; without a view the covariances (N, q, q) by these."""
         assert self.shared is not None
         rows = self.shared.reshape(-1, self.num_unknowns, self.shared.shape[1])
         return np.asarray(rows @ np.swapaxes(rows, 1, 2) if view is None else rows[view])

@@ -178,7 +178,7 @@ class Cholesky:
         return volume
 
     def _assembled(self, number: int, front: Front, damping: float) -> Array:
-        """Return the matrix's own part of a front: what its pivots have, the lower triangle."""
+        """Return the matrix's own part of a front: the lower triangle of its pivots."""
         q, count = self._size, len(front.pivots) + len(front.border)
         matrix = np.zeros((count, q, count, q))  # its transpose: as LAPACK has it
         diagonal = self.blocks.diagonal[front.pivots]
@@ -192,7 +192,7 @@ class Cholesky:
         return matrix.reshape(count * q, count * q).T
 
     def last(self) -> Array:
-        """Return what is left (m, m) for the unknowns of the last front once all others are eliminated."""
+        """Return the reduced matrix (m, m) of the unknowns of the last front once all others are eliminated."""
         lower = np.tril(self._of(len(self.order.fronts) - 1)[0])
         return np.asarray(lower @ lower.T)
 
@@ -282,7 +282,7 @@ def _spread(index: IntArray, size: int) -> IntArray:
 
 
 def _add(matrix: Array, place: IntArray, rest: Array) -> None:
-    """Add what a front below leaves, run by run of its places: they mostly follow each other."""
+    """Add the remainder of a front below, run by run of its places: they mostly follow each other."""
     starts = np.flatnonzero(np.diff(place, prepend=-2) != 1)
     stops = np.append(starts[1:], len(place))
     for a, b in zip(starts, stops, strict=True):

@@ -80,7 +80,7 @@ class Reduced:
         return factorize_blocks(self.matrix, order, damping, less)
 
     def with_diagonal(self, more: Array) -> Reduced:
-        """Return the same with (N, q) added to S's diagonal: what priors on single unknowns know."""
+        """Return the same with the precisions (N, q) of priors on single unknowns added to S's diagonal."""
         if isinstance(self.matrix, np.ndarray):
             return replace(self, matrix=self.matrix + np.diag(more.ravel()))
         diagonal = self.matrix.diagonal + more[:, :, None] * np.eye(more.shape[1])

@@ -66,7 +66,7 @@ class Problem:
         return self.cameras.project(params, structure.of_points(points), structure.bounds, out=out)
 
     def prepare(self, params: Array, points: Array) -> tuple[Array, Projected | None]:
-        """Return the residuals (2, K) [px], and what `linearise` gives unless it is too large to keep for `reduce`."""
+        """Return the residuals (2, K) [px], and the result of `linearise` unless it is too large for `reduce`."""
         if self.xy.shape[1] > KEPT:
             return self.residuals(params, points), None
         projected = self.linearise(params, points)
@@ -126,7 +126,7 @@ class Problem:
         return settled
 
     def point_terms(self, points: Array) -> tuple[Array, Array]:
-        """Return what the priors add to the points' normal matrices (6, P) and gradients (3, P)."""
+        """Return the priors' part of the points' normal matrices (6, P) and gradients (3, P)."""
         matrix, gradient = np.zeros((6, len(points))), np.zeros((3, len(points)))
         prior = self.point_prior
         if prior is not None:
@@ -148,7 +148,7 @@ class Problem:
     def counted_once(self, params: Array, points: Array, weight: Array) -> Problem:
         """Return the problem with the joint prior without observations that it knows already, of `weight` (K,) [1/px].
 
-        What is left of these is what their tie points tell with others: the cost of the others given them. That holds
+        These keep the information of their tie points with others: the cost of the others given them. That holds
         for observations that the prior was not learnt from, too.
         """
         prior = self.joint_prior

@@ -122,8 +122,8 @@ def minimise(
 def _has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
     """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
 
-    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Of what is met
-    without noise the cost is rounding alone: what is tolerated is a thousandth of a standard deviation at least.
+    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Without noise
+    the cost is rounding alone: the tolerance is a thousandth of a standard deviation at least.
     """
     cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
@@ -133,7 +133,7 @@ def _is_as_told(cost: float, told: float, tolerance: float) -> bool:
     """Return whether a step that leaves `cost` is the last, after which `told` should be left.
 
     What the residuals bend beyond their linearisation is all that a next step could mend, and it gains no more than
-    about twice what that adds to the cost: a hundredth of what is tolerated.
+    about twice what that adds to the cost: a hundredth of the tolerance.
     """
     return abs(cost - told) <= 5e-3 * tolerance * told
 

@@ -1,4 +1,4 @@
-"""Who sees what, and in which order the views of a block are eliminated: worked out once, used by every linearisation.
+"""The structure of a block: views by points, and the order in which views are eliminated, for every linearisation.
 
 The order is nested dissection (George 1973), so that little fills in. Views are tied to those beside them on the
 ground, or to those next in time where all see one place. A block is cut in two by the fewest views that touch all ties
@@ -42,8 +42,8 @@ class Dissection:
 def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None = None) -> Dissection:
     """Return the nested-dissection order of the views in `use` (N,), tied in `pairs` (M, 2), at `place` (N, 2).
 
-    Views that are to come `last` (n,) are the last front, in the order given: its matrix is what is left of theirs once
-    all others are eliminated.
+    Views that are to come `last` (n,) are the last front, in the order given: its matrix is the reduced one of theirs
+    once all others are eliminated.
     """
     n = len(place)
     (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
@@ -61,7 +61,7 @@ def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None
 
 
 def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: IntArray) -> list[Front]:
-    """Return the fronts of pieces in their order: a border is what the pivots touch, or the fronts below them."""
+    """Return the fronts of pieces in their order: a border has the unknowns tied to pivots or to fronts below."""
     fronts: list[Front] = []
     below: list[list[IntArray]] = [[] for _ in pieces]
     for number, piece in enumerate(pieces):
@@ -77,7 +77,7 @@ def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: 
 
 
 def _dissect(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArray]) -> None:
-    """Append the views (n,) piece by piece: one side, the other, what parts them."""
+    """Append the views (n,) piece by piece: one side, the other, and their separator."""
     waiting = [(views, False)]
     while waiting:
         piece, whole = waiting.pop()
@@ -121,7 +121,7 @@ def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
 
 
 def _best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
-    """Return an order, how many of it stand before its best cut (0: none parts it), and what that costs.
+    """Return an order, how many of it stand before its best cut (0: there is none), and its cost.
 
     A cut that s views touch from one side, and that leaves a and b, costs s / (a b): few views, and balanced sides.
     """

@@ -1,4 +1,4 @@
-"""What residuals show beside the cameras: one term a file, with its columns, prior, price, refinement and words."""
+"""Terms beside the cameras that explain residuals: one a file, with its columns, prior, price, refinement and words."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TERMS: dict[str, type[Term]] = {
 }
 """Name -> term, in the order in which they are proposed."""
 IN_IMAGES = Step, Decay, Transient, LowFrequency
-"""Those that are proposed where an interval of an image stands out."""
+"""Those that are proposed for significant intervals of images."""
 
 
 def proposed(

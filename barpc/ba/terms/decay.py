@@ -21,7 +21,7 @@ class Decaying(Term):
     """A term whose displacement decays exponentially along the rows."""
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
-        """Return the term with the rate that its derivative asks for, and as it is."""
+        """Return the term with the rate that its derivative asks for, and itself."""
         return [self.at_rate_of(fit(self.with_rate(residuals))), self]
 
     def with_rate(self, residuals: Residuals) -> Self:

@@ -50,7 +50,7 @@ class _Columns:
         return out
 
     def split(self, g: int, low: float, high: float, residual: Array) -> tuple[float, float]:
-        """Return the largest change between two columns of a group: what it explains beyond chance, and where."""
+        """Return the largest change between two columns of a group: its gain beyond chance, and its place."""
         places = self.places[g][np.searchsorted(self.places[g], low) : np.searchsorted(self.places[g], high)]
         if not len(places):
             return 0.0, low
@@ -97,7 +97,7 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
 
 
 def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
-    """Return the edges of every group, the largest first and then placed, and the cost of what is left."""
+    """Return the edges of every group, the largest first and then placed, and the cost of the residuals."""
     edges: Edges = [[] for _ in columns.groups]
     part = np.zeros_like(residual)
     for _ in range(ITERATIONS):

@@ -1,4 +1,4 @@
-"""A low-frequency displacement of the rows of one image: what a platform does that its polynomial drift does not."""
+"""A low-frequency displacement of the rows of one image, beyond the polynomial drift of a platform."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ _REGIONS = _regions()
 
 
 def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
-    """Return the best regions (C,), none of which covers more than half of what it has in common with another."""
+    """Return the best regions (C,), none of which shares more than half of its union with another."""
     found: list[BoolArray] = []
     for n in np.argsort(-gains, kind="stable"):
         one = regions[n]

@@ -1,4 +1,4 @@
-"""A term: unknowns beside the cameras, with their columns, prior and price, and what the search asks of it."""
+"""A term: unknowns beside the cameras, with their columns, prior and price, and its part in the search."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ class Term:
 
     @classmethod
     def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
-        """Return whether the intervals that stand out may be of such a term."""
+        """Return whether the significant intervals may be of such a term."""
         return True
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return such terms for an interval that stands out."""
+        """Return such terms for a significant interval."""
         raise NotImplementedError
 
     def first_cost(self, residuals: Residuals) -> float:
@@ -73,7 +73,7 @@ class Term:
         return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
-        """Return the shapes that are refined: its own, and what a fit with its derivatives makes of it."""
+        """Return the shapes to refine: its own, and those that a fit with derivatives suggests."""
         return [self]
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:

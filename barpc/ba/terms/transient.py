@@ -30,7 +30,7 @@ class Transient(Decaying):
 
     @classmethod
     def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
-        """Return whether all that stands out is at the beginning of images, or all at their end."""
+        """Return whether all significant intervals are at the beginning of images, or all at their end."""
         at_end = [
             (one.start <= 0.0, one.stop >= residuals.size[1, one.view]) if one.axis == 1 else (False, False)
             for one in intervals
