@@ -85,7 +85,7 @@ class AdditionalParameters:
 
     @cached_property
     def bands(self) -> Array:
-        """Groups of unknowns (size,) expected to be about as large: half an octave of waves, steps, parts, sinusoids."""
+        """Groups of unknowns (size,) of about the same size: half an octave of waves, steps, parts, sinusoids."""
         m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + float(DRIFTS))
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
