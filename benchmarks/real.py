@@ -1,0 +1,298 @@
+"""Real images, each set by barpc and by the peers that are installed: one table, a row a set and tool.
+
+    python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--only SET]...
+
+A row has the epipolar offset of independent points (median and spread, 1.4826 MAD [px], the worst pair of a set), CPU
+seconds, peak memory, the exit code and the first sentence of the result. The points are those of the data's truth
+(SIFT or correlation without any RPC); of a --folder, and where the truth has none, SIFT matches made here, filtered by
+a fundamental matrix. The offset is measured by tools/epi_check.py beside the data, which has its own RPC formula and
+reads files through GDAL. Tools:
+  delivered  the cameras as they are
+  barpc      `barpc adjust` with its defaults, and what a set gives (GCPs, DEM, reference)
+  cars       cars-bundleadjustment of the interpreter given, its .geom as written and half a pixel back
+A set or a tool that is absent is named with the reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import cv2  # noqa: E402  (the thread counts come first)
+import numpy as np  # noqa: E402
+import rasterio  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Images of one place, with the options that go with them."""
+
+    name: str
+    images: tuple[Path, ...]  # IMAGE arguments of barpc adjust, `,camera=` included
+    options: tuple[str, ...] = ()
+    bias: tuple[float, float] = (0.0, 0.0)  # added to the RPC of the last image [px]
+    ties: tuple[Path, ...] = ()  # check points, named as A__B__... after the stems of images
+    gcps: Path | None = None  # check points on the ground
+    missing: str = ""
+
+
+@dataclass
+class Row:
+    """One set by one tool."""
+
+    scene: str
+    tool: str
+    offset: str = ""
+    cpu: float = np.nan
+    peak: float = np.nan
+    code: int = 0
+    said: str = ""
+
+    def line(self) -> str:
+        """For the table."""
+        cost = f"{self.cpu:.1f} | {self.peak:.0f}" if np.isfinite(self.cpu) else "| "
+        return f"| {self.scene} | {self.tool} | {self.offset} | {cost} | {self.code} | {self.said} |"
+
+
+def scenes(data: Path) -> Iterator[Scene]:
+    """The sets of the data, absent ones with the reason."""
+    optical, cross, ties = data / "optical", data / "cross_sensor", data / "truth/ties"
+    north = tuple(sorted((optical / "phr_triplet_north").glob("img_*.tif")))
+    checks = tuple(sorted(ties.glob("phr_triplet_north__*ncc_check.csv")))
+    ventoux = optical / "phr_ventoux"
+    left, right = (ventoux / f"{side}_image.tif" for side in ("left", "right"))
+    of_ventoux = tuple(sorted(ties.glob("phr_ventoux__*ncc_check.csv")))
+    quickbird, aerial = optical / "qb2_single", cross / "ngi_2015"
+    truth = quickbird / "gcps.geojson"
+    terrain = ("--dem", str(aerial / "dem.tif"), "--geoid", str(data / "dem/egm96_15.gtx"))
+    orthos = itertools.chain(*(("--reference", str(one)) for one in sorted(aerial.glob("ortho_*.tif"))))
+    frames = tuple(sorted(aerial.glob("ngi_*.tif")))
+    found = [
+        Scene("Pleiades triplet", north, ties=checks),
+        Scene("the same, 20 px of bias in one RPC", north, bias=(12.0, 16.0), ties=checks),
+        Scene("Pleiades pair, Ventoux", (left, right), ties=of_ventoux),
+        Scene("Ventoux PAN and XS", (cross / "phr_ventoux_xs/left_xs.tif", right)),
+        Scene("QuickBird 2003 and aerial 2015", (quickbird / "qb2_basic1b.tif", *frames[:1]), terrain),
+        Scene("QuickBird on four orthoimages", (quickbird / "qb2_basic1b.tif",),
+              (*orthos, *terrain), gcps=truth),
+        Scene("aerial frames", frames),
+    ]  # fmt: skip
+    for one in found:
+        absent = [path for path in one.images if not path.exists()]
+        yield replace(one, missing=f"{absent[0]} is absent" if absent else "" if one.images else "no images")
+
+
+def of_folder(folder: Path) -> Scene:
+    """A set of all rasters of a folder."""
+    images = tuple(
+        sorted(path for path in folder.iterdir() if path.suffix.lower() in (".tif", ".tiff", ".ntf", ".jp2"))
+    )
+    return Scene(folder.name, images, missing="" if len(images) > 1 else f"{folder} has fewer than two images")
+
+
+def measured(command: list[str], folder: Path, log: Path) -> tuple[float, float, int]:
+    """CPU seconds, peak memory [MB] and exit code of a command, run in a folder, its output in a file."""
+    with log.open("w") as out:
+        process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0, os.waitstatus_to_exitcode(status)
+
+
+def delivered(scene: Scene, place: Path) -> tuple[dict[str, Path], list[str]]:
+    """Links to the images in a folder, the RPC of the last moved by the bias; their delivered cameras as VRTs."""
+    place.mkdir()
+    arguments = []
+    for path in scene.images:
+        for beside in path.parent.glob(f"{path.stem}*"):
+            (place / beside.name).symlink_to(beside.resolve())
+        arguments.append(str(place / path.name))
+    if any(scene.bias):
+        last = place / scene.images[-1].name
+        last.unlink()
+        shutil.copy(scene.images[-1].resolve(), last)
+        last.chmod(0o644)
+        with rasterio.open(last, "r+") as file:
+            rpc = file.rpcs
+            rpc.samp_off, rpc.line_off = rpc.samp_off + scene.bias[0], rpc.line_off + scene.bias[1]
+            file.rpcs = rpc
+    out = place / "delivered"
+    run = [sys.executable, "-m", "barpc", "-q", "convert", *arguments, "-o", str(out)]
+    measured(run, ROOT, place / "convert.log")
+    return {Path(path).stem: out / f"{Path(path).stem}.vrt" for path in arguments}, arguments
+
+
+def check_points(scene: Scene, place: Path) -> dict[tuple[str, str], Path]:
+    """Files of check points by the stems of two images: given, or SIFT matches that one fundamental matrix explains."""
+    names = [path.stem for path in scene.images]
+    if scene.ties:
+        return {tuple(path.stem.split("__")[1:3]): path for path in scene.ties}  # type: ignore[misc]
+    sift, found = cv2.SIFT_create(8000), {}
+    seen = [sift.detectAndCompute(_grey(path), None) for path in scene.images]
+    for (i, (a, first)), (j, (b, second)) in itertools.combinations(enumerate(seen), 2):
+        if first is None or second is None:
+            continue
+        forth, back = (cv2.BFMatcher().knnMatch(*pair, k=2) for pair in ((first, second), (second, first)))
+        of_second = {m[0].queryIdx: m[0].trainIdx for m in back if len(m) == 2 and m[0].distance < 0.7 * m[1].distance}
+        good = [m[0] for m in forth if len(m) == 2 and m[0].distance < 0.7 * m[1].distance]
+        good = [m for m in good if of_second.get(m.trainIdx) == m.queryIdx]
+        if len(good) < 30:
+            continue
+        left, right = np.float64([a[m.queryIdx].pt for m in good]), np.float64([b[m.trainIdx].pt for m in good])
+        _, kept = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, 1.0, 0.999, 10000)
+        rows = np.hstack([left, right])[kept.ravel() > 0]
+        path = place / f"{names[i]}__{names[j]}.csv"
+        np.savetxt(path, rows, delimiter=",", header="col_a,row_a,col_b,row_b", comments="")
+        found[names[i], names[j]] = path
+    return found
+
+
+def _grey(path: Path) -> np.ndarray:
+    with rasterio.open(path) as file:
+        band = file.read(1).astype(np.float64)
+    low, high = np.percentile(band[band > 0], (1, 99))
+    return np.clip(255.0 * (band - low) / (high - low), 0, 255).astype(np.uint8)
+
+
+def offsets(check: Path, cameras: dict[str, Path], points: dict[tuple[str, str], Path]) -> str:
+    """Median and spread of the epipolar offset in the pair where the median is largest."""
+    worst: tuple[float, float] | None = None
+    for (a, b), ties in points.items():
+        if not (cameras.get(a, Path()).is_file() and cameras.get(b, Path()).is_file()):
+            return "a camera is missing"
+        run = subprocess.run(
+            [sys.executable, check.__file__ or "", cameras[a], cameras[b], ties],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if run.returncode:
+            return (run.stderr.strip().splitlines() or ["failed"])[-1][:80]
+        said = json.loads(run.stdout)
+        if worst is None or abs(said["median"]) > abs(worst[0]):
+            worst = said["median"], said["spread"]
+    return "no check points" if worst is None else f"{worst[0]:+.3f} +- {worst[1]:.3f}"
+
+
+def by_barpc(scene: Scene, arguments: list[str], place: Path) -> tuple[Row, dict[str, Path]]:
+    """`barpc adjust` with its defaults."""
+    out = place / "barpc"
+    command = [sys.executable, "-m", "barpc", "-q", "adjust", *arguments, *scene.options, "-o", str(out)]
+    cpu, peak, code = measured(command, ROOT, place / "barpc.log")
+    row = Row(scene.name, "barpc", "", cpu, peak, code)
+    if (out / "summary.json").is_file():
+        told = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        row.said = "; ".join([told["status"], *told["reasons"][:1]])
+    else:
+        row.said = (place / "barpc.log").read_text().strip().splitlines()[-1]
+    return row, {Path(path).stem: out / f"{Path(path).stem}.vrt" for path in arguments}
+
+
+def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -> list[tuple[Row, dict[str, Path]]]:
+    """cars-bundleadjustment, its cameras as written and with the half pixel that all have in common taken back."""
+    program = Path(interpreter).parent / "cars-bundleadjustment"
+    names = [Path(path).stem for path in arguments]
+    sensors = {name: {"image": path} for name, path in zip(names, arguments, strict=True)}
+    pairing = [[names[0], name] for name in names[1:]]
+    wanted = {"pairing": pairing, "separate": True, "nb_decimals": 0, "min_matches": 50}
+    config = {
+        "input": {"sensors": sensors, "pairing": pairing},
+        "orchestrator": {"mode": "sequential"},
+        "tie_points": {"applications": {"bundle_adjustment": wanted}},
+        "output": {"directory": str(place / "cars")},
+    }
+    (place / "cars.json").write_text(json.dumps(config))
+    cpu, peak, code = measured([str(program), str(place / "cars.json")], place, place / "cars.log")
+    said = "" if code == 0 else (place / "cars.log").read_text().strip().splitlines()[-1][:100]
+    found = []
+    for kind, back in (("as written", 0.0), ("half a pixel back", 0.5)):
+        cameras = {name: place / f"cars_{back}/{name}.vrt" for name in names}
+        given = []
+        for name, path in zip(names, arguments, strict=True):
+            geom = next(iter(sorted((place / "cars").rglob(f"*{name}*.geom"))), None)
+            if geom is not None:
+                _shift(geom, back)
+                given.append(f"{path},camera={geom}")
+        run = [sys.executable, "-m", "barpc", "-q", "convert", *given, "-o", str(place / f"cars_{back}")]
+        if given:
+            measured(run, ROOT, place / "cars_convert.log")
+        found.append((Row(scene.name, f"cars, {kind}", "", cpu, peak, code, said), cameras))
+    return found
+
+
+def _shift(geom: Path, pixels: float) -> None:
+    lines = []
+    for line in geom.read_text().splitlines():
+        key, _, value = line.partition(":")
+        shifted = key.strip() in ("line_off", "samp_off")
+        lines.append(f"{key}: {float(value) - pixels!r}" if shifted else line)
+    geom.write_text("\n".join(lines) + "\n")
+
+
+def rows(scene: Scene, check: Path, cars: str | None) -> Iterator[Row]:
+    """The rows of a set."""
+    if scene.missing:
+        yield Row(scene.name, "-", said=scene.missing)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder, "set")
+        cameras, arguments = delivered(scene, place)
+        points = check_points(scene, place)
+        measure: Callable[[dict[str, Path]], str] = lambda found: offsets(check, found, points)  # noqa: E731
+        if scene.gcps is not None:
+            measure = lambda found: _of_gcps(found, scene)  # noqa: E731
+        yield Row(scene.name, "delivered", measure(cameras))
+        row, found = by_barpc(scene, arguments, place)
+        yield replace(row, offset=measure(found))
+        if cars is not None and len(arguments) > 1:
+            for other, corrected in by_cars(cars, scene, arguments, place):
+                yield replace(other, offset=measure(corrected))
+
+
+def _of_gcps(cameras: dict[str, Path], scene: Scene) -> str:
+    """Root mean square of surveyed points in the image, col and row, by `barpc check`."""
+    (camera,) = cameras.values()
+    with tempfile.TemporaryDirectory() as folder:
+        given = ["--gcp", str(scene.gcps), *scene.options[-4:], "-o", f"{folder}/out"]
+        run = [sys.executable, "-m", "barpc", "-q", "check", str(camera), *given]
+        measured(run, ROOT, Path(folder, "log"))
+        path = Path(folder, "out/summary.json")
+        if not path.is_file():
+            return Path(folder, "log").read_text().strip().splitlines()[-1][:80]
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return "GCPs " + json.dumps(told["gcps"])[:120]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared/data")
+    parser.add_argument("--folder", type=Path, action="append", default=[], help="images of one place")
+    parser.add_argument("--cars", metavar="PYTHON", help="interpreter that has cars-bundleadjustment")
+    parser.add_argument("--only", nargs="+", default=[], help="parts of the names of sets")
+    given = parser.parse_args()
+    tool = given.data.parent / "tools/epi_check.py"
+    if not tool.is_file():
+        sys.exit(f"{tool}, which measures the check points, is absent")
+    print("| set | tool | epipolar offset [px] | CPU [s] | peak [MB] | exit | result |\n|---|---|---|---|---|---|---|")
+    for scene in (*scenes(given.data), *map(of_folder, given.folder)):
+        if not given.only or any(part in scene.name for part in given.only):
+            for row in rows(scene, tool, given.cars):
+                print(row.line(), flush=True)
+
+
+if __name__ == "__main__":
+    main()
