@@ -226,7 +226,7 @@ class TermSearch:
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain those cut there as well, and nothing stands out beside them
         out = out or ([] if self.taken else self.first)
-        made = self._with([], self._worth_more(proposed(seen, out, periods)))
+        made = self._with([], self._worth_more(list(proposed(seen, out, periods))))
         made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         if (out or self.group) and not self._leaves_nothing(made):
             made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
@@ -256,10 +256,8 @@ class TermSearch:
         self.group = self.group or list[Term](MovingObjects.propose(self.seen, out[0]))
         found = self._with([], self.group)
         rows = self.seen.linear.taking_part
-        sure = [row for row in found if row[2] > SURE]
-        return self._refined(
-            self._with(found, self._worth_more(one for row in sure for one in self._members(row[1], rows)))
-        )
+        members = [one for row in found if row[2] > SURE for one in self._members(row[1], rows)]
+        return self._refined(self._with(found, members))
 
     def _refined(self, made: list[_Tried]) -> list[_Tried]:
         """Return the terms, best first, with ends, periods and lengths refined where these may gain most."""
@@ -274,11 +272,15 @@ class TermSearch:
             for one, found, gain in made
         )
 
-    def _worth_more(self, offered: Iterable[Term]) -> list[Term]:
-        """Return the terms that, by the sum of distances of a sample of tracks, may gain most."""
-        gains = [(one, -one.first_cost(self.seen)) for one in offered]
-        least = max((gain for _, gain in gains), default=0.0) / RIVALS
-        return [one for one, gain in gains if gain >= least]
+    def _worth_more(self, offered: list[Term]) -> list[Term]:
+        """Return the terms that, by a sample of tracks, may gain most, alone or as the largest of several."""
+        few = self.seen.few
+        if few is self.seen.linear or len(offered) < 3:
+            return offered
+        base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
+        gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
+        least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
+        return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
         """Yield the parts of images that hold a moving group: displaced rows move on the ground, too."""
