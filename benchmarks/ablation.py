@@ -9,7 +9,7 @@ observations that were cut, the stated sigma of the scene's place. For each cons
 `same` where no figure of any world changes by a bit; `fails` where a run ends in an error (a size that others must
 match). A constant that is an argument's default is not reached.
 
-    python -m benchmarks.ablation barpc.ba.judging              # all numbers of a room
+    python -m benchmarks.ablation barpc.ba.select               # all numbers of a room
     python -m benchmarks.ablation barpc.ba --only _SURE SURE --worlds local:0 swing:0 --factors 0.5 2
 """
 
@@ -164,7 +164,7 @@ def line(constant: Constant, factor: float, got: dict[str, Any]) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("package", help="such as barpc.ba.judging")
+    parser.add_argument("package", help="such as barpc.ba.select")
     parser.add_argument("--only", nargs="+", help="names of constants")
     parser.add_argument("--worlds", nargs="+", default=WORLDS, help="FAMILY:SEED")
     parser.add_argument("--factors", nargs="+", type=float, default=(0.5, 2.0))

@@ -11,12 +11,13 @@ import pytest
 
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import join, make_problem
-from barpc.ba.judging import following
-from barpc.ba.judging.explanations import FADE, STRIP, SWING
-from barpc.ba.judging.following import _Columns, _given_edges, _spline_counts, _with_edges, find_edges, follow
 from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.select import image_terms
+from barpc.ba.select.image_terms import _given_edges, _Layout, _spline_counts, _with_edges, with_splines
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.terms import detectors
+from barpc.ba.terms.detectors import _Columns, find_edges
 from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
@@ -110,19 +111,18 @@ def followed(monkeypatch, tells: str, better: str, **options: Any) -> tuple[str,
         name = str(made.index(f"{count}") + 1) if count >= 0 else "0"
         return Tried(name, name, name in tells, SimpleNamespace(smooth=f"smooth of {name}"), {"drift": 1})
 
-    def with_waves(
-        found: Any, block: Any, outer: Any, options: Any, waves: AdditionalParameters, once: bool = False
-    ) -> Tried:
+    def with_waves(found: Any, parts: Any, options: Any, layout: _Layout, once: bool = False) -> Tried:
         assert found.name == "0"  # always from where it ended without
         assert once == (not options.detectors)
-        made.append(str(waves.count))
-        return solution(waves.count)
+        made.append(str(layout.waves.count))
+        return solution(layout.waves.count)
 
-    monkeypatch.setattr(following, "_with_waves", with_waves)
-    monkeypatch.setattr(following, "_with_edges", lambda found, *_: found)
-    monkeypatch.setattr(following, "_explains", lambda *_: True)
-    monkeypatch.setattr(following, "is_better", lambda one, other, outer: one in better and other < one)
-    found = follow(solution(-1), views_of(3000, 3000), None, AdjustOptions(**options))  # type: ignore[arg-type]
+    monkeypatch.setattr(image_terms, "_solve_with", with_waves)
+    monkeypatch.setattr(image_terms, "_with_edges", lambda found, *_: found)
+    monkeypatch.setattr(image_terms, "_explains", lambda *_: True)
+    monkeypatch.setattr(image_terms, "is_admitted", lambda one, other, outer: one in better and other < one)
+    parts: Any = SimpleNamespace(inner=views_of(3000, 3000), outer=None)
+    found: Any = with_splines(solution(-1), parts, AdjustOptions(**options))  # type: ignore[arg-type]
     assert found.asked == ({"drift": 1} if found.name == "0" else {"drift": 1, "jitter": "smooth of 0"})
     return found.name, made
 
@@ -159,11 +159,11 @@ def test_knots_are_denser_until_nothing_is_left_or_two_are_no_better(monkeypatch
     ],
 )
 def test_what_is_followed_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
-    monkeypatch.setattr(following, "correlated_noise_gain", lambda outcome, block: outcome)
+    monkeypatch.setattr(image_terms, "correlated_noise_gain", lambda outcome, block: outcome)
     tried, found = (
         SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
     )
-    assert following._explains(tried, found, None) == kept  # type: ignore[arg-type]
+    assert image_terms._explains(tried, found, None) == kept  # type: ignore[arg-type]
 
 
 def test_what_is_asked_for_is_taken_once(monkeypatch) -> None:
@@ -188,25 +188,27 @@ class Ended:
 @pytest.mark.parametrize(
     ("parts", "plain", "kept"),
     [
-        ({0: STRIP, 1: STRIP}, 1, "tried"),  # one image stands still: it is seen against that
-        ({0: STRIP, 1: STRIP, 2: FADE}, 1, "found"),  # all do: what follows images as a whole, where it is better
-        ({0: STRIP, 1: STRIP, 2: FADE}, 3, "tried"),
-        ({0: SWING, 1: SWING}, 1, "found"),
-        ({0: SWING}, 1, "tried"),
+        ({0: "step", 1: "step"}, 1, "tried"),  # one image stands still: it is seen against that
+        ({0: "step", 1: "step", 2: "decay"}, 1, "found"),  # all do: what follows images as a whole, where it is better
+        ({0: "step", 1: "step", 2: "decay"}, 3, "tried"),
+        ({0: "sinusoid", 1: "sinusoid"}, 1, "found"),
+        ({0: "sinusoid"}, 1, "tried"),
     ],
 )
 def test_strips_of_all_images_compete_with_what_follows_them_as_a_whole(monkeypatch, parts, plain, kept) -> None:
     """Of three images; the fewer, the better are held-out tracks met: 9 without strips, 2 with them."""
-    findings = tuple(SimpleNamespace(kind=kind, view=v, where=(1,), moved=None) for v, kind in parts.items())
+    findings = tuple(SimpleNamespace(kind=kind, view=v, where=(1,), moved=None, gain=9.0) for v, kind in parts.items())
     found, whole = Ended("found", 9), Ended("whole", plain)
-    monkeypatch.setattr(following, "_waves_of", lambda *_: (None, None))
-    monkeypatch.setattr(following, "_at_selection", lambda found, *_: found)
-    monkeypatch.setattr(following, "_with_waves", lambda *_, **__: Ended("tried", 2))
-    monkeypatch.setattr(following, "follow", lambda *_: whole)
-    monkeypatch.setattr(following, "standing_out", lambda *_: [])
-    monkeypatch.setattr(following, "is_better", lambda one, other, outer: one < other)
+    monkeypatch.setattr(image_terms, "_layout_of", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(image_terms, "_at_selection", lambda found, *_: found)
+    monkeypatch.setattr(image_terms, "_solve_with", lambda *_, **__: Ended("tried", 2))
+    monkeypatch.setattr(image_terms, "with_splines", lambda *_: whole)
+    monkeypatch.setattr(image_terms, "standing_out", lambda *_: [])
+    monkeypatch.setattr(image_terms, "is_better", lambda one, other, outer: one < other)
+    monkeypatch.setattr(image_terms, "is_admitted", lambda one, other, outer, gain: not other < one)
     judged: Any = SimpleNamespace(findings=findings)
-    ended = following.without_strips(found, judged, views_of(300, 300, 300), None, AdjustOptions())  # type: ignore[arg-type]
+    block: Any = SimpleNamespace(inner=views_of(300, 300, 300), outer=None)
+    ended: Any = image_terms.with_terms(found, judged, block, AdjustOptions())  # type: ignore[arg-type]
     assert ended.name == kept
 
 
@@ -225,9 +227,8 @@ def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> 
             has_waves=tells[len(solved)],
         )
 
-    def with_waves(
-        found: Any, block: Any, outer: Any, options: Any, waves: AdditionalParameters, once: bool = False
-    ) -> Any:
+    def with_waves(found: Any, parts: Any, options: Any, layout: _Layout, once: bool = False) -> Any:
+        waves = layout.waves
         assert not once
         assert waves.count == 13
         solved.append(waves.edges.shape[1])
@@ -237,10 +238,11 @@ def steps(monkeypatch, counts: list[int], tells: list[bool], given: int = 0) -> 
         sigmas.append(float(sigma[0]))
         return np.zeros((2, counts[len(sigmas) - 1]))
 
-    monkeypatch.setattr(following, "_with_waves", with_waves)
-    monkeypatch.setattr(following, "find_edges", look)
+    monkeypatch.setattr(image_terms, "_solve_with", with_waves)
+    monkeypatch.setattr(image_terms, "find_edges", look)
     start = solution(AdditionalParameters(13, np.zeros((2, given))))
-    _with_edges(start, SimpleNamespace(sigma=np.full(3, 0.1)), None, None)  # type: ignore[arg-type]
+    parts: Any = SimpleNamespace(inner=SimpleNamespace(sigma=np.full(3, 0.1)))
+    _with_edges(start, parts, None)  # type: ignore[arg-type]
     return solved, sigmas
 
 
@@ -330,7 +332,7 @@ def test_means_of_detectors_are_weighted_and_nothing_where_there_is_no_edge() ->
 
 def grown(made: _Columns, residual: np.ndarray, sigma: float = 1.0) -> tuple[list[list[float]], float]:
     """Edges where points do not share what is wrong."""
-    return following._grown(made, residual, lambda given: given, np.full(residual.shape[1], 1.0 / sigma))
+    return detectors._grown(made, residual, lambda given: given, np.full(residual.shape[1], 1.0 / sigma))
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.98, False), (1.02, True)])
@@ -356,7 +358,7 @@ def test_a_step_of_a_focal_plane_has_to_explain_four_more_a_view(share, found) -
 
 @pytest.mark.parametrize(("share", "found"), [(0.48, False), (0.52, True)])
 def test_changes_half_as_large_as_the_largest_are_taken_with_it(monkeypatch, share, found) -> None:
-    monkeypatch.setattr(following, "ITERATIONS", 1)
+    monkeypatch.setattr(detectors, "ITERATIONS", 1)
     made, col = columns([np.arange(200.0)] * 2)
     size = np.where(np.arange(400) < 200, np.sqrt(200.0 / 50.0), np.sqrt(share * 200.0 / 50.0))
     edges, _ = grown(made, np.stack([np.where(col < 100, 0.0, size), 0 * col]))
@@ -414,14 +416,14 @@ def test_what_was_found_before_is_looked_for_anew(exact) -> None:
     cameras = SimpleNamespace(unknowns=unknowns)
     known: Any = SimpleNamespace(cameras=cameras, structure=problem.structure, xy=problem.xy)
     zero = np.zeros(problem.xy.shape)
-    found = following._without_steps(known, replace(state, params=params), zero)
+    found = detectors._without_steps(known, replace(state, params=params), zero)
     of_steps = params[:, unknowns.in_waves][:, waves.kinds[1]].reshape(3, 2, -1)
     right = problem.xy[0] >= 9000.0
     for v in range(3):
         mine = problem.structure.view == v
         levels = waves._of_steps @ of_steps[v].T  # (2 detectors, 2 coordinates)
         np.testing.assert_allclose(found[:, mine], -levels[right[mine].astype(int)].T, atol=1e-12)
-    assert (following._without_steps(problem, state, zero) == 0).all()
+    assert (detectors._without_steps(problem, state, zero) == 0).all()
 
 
 # --- splines and steps ------------------------------------------------------------------------------------------------
