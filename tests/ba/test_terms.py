@@ -1,22 +1,24 @@
-"""Explanations: which unknowns, where, at what price, and how ends and rates follow single ties."""
+"""Terms: which unknowns, where, at what price, how places, ends and rates follow single ties, and what is recorded."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.mixture import MixtureFit
+from barpc.ba.evidence.mixture import MixtureFit, fit_mixture, log_likelihoods
 from barpc.ba.evidence.periods import Period
 from barpc.ba.evidence.scan import BINS, Interval, price
-from barpc.ba.select import image_terms
-from barpc.ba.terms import IN_IMAGES, LowFrequency, Sinusoid, Transient, decay, proposed, step
+from barpc.ba.terms import LowFrequency, MovingObjects, Sinusoid, Transient, proposed
 from barpc.ba.terms.decay import Decay
 from barpc.ba.terms.step import Step, largest_part, open_ended
-from barpc.ba.terms.term import SIZE_PRICE, Finding, Residuals
+from barpc.ba.terms.term import SIZE_PRICE, Residuals, Term
 from barpc.sensor.image_corrections import profile
+from tests.ba.residuals import Displacement, decaying, residuals_of, settling, stepped
+from tests.lanes import rest_slow
 
 SIZE = np.array([[400.0, 500.0], [1000.0, 2000.0]])  # of two images, columns and rows
 
@@ -68,51 +70,40 @@ def test_a_strip_is_a_displacement_in_columns_and_one_in_rows(axis: int) -> None
     assert whole.where == (axis, -size, 2.0 * size, 0.0, 0.0)
 
 
-def test_what_fades_is_tried_on_both_sides_of_both_ends_over_halved_lengths(monkeypatch) -> None:
-    """The cheapest upwards and the cheapest downwards: here a script wants one origin and length of each."""
-    s, asked = seen(), list[tuple[float, float, float, float]]()
-
-    def first_guess(
-        few: Any, base: Any, extra: Any, own: np.ndarray, precision: np.ndarray
-    ) -> tuple[None, None, float]:
-        np.testing.assert_allclose(precision, 1.0)
-        return None, None, costs.pop(0) if costs else 50.0
-
-    monkeypatch.setattr(decay, "first_guess", first_guess)
-    local = Decay.at
-
-    def watched(residuals: Residuals, view: int, where: Any) -> Decay:
-        asked.append(where[1:])
-        return local(residuals, view, where)
-
-    monkeypatch.setattr(Decay, "at", watched)
-    costs = [9.0, 8.0, 7.0, 6.0, 5.0, 4.0]
-    up, down = Decay.propose(s, interval(500.0, 1000.0))
-    lengths = [(o, 1.0 / w) for _, _, o, w in asked]
-    # from 500 to the end at 2000 over what is at least half of 500, from 1000 to it, and the other way
-    upwards = [(500.0, 1500.0 / 2**n) for n in range(4)] + [(1000.0, 1000.0 / 2**n) for n in range(3)]
-    downwards = [(500.0, -500.0 / 2**n) for n in range(2)] + [(1000.0, -1000.0 / 2**n) for n in range(3)]
-    np.testing.assert_allclose(lengths, upwards + downwards)
-    assert {row[:2] for row in asked} == {(500.0, 4000.0), (1000.0, 4000.0), (-2000.0, 500.0), (-2000.0, 1000.0)}
-    assert up.where == (1, 1000.0, 4000.0, 1000.0, 1.0 / 500.0)  # the sixth was the cheapest
-    assert down.where == (1, -2000.0, 500.0, 500.0, -1.0 / 500.0)  # of equal ones the first
-    assert {one.NAME for one in (up, down)} == {"decay"}
-    assert up.price == pytest.approx(price(5) + 2.0 * SIZE_PRICE)
-    assert Decay.propose(s, interval(0.0, 100.0, axis=0)) == []
-    assert len(Decay.propose(s, interval(0.0, 2000.0))) == 2
+def beside_right_cameras(*moved: Displacement, tracks: int = 150) -> Residuals:
+    """Residuals beside a fit of which no camera has followed the displacement."""
+    return replace(residuals_of(*moved, tracks=tracks), base=residuals_of(tracks=tracks).base)
 
 
-def test_what_settles_is_tried_from_either_end_over_all_to_a_hundredth_of_an_image(monkeypatch) -> None:
-    s, rates = seen(), list[float]()
-    made = Transient.at_rate
-    monkeypatch.setattr(Transient, "at_rate", lambda *given: rates.append(given[1]) or made(*given))
-    costs = [0.0] * 16
-    costs[3] = -8.0  # what the fourth takes away
-    monkeypatch.setattr(decay, "first_guess", lambda *_: (None, None, costs.pop(0)))
-    (one,) = Transient.propose(s, interval(0.0, 1.0))
-    lengths = 1500.0 * 2.0 ** np.arange(-7.0, 1.0)
-    np.testing.assert_allclose(rates, np.concatenate([1.0 / lengths, -1.0 / lengths]))
-    assert one.where == (1, -np.inf, np.inf, 0.0, pytest.approx(1.0 / lengths[3]))
+@pytest.mark.parametrize(
+    ("origin", "length"),
+    # lengths are halved from the rest of the image on, to half of the interval at least
+    [(0.4, 0.6), (0.4, 0.15), (0.4, 0.075), (0.6, 0.1), (0.6, -0.6), (0.6, -0.075), (0.4, -0.1)],
+)
+def test_a_decay_is_proposed_from_the_end_of_an_interval_from_which_it_goes_and_with_its_length(origin, length) -> None:
+    s = beside_right_cameras(decaying(3.0, 1, origin, length))
+    told = Decay.propose(s, interval(8000.0, 12000.0))
+    assert [np.sign(one.where[4]) for one in told if one.where] == [1.0, -1.0]
+    one = told[0 if length > 0 else 1]
+    start, stop = (20000 * origin, 40000.0) if length > 0 else (-20000.0, 20000 * origin)
+    assert one.where == pytest.approx((1, start, stop, 20000 * origin, 1.0 / (20000 * length)))
+    assert (one.NAME, one.view) == ("decay", 1)
+    assert one.price == pytest.approx(price(s.linear.choices) + 2.0 * SIZE_PRICE)
+
+
+def test_a_decay_is_one_of_rows_and_a_whole_image_has_one_from_either_end() -> None:
+    s = residuals_of()
+    assert Decay.propose(s, interval(0.0, 1000.0, axis=0)) == []
+    down, up = Decay.propose(s, interval(0.0, 20000.0))
+    assert (down.where[3], up.where[3]) == (0.0, 20000.0)  # type: ignore[index]
+
+
+@pytest.mark.parametrize("length", rest_slow([2.0**-4, -(2.0**-3), 2.0**-7, -1.0]))
+def test_a_transient_is_proposed_from_its_end_with_its_length(length: float) -> None:
+    (one,) = Transient.propose(beside_right_cameras(settling(6.0, length), tracks=600), interval(0.0, 1.0))
+    assert one.where is not None
+    assert one.where[:4] == (1, -np.inf, np.inf, 0.0)
+    assert 1.0 / (20000 * one.where[4]) == pytest.approx(length)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -192,23 +183,23 @@ def test_a_swing_is_a_cosine_and_a_sine_in_columns_and_in_rows() -> None:
     assert one.price == pytest.approx(np.log(4.0 * 2000.0 / 32.0 * 5) + SIZE_PRICE)
 
 
-def test_what_is_proposed_once_is_not_again(monkeypatch) -> None:
-    said: list[tuple[str, Any]] = []
-    for kind in IN_IMAGES:
-        monkeypatch.setattr(kind, "propose", lambda seen, one, kind=kind: said.append((kind.NAME, one)) or [kind.NAME])
-    rows = [interval(0.0, 100.0), interval(0.0, 300.0), interval(0.0, 100.0, 0)]
-    assert list(proposed(seen(), rows, [])) == [
-        "step", "decay", "transient", "low_frequency", "step", "decay", "step", "decay", "low_frequency",
+def test_what_is_proposed_once_is_not_again() -> None:
+    """A part of an image once an interval, a curve once an image, what is of all images once."""
+    s = residuals_of(stepped(1.0, 1, 0.0, 0.3))
+    rows = [interval(0.0, 4000.0), interval(0.0, 6000.0), interval(0.0, 4000.0, 0), interval(0.0, 4000.0)]
+
+    def of(intervals: list[Interval], *kinds: Any) -> list[tuple[str, int]]:
+        return [(one.NAME, one.view) for one in (proposed(s, intervals, [], *kinds))]
+
+    part = [("step", 1), ("decay", 1), ("decay", 1)]
+    first = [("step", 1), *[("decay", 1)] * (len(Decay.propose(s, rows[0])))]
+    assert of(rows) == [
+        *first, ("transient", -1), ("low_frequency", 1), *part, *[(name, 0) for name, _ in first], ("low_frequency", 0),
     ]  # fmt: skip
-    assert [one for kind, one in said if kind == "low_frequency"] == [rows[0], rows[2]]
-    assert list(proposed(seen(), rows[:1], [], [kind for kind in IN_IMAGES if kind is not Decay])) == [
-        "step",
-        "transient",
-        "low_frequency",
-    ]
-    middle = [interval(0.0, 100.0), interval(500.0, 600.0)]
-    assert list(proposed(seen(), middle, [], [Step, Decay, Transient])) == ["step", "decay", "step", "decay"]
-    (only,) = proposed(seen(), [], [Period(0, 50.0, 1.0)])
+    assert of(rows[:1], [Step, Transient, LowFrequency]) == [("step", 1), ("transient", -1), ("low_frequency", 1)]
+    middle = [rows[0], interval(8000.0, 9000.0)]
+    assert of(middle, [Step, Transient]) == [("step", 1), ("step", 1)]
+    (only,) = proposed(s, [], [Period(0, 50.0, 1.0)])
     assert only.NAME == "sinusoid"
 
 
@@ -231,47 +222,68 @@ def test_all_begins_or_all_ends() -> None:
     ("gain", "part"),
     [([1, 1, -5, 2, 3, -1, 2, -9], (3, 6)), ([-1, -2, 3], (2, 2)), ([4, -1, 2], (0, 2)), ([-1, -1, -2], (0, 0))],
 )
-def test_thelargest_part_is_the_run_with_the_largest_sum(gain: list[int], part: tuple[int, int]) -> None:
+def test_the_largest_part_is_the_run_with_the_largest_sum(gain: list[int], part: tuple[int, int]) -> None:
     sums = {(i, j): sum(gain[i : j + 1]) for i in range(len(gain)) for j in range(i, len(gain))}
     assert largest_part(np.array(gain, dtype=float)) == part
     assert sums[part] == max(sums.values())
 
 
-def gains(monkeypatch, s: Residuals, inside: np.ndarray) -> list[np.ndarray]:
-    """Single ties of view 1 gain where they are `inside` and lose elsewhere; what they were asked with."""
-    asked: list[np.ndarray] = []
-
-    def log_likelihoods(linear: Any, residual: np.ndarray, found: MixtureFit) -> np.ndarray:
-        asked.append(residual)
-        return np.where(inside, 1.0, -1.0) if len(asked) % 2 else np.zeros(residual.shape[1])
-
-    monkeypatch.setattr(step, "log_likelihoods", log_likelihoods)
-    return asked
-
-
-def test_a_strip_ends_between_ties_and_is_as_wide_as_it_is_large(monkeypatch) -> None:
-    s = seen()
-    rows = s.place[1] / SIZE[1, s.linear.view]
-    one = Step.at(s, 1, (1, 500.0, 1000.0, 0.0, 0.0), 1.0)
-    inside = (rows > 0.3) & (rows < 0.6)
-    asked = gains(monkeypatch, s, inside)
-    others = np.full((2, 60), 0.5)
-    found = one.refined(s, fitted(60, [9.0, 3.0, -4.0], step=0.1), others)
-    assert found.where == pytest.approx((1, 0.3 * 2000, 0.6 * 2000, 0.0, 0.0))  # ties lie at 0.283, 0.317, ..
-    np.testing.assert_allclose(found.sigma, np.sqrt(12.5))
-    displaced, left = asked
-    np.testing.assert_allclose(left, 0.1 + 0.5 / 0.25)
-    mine = s.linear.view == 1
-    np.testing.assert_allclose(displaced - left, np.where(mine, [[3.0 / 0.25], [-4.0 / 0.25]], 0.0))
-    for size, sigma in ((0.01, 1.0 / 30.0), (99.0, 30.0)):
-        again = one.refined(s, fitted(60, [size, size]), others)
-        np.testing.assert_allclose(again.sigma, sigma)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_single_tie_gains_what_its_track_is_likelier_displaced(axis: int) -> None:
+    """By a fit with the term and another one, whose displacement is known; of a decay as if it were everywhere."""
+    s = residuals_of(stepped(1.0, 1, 0.4, 0.6, axis), stepped(2.0, 2, 0.1, 0.3))
+    other = Step.at(s, 2, (1, 2000.0, 6000.0, 0.0, 0.0))
+    for one in (
+        Step.at(s, 1, (axis, 0.3 * s.size[axis, 1], 0.7 * s.size[axis, 1], 0.0, 0.0)),
+        Decay.at(s, 1, (axis, 3000.0, 40000.0, 3000.0, 1.0 / 5000.0)),
+    ):
+        columns = np.concatenate([other.columns, one.columns], axis=1)
+        found = fit_mixture(s.linear, columns, np.ones(4), s.base)
+        others = np.einsum("cek,e->ck", other.columns, found.extra[:2])
+        place, gain = one.gains(s, found, others)
+        rows = np.flatnonzero(s.linear.view == 1)
+        rows = rows[np.argsort(s.place[axis, rows])]
+        np.testing.assert_array_equal(place, s.place[axis, rows])
+        for k in (0, 40, len(rows) - 1):
+            left = s.linear.left(found.step) + others / s.linear.sigma
+            before = log_likelihoods(s.linear, left, found)[rows[k]]
+            rate = one.where[4]  # type: ignore[index]
+            size = np.exp(-max((place[k] - 3000.0) * rate, 0.0)) if rate else 1.0
+            left[:, rows[k]] += found.extra[2:] * size / s.linear.sigma[rows[k]]
+            assert gain[k] == pytest.approx(log_likelihoods(s.linear, left, found)[rows[k]] - before, abs=1e-6)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_strip_at_an_end_goes_on_beyond_it(monkeypatch, axis: int) -> None:
+def test_a_step_ends_between_ties_and_its_prior_is_as_wide_as_it_is_large(axis: int) -> None:
+    s = residuals_of(stepped(1.0, 1, 0.4, 0.6, axis))
+    size = s.size[axis, 1]
+    one = Step.at(s, 1, (axis, 0.34 * size, 0.62 * size, 0.0, 0.0))
+    found = fit_mixture(s.linear, one.columns, one.sigma, s.base)
+    again = one.refined(s, found, np.zeros((2, 1)))
+    assert again.where is not None
+    place = np.sort(s.place[axis, s.linear.view == 1])
+    for end, true in zip(again.where[1:3], (0.4 * size, 0.6 * size), strict=True):
+        k, between = int(np.searchsorted(place, end)), 0.5 * (place[1:] + place[:-1])
+        assert end == pytest.approx(between[k - 1], abs=1e-6)
+        assert abs(k - int(np.searchsorted(place, true))) <= 1
+    np.testing.assert_allclose(again.sigma, np.sqrt((found.extra**2).mean()))
+    np.testing.assert_array_equal(again.columns, Step.at(s, 1, again.where).columns)
+
+
+def told(monkeypatch: pytest.MonkeyPatch, s: Residuals, one: Term, inside: np.ndarray) -> Any:
+    """Where a term is refined to if single ties of view 1 gain a nat inside and lose one elsewhere."""
+    axis = one.where[0]  # type: ignore[index]
+    rows = np.flatnonzero(s.linear.view == 1)
+    rows = rows[np.argsort(s.place[axis, rows])]
+    gain = np.where(inside, 1.0, -1.0)[rows]
+    monkeypatch.setattr(type(one), "gains", lambda *_: (s.place[axis, rows], gain))
+    return one.refined(s, fitted(60, [1.0, 2.0]), np.zeros((2, 60))).where
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_step_at_an_end_goes_on_beyond_it(monkeypatch, axis: int) -> None:
     s, size = seen(), SIZE[axis, 1]
-    one = Step.at(s, 1, (axis, 0.1 * size, 0.3 * size, 0.0, 0.0), 1.0)
+    one = Step.at(s, 1, (axis, 0.1 * size, 0.3 * size, 0.0, 0.0))
     part = s.place[axis] / SIZE[axis, s.linear.view]
     for inside, ends in (
         (part < 0.2, (-size, 0.2 * size)),
@@ -281,30 +293,23 @@ def test_a_strip_at_an_end_goes_on_beyond_it(monkeypatch, axis: int) -> None:
         ((part > 0.5) & (part < 0.7), (0.5 * size, 0.7 * size)),
         (part > 0.0, (-size, 2.0 * size)),
     ):
-        gains(monkeypatch, s, inside)
-        found = one.refined(s, fitted(60, [1.0, 1.0]), np.zeros((2, 60)))
-        assert found.where == pytest.approx((axis, *ends, 0.0, 0.0))
+        assert told(monkeypatch, s, one, inside) == pytest.approx((axis, *ends, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_fade_begins_where_ties_say(monkeypatch, sign: float) -> None:
-    """Of what it moves all is to be inside, on the side to which it fades."""
-    s = seen()
-    one = Decay.at(s, 1, (1, 300.0, 4000.0, 300.0, sign / 400.0), 1.0)
-    part = s.place[1] / SIZE[1, s.linear.view]
-    asked = gains(monkeypatch, s, part > 0.4 if sign > 0 else part < 0.4)
-    found = one.refined(s, fitted(60, [1.0, 2.0]), np.zeros((2, 60)))
-    ends = (800.0, 4000.0) if sign > 0 else (-2000.0, 800.0)
-    assert found.where == pytest.approx((1, *ends, 800.0, sign / 400.0))
-    assert found.NAME == "decay"
-    mine = s.linear.view == 1  # what fades is asked everywhere
-    everywhere = profile(s.place[1, mine], np.array(-np.inf), np.array(np.inf), np.array(300.0), np.array(sign / 400.0))
-    np.testing.assert_allclose((asked[0] - asked[1])[:, mine], np.array([[4.0], [8.0]]) * everywhere)
-    gains(monkeypatch, s, part > (-1.0 if sign > 0 else 2.0))
-    again = one.refined(s, fitted(60, [1.0, 2.0]), np.zeros((2, 60)))
-    assert again.where == pytest.approx(
-        (1, -2000.0, 4000.0, 0.0, sign / 400.0) if sign > 0 else (1, -2000.0, 0.0, 0.0, sign / 400.0)
-    )
+def test_a_decay_begins_where_all_that_gains_is_on_the_side_to_which_it_goes(monkeypatch, sign: float) -> None:
+    s, part = seen(), np.tile((np.arange(30) + 0.5) / 30, 2)
+    one = Decay.at(s, 1, (1, 300.0, 4000.0, 300.0, sign / 400.0))
+    for inside, place in (
+        (part > 0.4 if sign > 0 else part < 0.4, (800.0, 4000.0, 800.0) if sign > 0 else (-2000.0, 800.0, 800.0)),
+        (part > 0.0, (-2000.0, 4000.0, 0.0) if sign > 0 else (-2000.0, 4000.0, 2000.0)),
+        (part > 2.0, (4000.0, 4000.0, 2000.0) if sign > 0 else (-2000.0, -2000.0, 0.0)),
+    ):
+        found = told(monkeypatch, s, one, inside)
+        assert found[3] == pytest.approx(place[2])
+        if (part > 2.0).sum() == inside.sum():
+            continue
+        assert found == pytest.approx((1, *place, sign / 400.0))
 
 
 def test_what_settles_and_what_has_no_place_are_as_wide_as_they_are_large() -> None:
@@ -318,6 +323,8 @@ def test_what_settles_and_what_has_no_place_are_as_wide_as_they_are_large() -> N
     assert found.where == settles.where
     np.testing.assert_allclose(found.sigma, 2.0)
     np.testing.assert_array_equal(found.columns, settles.columns)
+    for size, sigma in ((0.01, 1.0 / 30.0), (99.0, 30.0)):
+        np.testing.assert_allclose(swing.refined(s, fitted(60, [size] * 4), np.zeros((2, 60))).sigma, sigma)
 
 
 @pytest.mark.parametrize("shape", ["strip", "up", "down"])
@@ -346,33 +353,59 @@ def test_rows_that_wander_like_a_strip_or_a_fade_are_tried_as_such(shape: str) -
         assert 1.0 / abs(told.where[4]) in (62.5, 125.0, 250.0, 500.0, 1000.0)
 
 
-# --- what is followed -------------------------------------------------------------------------------------------------
+# --- what is recorded -------------------------------------------------------------------------------------------------
 
 
-def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> None:
-    def found(kind: str, view: int, *unknowns: float, where: Any = None, period: float | None = None) -> Finding:
-        return Finding(kind, view, where, np.zeros(2), 9.0, 1.0, "", np.array(unknowns), period)
+SAID: Any = {"gain": 9.0, "gap": 1.0, "runner_up": "", "or_of": ()}
 
-    strip, fade = (1, 10.0, 20.0, 0.0, 0.0), (1, 30.0, 99.0, 30.0, 0.1)
-    parts = [
-        found("step", 2, 1.0, 2.0, where=strip),
-        found("sinusoid", 0, 3.0, 4.0, 5.0, 6.0, period=50.0),
-        found("decay", 2, 7.0, 8.0, where=fade),
-        found("transient", 1, 9.0, 10.0, where=fade),
-    ]
-    layout = image_terms._layout_of(parts, 4)
-    waves, params = layout.waves, layout.start
-    assert params is not None
-    assert waves.count == 0
-    assert waves.edges.shape == (4, 0)
-    assert waves.strips.shape == (4, 2, 5)
-    np.testing.assert_array_equal(waves.strips[2], [strip, fade])
-    np.testing.assert_array_equal(waves.strips[1, 0], fade)
-    assert np.isinf(waves.strips[[0, 3]]).all()
-    assert np.isinf(waves.strips[1, 1]).all()
-    np.testing.assert_array_equal(waves.periods, [[50.0], [np.inf], [np.inf], [np.inf]])
-    # columns of all strips, then rows; of swings too
-    np.testing.assert_array_equal(params[2], [1, 7, 2, 8, 0, 0, 0, 0])
-    np.testing.assert_array_equal(params[1], [9, 0, 10, 0, 0, 0, 0, 0])
-    np.testing.assert_array_equal(params[0], [0, 0, 0, 0, 3, 4, 5, 6])
-    assert not params[3].any()
+
+def test_a_record_has_the_size_in_columns_and_rows_of_what_is_displaced() -> None:
+    s = seen(600)
+    (step,) = Step.propose(s, interval(0.0, 500.0))
+    (one,) = step.findings(s, np.array([3.0, -4.0]), **SAID)
+    assert (one.kind, one.view, one.where, one.size.tolist()) == ("step", 1, step.where, [3.0, -4.0])
+    (one,) = Sinusoid.of(s, Period(1, 300.0, 9.0)).findings(s, np.array([3.0, -4.0, 5.0, 12.0]), **SAID)
+    assert (one.kind, one.period, one.size.tolist()) == ("sinusoid", 300.0, [5.0, 13.0])  # amplitudes
+    (curve,) = LowFrequency.propose(s, interval(0.0, 1.0))
+    unknowns = np.random.default_rng(0).normal(size=len(curve.sigma))
+    (one,) = curve.findings(s, unknowns, **SAID)
+    moved = np.einsum("cek,e->ck", curve.columns, unknowns)[:, s.linear.view == 1]
+    np.testing.assert_allclose(one.size, np.sqrt((moved**2).mean(axis=1)))
+    (first, second) = Transient.at_rate(s, 0.01, 1.0).findings(s, np.arange(4.0), **SAID)
+    assert (first.kind, first.view, second.view, second.size.tolist()) == ("transient", 0, 1, [2.0, 3.0])
+    assert first.where == (1, -1000.0, 2000.0, 0.0, 0.01)
+    assert all(row.gain == 9.0 for row in (first, second))
+
+
+def test_a_decay_may_be_a_step_of_its_rows_and_no_other_term_is_simpler() -> None:
+    s = seen()
+    one = Decay.at(s, 1, (1, 800.0, 4000.0, 800.0, 1.0 / 400.0), 3.0)
+    plain = one.simpler(s)
+    assert (plain.NAME, plain.view, plain.where) == ("step", 1, (1, 800.0, 4000.0, 0.0, 0.0))
+    np.testing.assert_array_equal(plain.sigma, [3.0, 3.0])
+    np.testing.assert_array_equal(plain.columns[0, 0], (s.linear.view == 1) & (s.place[1] >= 800.0))
+    assert plain.price == pytest.approx(one.price - SIZE_PRICE)
+    assert plain.simpler(s) is None
+    assert Transient.at_rate(s, 0.01, 1.0).simpler(s) is None
+
+
+def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
+    s = seen()
+    assert Step.at(s, 1, (1, 0.0, 1000.0, 0.0, 0.0)).share(s) == pytest.approx(0.5)
+    assert Step.at(s, 7, (1, 0.0, 1000.0, 0.0, 0.0)).share(s) == 0.0
+    assert Transient.at_rate(s, 0.01, 1.0).share(s) == 1.0
+
+
+def test_floors_are_those_of_an_amplitude_and_of_a_mean_motion() -> None:
+    swing = Sinusoid.of(seen(), Period(1, 300.0, 9.0))
+    assert swing.amplitude(fitted(60, [7.0, 0.36, 0.48, 0.48, 0.64])) == pytest.approx(1.0)
+    by_move = np.zeros((2, 1, 6))
+    by_move[0, 0, [0, 1]], by_move[1, 0, 2] = [1.0, 50.0], 7.0  # a mean square of 25, of those that move
+    group: Any = SimpleNamespace(by_move=by_move)
+    one = MovingObjects(-1, np.zeros((2, 0, 6)), np.zeros(0), 0.0, group=group)
+    moving = np.array([0.6, 0.4, 0.9, 0.0, 0.0, 0.0])
+    found: Any = SimpleNamespace(moving=moving, move=np.array([0.05]))
+    assert one.amplitude(found) == pytest.approx(0.25)
+    found.moving = 0.5 * np.ones(6)
+    assert one.amplitude(found) == np.inf
+    assert Step.at(seen(), 1, (1, 0.0, 9.0, 0.0, 0.0)).amplitude(fitted(60, [0.0, 0.0])) == np.inf
