@@ -43,9 +43,8 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.sparse import bsr_array, coo_matrix
 from scipy.sparse.linalg import splu
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, solution
 from barpc.ba.constraints.block import join, make_problem
-from barpc.ba.judging import solution
 from barpc.ba.robust.systematic_residuals import Smooth
 from barpc.ba.solving import structure
 from barpc.ba.solving.linear import Cholesky

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.judging import agreement as sets
-from barpc.ba.judging import solution
-from barpc.ba.judging.agreement import Agreement, Offsets, agreement, offsets_of
-from barpc.ba.judging.snooping import ControlTest
-from barpc.ba.judging.solution import Solution
+from barpc.ba import AdjustOptions, adjust_tracks, solution
+from barpc.ba.control import agreement as sets
+from barpc.ba.control.agreement import Agreement, Offsets, agreement, offsets_of
+from barpc.ba.control.snooping import ControlTest
+from barpc.ba.solution import Solution
 from barpc.base.geodesy import enu_basis
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
@@ -212,7 +211,7 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
         return taken[-1][2]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("barpc.ba.judging.solution.offsets_of", spy)
+        patch.setattr("barpc.ba.solution.offsets_of", spy)
         options = AdjustOptions(drift=0, jitter="off", **INDEPENDENT)
         adjust_tracks(block.views, block.tracks, options, gcps, centers=centers_of(block), hold_out=False)
     covariance, first, offsets = taken[-1]
@@ -295,7 +294,7 @@ def raised(block: Any, gcps: GroundPoints) -> tuple[Any, float]:
 
 def believing(patch: pytest.MonkeyPatch) -> None:
     """Let every control point pass as one that agrees with all others."""
-    patch.setattr("barpc.ba.judging.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool)))
+    patch.setattr("barpc.ba.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool)))
 
 
 @pytest.mark.landing(1)
@@ -314,7 +313,7 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     wrong = replace(gcps, lonlatalt=lonlatalt, xy=xy)
     believing(monkeypatch)
     with monkeypatch.context() as patch:
-        patch.setattr("barpc.ba.judging.solution.is_better", lambda *_: False)
+        patch.setattr("barpc.ba.solution.is_better", lambda *_: False)
         torn = raised(block, wrong)[1]
     one, rise = raised(block, wrong)
     assert torn > 0.04
@@ -376,7 +375,7 @@ def test_control_that_is_right_is_not_let_go_where_the_images_are_worse_with_it_
 ) -> None:
     block = simulate_block(3, 400, seed=5, num_gcps=6)
     assert adjust_tracks(block.views, block.tracks, None, block.gcps).control.used.all()
-    monkeypatch.setattr("barpc.ba.judging.solution.is_better", lambda *_: True)  # by however little
+    monkeypatch.setattr("barpc.ba.solution.is_better", lambda *_: True)  # by however little
     one = adjust_tracks(block.views, block.tracks, None, block.gcps)
     assert one.control.used.all()
     assert not one.control.torn

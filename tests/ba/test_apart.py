@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment, apart
-from barpc.ba.apart import find_apart
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
 from barpc.ba.resection import RpcDiagnosis
+from barpc.ba.select import foreign_camera, models
+from barpc.ba.select.foreign_camera import find_foreign_camera
+from barpc.ba.select.parts import Parts
 from barpc.base.errors import AdjustError
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
@@ -76,7 +78,7 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, chan
     if look == "height":  # a prior tells of one view where the others agree, which a pair always does
         assert adjust_tracks(block.views, block.tracks).apart is None
     if look != "axes":
-        monkeypatch.setattr(apart, "_TELLING", 2)
+        monkeypatch.setattr(foreign_camera, "_TELLING", 2)
     found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
     assert found.apart is not None
     assert found.apart.views == (2,)
@@ -114,10 +116,10 @@ def test_nothing_is_tried_where_the_block_agrees(monkeypatch) -> None:
     tried: list[Any] = []
 
     def watched(first: Any, block: Any, outer: Any, options: Any, solve: Any) -> Any:
-        tried.append(find_apart(first, block, outer, options, no_solve))
+        tried.append(find_foreign_camera(first, block, outer, options, no_solve))
         return tried[-1]
 
-    monkeypatch.setattr(adjustment, "find_apart", watched)
+    monkeypatch.setattr(models, "find_foreign_camera", watched)
     made = simulate_block(3, 400, seed=3, attitude=10e-6, position=2.0)
     wrong = np.random.default_rng(1).uniform(size=len(made.tracks)) < 0.1
     noisy = replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * [9.0, -14.0])
@@ -165,7 +167,7 @@ def test_of_two_views_whose_ties_are_all_wrong_too_few_agree(num: int) -> None:
 @pytest.mark.parametrize("given", [{"loss": "linear"}, {"model": "affine"}, {"drift": 0}])
 def test_who_asks_for_less_than_cameras_have_gets_it_of_all(given) -> None:
     block: Any = SimpleNamespace(views=(None,) * 4)
-    assert find_apart(None, block, block, AdjustOptions(**given), pytest.fail) == (None, None)
+    assert find_foreign_camera(None, block, block, AdjustOptions(**given), pytest.fail) == (None, None)
 
 
 def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> Any:
@@ -180,13 +182,13 @@ def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> A
         told = {"contradicted": lambda _: contradicted[view], "is_coherent": lambda _: True}
         return SimpleNamespace(meets=False, squared=np.zeros(200), **told)
 
-    monkeypatch.setattr(apart, "_leave_one_view_out", agreeing)
-    monkeypatch.setattr(apart, "resect", placed)
-    monkeypatch.setattr(apart.LeaveOneOut, "usual", 0.02)
-    monkeypatch.setattr(apart, "_tie_evidence", lambda one, block: evidence[one.view])
-    monkeypatch.setattr(apart, "diagnose_rpc", lambda *_: "looked")
+    monkeypatch.setattr(foreign_camera, "_leave_one_view_out", agreeing)
+    monkeypatch.setattr(foreign_camera, "resect", placed)
+    monkeypatch.setattr(foreign_camera.LeaveOneOut, "usual", 0.02)
+    monkeypatch.setattr(foreign_camera, "_tie_evidence", lambda one, block: evidence[one.view])
+    monkeypatch.setattr(foreign_camera, "diagnose_rpc", lambda *_: "looked")
     block: Any = SimpleNamespace(views=(None,) * num, names=tuple("abcdef"[:num]))
-    return find_apart(None, block, block, AdjustOptions(), pytest.fail)
+    return find_foreign_camera(None, block, block, AdjustOptions(), pytest.fail)
 
 
 def test_of_two_views_as_likely_none_is_taken_out(monkeypatch) -> None:
@@ -212,9 +214,9 @@ def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkey
         assert linear.area == linear.image == pytest.approx(5e4)
         return SimpleNamespace(evidence=50.0)
 
-    monkeypatch.setattr(apart, "around", looked)
-    monkeypatch.setattr(apart, "fit_mixture", fitted)
-    monkeypatch.setattr(apart, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
+    monkeypatch.setattr(foreign_camera, "linearised_among", looked)
+    monkeypatch.setattr(foreign_camera, "fit_mixture", fitted)
+    monkeypatch.setattr(foreign_camera, "replace", lambda of, **more: SimpleNamespace(**{**vars(of), **more}))
     rest = SimpleNamespace(views=(None,) * 2)
     outcome = SimpleNamespace(problem=SimpleNamespace(camera_prior="learnt"))
     found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(camera_prior="stated"))
@@ -222,17 +224,17 @@ def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkey
     block: Any = SimpleNamespace(
         use=np.arange(11) > 0, point=np.arange(11), num_tracks=10, views=size, sigma=np.full(11, 0.2)
     )
-    assert apart._tie_evidence(SimpleNamespace(found=found, block=rest), block) == pytest.approx(worth)  # type: ignore[arg-type]
+    assert foreign_camera._tie_evidence(SimpleNamespace(found=found, block=rest), block) == pytest.approx(worth)  # type: ignore[arg-type]
     ((problem, given, views),) = asked
     assert (problem.camera_prior, given, views) == ("stated", rest, [0, 1])
 
 
 @pytest.mark.parametrize(("lost", "own"), [(0.3, 0.6), (0.7, 0.7), (1.0, 0.999)])
 def test_the_gain_of_an_own_share_is_that_of_two_binomials_less_the_choice(monkeypatch, lost, own) -> None:
-    monkeypatch.setattr(apart.LeaveOneOut, "usual", 0.02)
+    monkeypatch.setattr(foreign_camera.LeaveOneOut, "usual", 0.02)
     placed: Any = SimpleNamespace(squared=np.zeros(200))
     block: Any = SimpleNamespace(views=(None,) * 4)
-    one = apart.LeaveOneOut(1, block, None, placed, 0.6, True)  # type: ignore[arg-type]
+    one = foreign_camera.LeaveOneOut(1, block, None, placed, 0.6, True)  # type: ignore[arg-type]
     expected = 200 * (own * np.log(own / 0.02) + (1.0 - own) * np.log((1.0 - own) / 0.98)) - np.log(4.0)
     assert one.gain(lost) == pytest.approx(expected)
 
@@ -248,7 +250,7 @@ def test_a_block_of_which_one_of_several_is_wrong_is_refused_with_their_names(mo
 
     told: Any = SimpleNamespace(views=(0, 2), clear=False)
     monkeypatch.setattr(adjustment, "solve_block", fails)
-    monkeypatch.setattr(adjustment, "find_apart", lambda *_: (told, None))
+    monkeypatch.setattr(models, "find_foreign_camera", lambda *_: (told, None))
     made = simulate_block(3, 60, seed=3)
     with pytest.raises(AdjustError, match=f"Without any one of {made.views[0].name}, {made.views[2].name} "):
         adjust_tracks(made.views, made.tracks)
@@ -322,8 +324,8 @@ def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> No
         inlier[: 4 - kept] = False
         found: Any = SimpleNamespace(outcome=SimpleNamespace(inlier=inlier))
         group = np.where(np.arange(12) == 11, int(moves), 0)
-        assert apart.Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 0) == own
-        assert apart.Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 1) == (not moves)
+        assert Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 0) == own
+        assert Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 1) == (not moves)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +340,7 @@ def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> No
     ],
 )
 def test_what_sees_the_place_may_be_its_own(look: RpcDiagnosis, placed: Any, views: tuple[int, ...], own: bool) -> None:
-    assert apart.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
+    assert foreign_camera.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
-from barpc.ba.judging.explanations import FADE, LOCAL, STRIP, SWING, TRANSIENT, WANDER
 from barpc.scene import Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import Splined
@@ -63,7 +62,7 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
         block, tracks = flawed(3, 1500, where)
         found = adjusted(block, tracks)
     one = found.findings[0]
-    assert (one.kind, one.view) == (STRIP, where["view"])
+    assert (one.kind, one.view) == ("step", where["view"])
     assert len(found.findings) == 1
     assert found.apart is None  # no RPC of another image
     assert one.where is not None
@@ -91,7 +90,7 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
 def test_two_of_them_in_two_images_are_both_found() -> None:
     block, tracks = flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0})
     found = adjusted(block, tracks)
-    assert {(one.kind, one.view) for one in found.findings} == {(STRIP, 1), (STRIP, 2)}
+    assert {(one.kind, one.view) for one in found.findings} == {("step", 1), ("step", 2)}
     assert all(one.share < 0.1 and one.off < 0.03 for one in found.left)  # ties beside an end
 
 
@@ -100,7 +99,7 @@ def test_what_fades_is_named_with_its_length() -> None:
     where = {"view": 1, "axis": 1, "start": 0.0, "stop": 1.1, "px": 4.0, "length": 0.05}
     block, tracks = flawed(3, 2500, where)
     found = adjusted(block, tracks)
-    assert [(one.kind, one.view) for one in found.findings] == [(FADE, 1)]
+    assert [(one.kind, one.view) for one in found.findings] == [("decay", 1)]
     assert found.findings[0].where is not None
     rows = block.views[1].size[1]
     assert 1.0 / found.findings[0].where[4] == pytest.approx(0.05 * rows, rel=0.25)
@@ -118,7 +117,7 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     angle = np.array([0.3, 1.9, 3.7, 5.2])[block.tracks.view]
     moved = 8.0 * np.exp(-away / 0.02) * np.array([np.cos(angle), np.sin(angle)])
     found = adjusted(block, replace(block.tracks, xy=block.tracks.xy + moved.T))
-    assert [one.kind for one in found.findings] == [TRANSIENT] * 4
+    assert [one.kind for one in found.findings] == ["transient"] * 4
     assert sorted(one.view for one in found.findings) == [0, 1, 2, 3]
     for one in found.findings:
         assert one.where is not None
@@ -147,7 +146,7 @@ def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[fl
     block, tracks = swung(3, 1500, px, period)
     found = adjusted(block, tracks)
     (one,) = found.findings
-    assert (one.kind, one.view, one.where) == (SWING, 1, None)
+    assert (one.kind, one.view, one.where) == ("sinusoid", 1, None)
     rows = block.views[1].size[1]
     assert one.period is not None
     assert rows / one.period == pytest.approx(rows / period, abs=0.2)  # waves of the image
@@ -170,7 +169,7 @@ def test_of_a_pair_a_swing_is_that_of_one_or_of_either() -> None:
     block, tracks = swung(2, 2000, 0.2, 300.0)
     found = adjusted(block, tracks)
     (one,) = found.findings
-    assert one.kind == SWING
+    assert one.kind == "sinusoid"
     assert 1 in (one.view, *one.or_of)
     assert one.period == pytest.approx(300.0, rel=0.02)
     assert 0.03 < np.hypot(*one.size) < 0.22  # what lies along epipolar lines is not seen
@@ -191,7 +190,7 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
     where = {"view": 0, "axis": 1, "start": 0.6, "stop": 1.1, "px": 25.0, "length": 0.8}
     block, tracks = flawed(2, 1500, where)
     found = adjusted(block, tracks)
-    assert found.findings[0].kind == FADE
+    assert found.findings[0].kind == "decay"
     assert found.inlier[~found.held_out].mean() > 0.95
     assert np.nanmax(found.held_out_rms) < 0.16
 
@@ -221,8 +220,8 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     u = xy[:, 1] / rows
     xy[:, 0] += (block.tracks.view == 1) * 0.6 * (np.sin(17.0 * u + 1.0) + np.cos(11.0 * u))
     found = adjusted(block, replace(block.tracks, xy=xy))
-    assert found.findings[0].kind == WANDER
-    assert not any(one.kind in LOCAL for one in found.findings)
+    assert found.findings[0].kind == "low_frequency"
+    assert not any(one.kind in ("step", "decay") for one in found.findings)
     at = np.linspace(0.0, rows - 1.0, 300)
     size = [
         s.correction.at(np.column_stack([at, at]))[:, 0].std() if isinstance(s, Splined) else 0.0 for s in found.sensors
@@ -258,7 +257,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("7-th leading minor")
 
-    monkeypatch.setattr("barpc.ba.judging.judge.fit_mixture", fails)
+    monkeypatch.setattr("barpc.ba.select.search.fit_mixture", fails)
     found = adjusted(*flawed(3, 400, MIDDLE))
     assert not found.findings
     assert {one.view for one in found.left} == {1}  # and what stands out is still said
@@ -273,10 +272,10 @@ def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -
     swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
     given = replace(tracks, xy=tracks.xy + view[:, None] * swung)
     found = adjusted(block, given)
-    assert {(one.kind in LOCAL, one.kind == SWING, one.view) for one in found.findings} == {
+    assert {(one.kind in ("step", "decay"), one.kind == "sinusoid", one.view) for one in found.findings} == {
         (True, False, 30), (False, True, 55),
     }  # fmt: skip
-    by_kind = {one.kind == SWING: one for one in found.findings}
+    by_kind = {one.kind == "sinusoid": one for one in found.findings}
     assert by_kind[True].period == pytest.approx(rows / 7.0, rel=0.01)
     assert np.hypot(*by_kind[True].size) == pytest.approx(0.8, abs=0.05)
     assert by_kind[False].where is not None

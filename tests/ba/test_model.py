@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks, adjustment, block_prior
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
+from barpc.ba import solution as solved
 from barpc.ba.constraints.block import first_state, join, make_problem
-from barpc.ba.judging import solution as solved
-from barpc.ba.judging.judge import Selection
-from barpc.ba.judging.solution import Solution
 from barpc.ba.robust.rounds import Outcome
+from barpc.ba.select import models
+from barpc.ba.select.beam import Selection
+from barpc.ba.solution import Solution
 from barpc.ba.solving.structure import make_structure
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
@@ -47,15 +48,15 @@ def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **giv
         said = {"is_skew": skew, "has_trend": trend, "has_waves": False, "tested": None, "goes_on": prior is not None}
         return SimpleNamespace(**said, after=after, model=options.model, problem=in_space, outcome=None)
 
-    monkeypatch.setattr(adjustment, "standing_out", lambda *_: [])
-    monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Selection()))
+    monkeypatch.setattr(models, "standing_out", lambda *_: [])
+    monkeypatch.setattr(models, "with_splines", lambda found, *_: found)
+    monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
+    monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
     options = AdjustOptions(**given)
     first: Any = by_script(None, None, options)
-    found, in_space, _ = adjustment._choose_model(first, parts, options, by_script)
-    return found.model, in_space, asked
+    model: Any = models._select_beside(first, parts, options, by_script)
+    return model.found.model, model.in_space_rms, asked
 
 
 @pytest.mark.parametrize(
@@ -121,15 +122,13 @@ def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypa
         asked.append("strips")
         return found
 
-    monkeypatch.setattr(adjustment, "standing_out", lambda *_: out)
-    monkeypatch.setattr(adjustment, "follow", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_strips", without_strips)
-    monkeypatch.setattr(adjustment, "without_moving", without_moving)
+    monkeypatch.setattr(models, "standing_out", lambda *_: out)
+    monkeypatch.setattr(models, "with_splines", lambda found, *_: found)
+    monkeypatch.setattr(models, "with_terms", without_strips)
+    monkeypatch.setattr(models, "_without_moving_ground", without_moving)
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    found, in_space, _ = adjustment._choose_model(
-        solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block
-    )
-    assert (found.model, in_space) == ("affine", 1.0)
+    model: Any = models._select_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    assert (model.found.model, model.in_space_rms) == ("affine", 1.0)
     assert asked == (["moving", "strips"] if judged else [])
 
 
@@ -516,14 +515,12 @@ def followed(
         assert found.name == "auto"
         return SimpleNamespace(name="followed", after=SimpleNamespace(error=error))
 
-    monkeypatch.setattr(adjustment, "follow", follow)
-    monkeypatch.setattr(adjustment, "without_strips", lambda found, *_: found)
-    monkeypatch.setattr(adjustment, "without_moving", lambda found, parts, *_: (found, parts, Selection()))
+    monkeypatch.setattr(models, "with_splines", follow)
+    monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
+    monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    found, left, _ = adjustment._choose_model(
-        solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block
-    )
-    return found.name, left
+    model: Any = models._select_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    return model.found.name, model.in_space_rms
 
 
 def test_what_follows_the_model_in_space_is_taken_before_an_affine_that_is_not_much_better(

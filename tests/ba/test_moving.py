@@ -10,18 +10,17 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.apart import Parts
 from barpc.ba.constraints.block import Block as Joined
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, Mixture, fit_mixture
 from barpc.ba.evidence.mixture import moving as moving_of
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.judging import explanations, moving
-from barpc.ba.judging.explanations import MOVING, STRIP
-from barpc.ba.judging.moving import GROUND_CELLS, GroundMotion, group_of, members
+from barpc.ba.select.parts import Parts
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
+from barpc.ba.terms import MovingObjects, moving_ground
+from barpc.ba.terms.moving_ground import GROUND_CELLS, GroundMotion, group_of, members
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.base.statistics import LEVEL
 from barpc.scene import BoolArray, GroundPoints, Tracks
@@ -143,10 +142,15 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     seen: Any = SimpleNamespace(
         linear=linear, ground=ground, base=fit_mixture(linear), extra=nothing, sigma=np.zeros(0)
     )
-    (one,) = explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True))
+    (one,) = MovingObjects.propose(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True))
     group = one.group
     assert group is not None
-    assert (one.kind, one.view, one.extra.shape[1], len(one.sigma)) == (MOVING, -1, 0, 0)  # no unknowns of a camera
+    assert (one.NAME, one.view, one.columns.shape[1], len(one.sigma)) == (
+        "moving_objects",
+        -1,
+        0,
+        0,
+    )  # no unknowns of a camera
     tracks_of = {(cell, point) for cell, point in zip(group.cell.tolist(), block.point.tolist(), strict=True)}
     counts = np.unique([cell for cell, _ in tracks_of], return_counts=True)[1]
     assert one.price == pytest.approx(0.5 * np.log(counts).sum(), rel=0.05)  # but for tracks that take no part
@@ -167,8 +171,8 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     base = replace(base, right=np.where(moves[block.order] & cut, 0.1, np.maximum(base.right, 0.6)))
     by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.full(len(cell), 0.5))
-    shares = list(moving._first_shares(linear, group, base, none, np.zeros(0)))
-    assert len(shares) == moving._STARTS + cut
+    shares = list(moving_ground._first_shares(linear, group, base, none, np.zeros(0)))
+    assert len(shares) == moving_ground._STARTS + cut
     assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
     inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]
     assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
@@ -184,12 +188,12 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     ground, none = GroundMotion.of(problem, state), np.zeros((2, 0, len(block.view)))
     base, by_move, cell = fit_mixture(linear), ground.by_moves(block.view, 3), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(4, 30.0), cell, np.full(len(cell), 0.5))
-    gains = moving._region_gains(linear, group, base, none, np.zeros(0))
+    gains = moving_ground._region_gains(linear, group, base, none, np.zeros(0))
     curvature, _, across = Mixture(linear, none, np.zeros(0), base).scores(by_move, cell, GROUND_CELLS**2)
     best = np.argsort(-gains)[[0, 10, 100]]
     assert gains[best[0]] > 20.0
     for n in best:
-        region = moving._REGIONS[n]
+        region = moving_ground._REGIONS[n]
         part = across[region].sum(axis=0)
         room = np.eye(4) + 30.0**2 * (curvature[region].sum(axis=0) - part.T @ part)
         found = fit_mixture(linear, by_move * region[cell], group.sigma, base)
@@ -198,9 +202,9 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
 
 
 def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("barpc.ba.judging.moving.proposal", lambda *_: None)
+    monkeypatch.setattr("barpc.ba.terms.moving_ground.proposal", lambda *_: None)
     seen: Any = SimpleNamespace(linear=SimpleNamespace(view=np.zeros(3, dtype=int)), ground=0, base=0, extra=0, sigma=0)
-    assert explanations.group(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True)) == []
+    assert MovingObjects.propose(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True)) == []
 
 
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
@@ -240,7 +244,7 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
             asked.append(part)
             return part.point % share == 0
 
-        monkeypatch.setattr("barpc.ba.apart.members", of_share)
+        monkeypatch.setattr("barpc.ba.select.parts.members", of_share)
         one: Any = SimpleNamespace(member=parts.inner.point % share == 0)
         gone = (parts.group == 0) & (block.point % share == 0)
         less = parts.less(found, one)
@@ -267,7 +271,7 @@ def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
         xy_sigma=np.full(24, 0.2),
     )
     found = adjust_tracks(made.views, tracks, gcps=gcps)
-    (one,) = [f for f in found.findings if f.kind == MOVING]
+    (one,) = [f for f in found.findings if f.kind == "moving_objects"]
     assert one.motion is not None
     assert one.motion.gcps == ("P0", "P1", "P2")
     assert found.control is not None
@@ -304,7 +308,7 @@ def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float,
     views, part, metres, seed, outliers = case
     block, tracks, moves = drifting(views, 900, part, metres, seed, outliers=outliers)
     found, without = (adjust_tracks(block.views, ties) for ties in (tracks, tracks.select(~moves)))
-    (one,) = [f for f in found.findings if f.kind == MOVING]
+    (one,) = [f for f in found.findings if f.kind == "moving_objects"]
     assert one.motion is not None
     assert one.motion.share == pytest.approx(part, abs=0.03)
     assert one.motion.metres == pytest.approx(metres, rel=0.15)
@@ -345,7 +349,7 @@ def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
     ties, size = block.tracks, block.views[1].size[axis]
     inside = (ties.view == 1) & (ties.xy[:, axis] < 0.35 * size)
     found = adjust_tracks(block.views, replace(ties, xy=ties.xy + inside[:, None] * [1.0, 1.5]))
-    assert [one.kind for one in found.findings] == [STRIP]
+    assert [one.kind for one in found.findings] == ["step"]
     assert not found.moving.any()
 
 

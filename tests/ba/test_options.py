@@ -131,7 +131,7 @@ def run(
 ) -> Adjustment:
     terrain = None if dem is None else lambda lon, lat: np.full(len(lon), dem)
     # among ties of twice the stated noise a foreign RPC is looked for in every run: test_apart.py
-    unasked = mock.patch("barpc.ba.adjustment.find_apart", return_value=(None, None))
+    unasked = mock.patch("barpc.ba.select.models.find_foreign_camera", return_value=(None, None))
     with warnings.catch_warnings(), unasked, chosen(AdjustOptions, **{**BASE, **options}) as given:
         warnings.simplefilter("ignore", BarpcWarning)
         centers = centers_of(block)

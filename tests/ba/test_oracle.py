@@ -14,8 +14,8 @@ from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.constraints.gauge import MOTIONS, _modes, datum_shares, gauge_report
 from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control
-from barpc.ba.judging import snooping
-from barpc.ba.judging.snooping import image_test
+from barpc.ba.control import snooping
+from barpc.ba.control.snooping import image_test
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence import periods
-from barpc.ba.evidence.periods import price_of_period, find_periods
+from barpc.ba.evidence.periods import find_periods, price_of_period
 from barpc.base.statistics import SURE
 
 

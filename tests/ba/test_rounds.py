@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import AdjustOptions, adjust_tracks, solution
 from barpc.ba.constraints.block import first_state, join, make_problem
-from barpc.ba.judging import solution
 from barpc.ba.parameters.priors import CameraPrior
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _weighted_median

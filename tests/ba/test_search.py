@@ -1,47 +1,219 @@
-"""The search for explanations: what are rivals, what is the same, what ends it, by made-up gains."""
+"""The search for terms, on residuals of simulated blocks with known displacements: what is named, and what not."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from barpc.ba import AdjustOptions
+from barpc.ba.constraints.block import Block, join
+from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.judging import judge as judging
-from barpc.ba.judging.explanations import FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER, BlockResiduals, Explanation
-from barpc.ba.judging.judge import (
-    _amplitude,
-    _differs,
-    _ExplanationSearch,
-    _image_share,
-    _neighbour_views,
-    _of_one_image,
-    _rival_states,
-    _same,
-    _SearchState,
-    _TakenExplanation,
-    _uncovered,
-    _with_findings,
-)
+from barpc.ba.robust.rounds import Outcome
+from barpc.ba.select import anomalies, search
+from barpc.ba.select.beam import Selection, TermSearch, _of_one_image, _rivals, _same, _SearchState, _Taken, _uncovered
+from barpc.ba.select.search import linearised_among, search_terms
+from barpc.ba.solution import solve_block
+from barpc.ba.terms import TERMS
+from barpc.ba.terms.term import Finding, Residuals, Term
 from barpc.base.statistics import SURE
+from barpc.simulate import simulate_block
+from tests.ba.residuals import (
+    DIRECTION,
+    Displacement,
+    celled,
+    decaying,
+    residuals_at,
+    residuals_of,
+    settling,
+    stepped,
+    swinging,
+)
+from tests.ba.test_moving import drifting
+from tests.lanes import rest_slow
 
-VIEW = np.array([0, 0, 0, 0, 1, 1])
+FLOOR = 0.05  # px
+STEP, SWING = stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 1, 20.0)
+
+
+def searched(seen: Residuals, *first: Interval, floor: float = FLOOR) -> Selection:
+    """The terms of residuals, of which intervals stood out before."""
+    return TermSearch(seen, list(first), floor, float(np.median(seen.linear.sigma))).run()
+
+
+def kinds(found: Selection) -> list[tuple[str, int]]:
+    return [(one.kind, one.view) for one in found.findings]
 
 
 def interval(start: float, stop: float, view: int = 0, axis: int = 1, by_share: bool = False) -> Interval:
     return Interval(view, axis, start, stop, 9.0, 0.1, 0.5, by_share)
 
 
-def explained(kind: str, view: int = 0, start: float = 0.0, stop: float = 9.0, **given: Any) -> Explanation:
-    """An explanation of two unknowns that moves the observations 0, 1, .. of `rows`, the first by default."""
-    extra = np.zeros((2, 2, len(VIEW)))
-    extra[1, 1, given.pop("rows", [0])] = 1.0
-    where = None if kind in (SWING, MOVING) else (given.pop("axis", 1), start, stop, 0.0, 0.0)
-    return Explanation(kind, view, extra, np.full(2, 0.5), given.pop("price", 0.0), where, **given)
+# --- what is named ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", rest_slow([1, 2]))
+@pytest.mark.parametrize(
+    ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str
+)
+def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start, stop, seed) -> None:
+    seen = residuals_of(stepped(1.0, view, start, stop, axis), seed=seed)
+    found = searched(seen)
+    (one,) = found.findings
+    assert (one.kind, one.view, one.or_of) == ("step", view, ())
+    assert one.where is not None
+    assert one.where[0] == axis
+    at = seen.place[axis, seen.linear.view == view]
+    true = (at >= start * seen.size[axis, view]) & (at < stop * seen.size[axis, view])
+    inside = (at >= one.where[1]) & (at < one.where[2])
+    assert (inside != true).sum() <= 2
+    np.testing.assert_allclose(one.size, DIRECTION[:, 0], atol=0.13)
+    assert one.gain > 100.0
+    assert 0.0 < one.gap < one.gain
+    assert (found.right > 0.5).mean() > 0.98  # those that were displaced, too
+    assert found.step.shape == (3, seen.linear.residual.size and found.step.shape[1])
+
+
+@pytest.mark.parametrize("seed", rest_slow([1, 2]))
+@pytest.mark.parametrize(("view", "origin", "length"), [(2, 0.4, 0.2), (0, 0.5, -0.15)], ids=str)
+def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, seed) -> None:
+    seen = residuals_of(decaying(3.0, view, origin, length), seed=seed)
+    (one,) = searched(seen).findings
+    assert (one.kind, one.view) == ("decay", view)
+    assert one.where is not None
+    assert one.where[3] == pytest.approx(origin * 20000, abs=200)
+    assert 1.0 / (one.where[4] * 20000) == pytest.approx(length, rel=0.12)
+    np.testing.assert_allclose(one.size, 3.0 * DIRECTION[:, 0], rtol=0.06)
+
+
+@pytest.mark.parametrize("length", rest_slow([0.05, -0.05]))
+def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
+    seen = residuals_of(settling(6.0, length), views=4, tracks=200)
+    found = searched(seen)
+    assert [(one.kind, one.view) for one in found.findings] == [("transient", v) for v in range(4)]
+    for one in found.findings:
+        assert one.where is not None
+        assert one.where[3:] == pytest.approx((0.0 if length > 0 else 20000.0, 1.0 / (length * 20000)), rel=0.05)
+    # what all images have in common is the ground's
+    assert max(float(np.hypot(*one.size)) for one in found.findings) == pytest.approx(6.0, rel=0.15)
+    assert (found.right > 0.5).mean() > 0.98
+
+
+def test_a_sinusoid_is_found_with_its_image_period_and_amplitude() -> None:
+    for seed in (1, 2):
+        (one,) = searched(residuals_of(swinging(0.4, 1, 20.0), seed=seed)).findings
+        assert (one.kind, one.view, one.where, one.or_of) == ("sinusoid", 1, None, ())
+        assert one.period == pytest.approx(1000.0, abs=6.0)
+        np.testing.assert_allclose(one.size, 0.4 * DIRECTION[:, 0], atol=0.05)
+    (one,) = searched(residuals_of(swinging(0.5, 1, 20.0), views=2, tracks=300, seed=2)).findings
+    assert (one.view, one.runner_up) == (1, "sinusoid")  # of a pair the part across epipolar lines is seen
+    assert 0.4 < np.hypot(*one.size) < 0.52
+
+
+def test_of_a_part_and_the_rest_of_an_image_the_smaller_is_displaced() -> None:
+    for part in (0.1, 0.2):
+        seen = residuals_of(stepped(3.0, 1, part, 1.1), views=2, tracks=300)
+        (one,) = searched(seen, interval(0.0, 20000 * part, 1)).findings
+        assert one.kind == "step"
+        assert one.where is not None
+        assert one.where[1:3] == pytest.approx((-20000.0, 20000 * part), abs=100.0)
+
+
+@pytest.mark.parametrize(
+    "more",
+    rest_slow([[stepped(2.0, 2, 0.25, 0.4, 0)], [stepped(2.0, 2, 0.25, 0.4, 0), swinging(0.5, 0, 20.0)]]),
+    ids=len,
+)
+def test_several_terms_are_found_each_with_its_own_unknowns_and_by_a_sample_of_tracks_the_same(more) -> None:
+    seen = residuals_of(stepped(1.0, 1, 0.4, 0.6), *more, tracks=100 + 75 * len(more))
+    found = searched(seen)
+    assert sorted(kinds(found)) == [("sinusoid", 0), ("step", 1), ("step", 2)][2 - len(more) :]
+    assert all(one.gain > 50.0 for one in found.findings)
+    by_view = {one.view: one for one in found.findings}
+    for view, px in ((1, 1.0), (2, 2.0)):
+        np.testing.assert_allclose(by_view[view].unknowns, px * DIRECTION[:, 0], atol=0.25 * px)
+    if 0 in by_view:
+        assert by_view[0].unknowns.shape == (4,)
+        np.testing.assert_allclose(by_view[0].size, 0.5 * DIRECTION[:, 0], atol=0.08)
+    again = searched(replace(seen, few=seen.linear.thinned(100)))
+    assert [one.where for one in again.findings] == [one.where for one in found.findings]
+
+
+@pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0]))
+def test_nothing_is_found_in_sound_residuals_though_intervals_are_asked_about(outliers) -> None:
+    found = searched(residuals_of(outliers=outliers), interval(4000.0, 8000.0, 1), interval(0.0, 1000.0, by_share=True))
+    assert found.findings == ()
+    assert found.step.size == found.right.size == 0
+
+
+def test_errors_that_neighbours_share_are_no_term_and_hide_none() -> None:
+    assert kinds(searched(residuals_of(celled(0.3, 1), tracks=400), interval(4000.0, 8000.0, 1))) == []
+    assert kinds(searched(residuals_of(STEP, celled(0.2, 0), tracks=300))) == [("step", 1)]
+
+
+@pytest.mark.slow
+def test_a_sinusoid_or_a_motion_is_taken_from_two_and_a_half_floors_on() -> None:
+    """The same residuals, of a sinusoid of 0.16 px and of ground that moved, and floors below and above."""
+    seen = residuals_of(swinging(0.16, 1, 20.0), tracks=400)
+    (one,) = searched(seen).findings
+    size = float(np.hypot(*one.size))
+    assert size == pytest.approx(0.16, abs=0.02)
+    assert kinds(searched(seen, floor=size / 2.6)) == [("sinusoid", 1)]
+    assert ("sinusoid", 1) not in kinds(searched(seen, floor=size / 2.4))
+    assert kinds(searched(seen, floor=size / 1.7)) == []
+    moved, _ = moving()
+    assert ("moving_objects", -1) in kinds(searched(moved, interval(10000.0, 20000.0, 1), floor=0.2))
+    assert ("moving_objects", -1) not in kinds(searched(moved, interval(10000.0, 20000.0, 1), floor=3.0))
+
+
+@cache
+def moving(*beside: Displacement) -> tuple[Residuals, np.ndarray]:
+    """Residuals of a block of which a tenth of the ground moves by 2 m; the observations there."""
+    made, tracks, moves = drifting(3, 300, 0.1, 2.0)
+    block = join(made.views, tracks, None, AdjustOptions())
+    return residuals_at(block, *beside), moves[block.order]
+
+
+def test_ground_that_moves_is_the_last_term_and_no_camera_follows_it() -> None:
+    seen, moves = moving()
+    found = searched(seen, interval(10000.0, 20000.0, 1))
+    (one,) = found.findings
+    assert (one.kind, one.view, one.where, one.gap > 100.0) == ("moving_objects", -1, None, True)
+    assert one.moved is not None
+    np.testing.assert_array_equal(one.moved.member, moves)
+    np.testing.assert_array_equal(found.step, seen.base.step)  # cameras, and what is right, are as without it
+    np.testing.assert_array_equal(found.right, seen.base.right)
+
+
+@pytest.mark.slow
+def test_ground_that_moves_is_found_beside_a_sinusoid_and_the_cameras_are_those_of_the_sinusoid() -> None:
+    both, moves = moving(swinging(1.0, 1, 20.0))
+    found = searched(both, interval(10000.0, 20000.0, 1))
+    assert [one.kind for one in found.findings] == ["sinusoid", "moving_objects"]
+    assert found.findings[1].moved is not None
+    assert (found.findings[1].moved.member == moves).mean() > 0.99
+    assert np.abs(found.step - both.base.step).max() > 0.0  # as with the sinusoid alone
+    assert (found.right[~moves] > 0.5).mean() > 0.98
+
+
+# --- rivals and ends, by gains that are given ------------------------------------------------------------------------
+
+
+VIEW = np.array([0, 0, 0, 0, 1, 1])
+
+
+def term(kind: str, view: int = 0, start: float = 0.0, stop: float = 9.0, **given: Any) -> Term:
+    """A term of two unknowns that displaces the observations `rows`, the first by default."""
+    columns = np.zeros((2, 2, len(VIEW)))
+    columns[1, 1, given.pop("rows", [0])] = 1.0
+    where = None if kind in ("sinusoid", "moving_objects") else (given.pop("axis", 1), start, stop, 0.0, 0.0)
+    return TERMS[kind](view, columns, np.full(2, 0.5), given.pop("price", 0.0), where, **given)
 
 
 def fitted(evidence: float = 0.0, extra: Any = (), **given: Any) -> MixtureFit:
@@ -49,20 +221,17 @@ def fitted(evidence: float = 0.0, extra: Any = (), **given: Any) -> MixtureFit:
     return replace(MixtureFit(evidence, np.zeros((2, 3)), np.array(extra), 1.0, np.zeros(2), np.ones(n)), **given)
 
 
-def seen() -> BlockResiduals:
+def seen_of() -> Residuals:
     linear: Any = SimpleNamespace(view=VIEW, sigma=np.ones(len(VIEW)))
-    other: Any = SimpleNamespace(view=VIEW)
-    nothing: Any = None
-    return BlockResiduals(
-        linear, other, nothing, np.zeros((2, 6)), np.ones((2, 2)), fitted(), np.zeros((2, 0, 6)), np.zeros(0)
+    none: Any = None
+    return Residuals(
+        linear, linear, none, np.zeros((2, 6)), np.ones((2, 2)), fitted(), np.zeros((2, 0, 6)), np.zeros(0)
     )
 
 
-def taken(gain: float, kind: str = STRIP, view: int = 0, gap: float = 1.0) -> _TakenExplanation:
-    return _TakenExplanation(explained(kind, view), gain, gap, "", (), seen())
-
-
-# --- intervals and explanations that are the same ---------------------------------------------------------------------
+def state(*gains: float, kind: str = "step", view: int = 0, **given: Any) -> _SearchState:
+    taken = tuple(_Taken(term(kind, view), gain, 1.0, "", (), seen_of()) for gain in gains)
+    return _SearchState(seen_of(), fitted(), taken, **given)
 
 
 @pytest.mark.parametrize(
@@ -79,74 +248,53 @@ def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
     assert _same(interval(*one), interval(*other)) == _same(interval(*other), interval(*one)) == same
     assert not _same(interval(*one), interval(*other, view=1))
     assert not _same(interval(*one), interval(*other, axis=0))
+    rows = [interval(*one), interval(*other), interval(50, 60)]
+    assert _uncovered(rows) == ([rows[0], rows[2]] if same else rows)
 
 
-def test_of_intervals_that_are_the_same_the_first_stays() -> None:
-    rows = [interval(0, 10), interval(0, 12), interval(50, 60), interval(1, 10), interval(49, 61)]
-    assert _uncovered(rows) == [rows[0], rows[2]]
-
-
-def test_explanations_differ_by_kind_view_axis_and_rows_that_do_not_overlap() -> None:
-    one = explained(STRIP, 0, 2.0, 5.0)
-    assert not _differs(one, explained(STRIP, 0, 4.9, 9.0))
-    assert not _differs(explained(STRIP, 0, 4.9, 9.0), one)
-    assert _differs(one, explained(STRIP, 0, 5.0, 9.0))
-    assert _differs(explained(STRIP, 0, 5.0, 9.0), one)
-    assert _differs(one, explained(STRIP, 0, 2.0, 5.0, axis=0))
-    assert _differs(one, explained(STRIP, 1, 2.0, 5.0))
-    assert _differs(one, explained(FADE, 0, 2.0, 5.0))
-    assert not _differs(explained(SWING), explained(SWING))
-    assert _differs(explained(SWING), explained(SWING, 1))
-    assert not _differs(replace(one, where=None), one)
-    assert not _differs(one, replace(one, where=None))
+def test_terms_differ_by_kind_view_axis_and_rows_that_do_not_overlap() -> None:
+    one = term("step", 0, 2.0, 5.0)
+    for other, differs in (
+        (term("step", 0, 4.9, 9.0), False),
+        (term("step", 0, 5.0, 9.0), True),
+        (term("step", 0, 2.0, 5.0, axis=0), True),
+        (term("step", 1, 2.0, 5.0), True),
+        (term("decay", 0, 2.0, 5.0), True),
+        (replace(one, where=None), False),
+    ):
+        assert one.differs(other) == other.differs(one) == differs
+    assert not term("sinusoid").differs(term("sinusoid"))
+    assert term("sinusoid").differs(term("sinusoid", 1))
 
 
 def test_a_part_and_its_complement_are_of_one_image() -> None:
-    strip, fade, swing = explained(STRIP), explained(FADE), explained(SWING)
-    assert _of_one_image(strip, fade)
-    assert _of_one_image(fade, explained(STRIP))
-    assert _of_one_image(swing, swing)
-    assert not _of_one_image(swing, explained(SWING))
-    assert not _of_one_image(strip, swing)
-    assert not _of_one_image(swing, strip)
-    assert not _of_one_image(strip, explained(FADE, 1))
-
-
-def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
-    assert _image_share(explained(STRIP, 0, rows=[0, 1, 2, 4]), seen()) == pytest.approx(3 / 4)
-    assert _image_share(explained(STRIP, 1, rows=[0, 4]), seen()) == pytest.approx(1 / 2)
-    assert _image_share(explained(TRANSIENT, -1, rows=[0, 4]), seen()) == pytest.approx(2 / 6)
-    assert _image_share(explained(STRIP, 7, rows=[0]), seen()) == 0.0
-
-
-def test_a_swing_s_amplitude_is_that_of_a_cosine_and_a_sine_each_in_columns_and_rows() -> None:
-    np.testing.assert_allclose(_amplitude(np.array([3.0, -4.0, 5.0, 12.0])), [5.0, 13.0])
+    step, swing = term("step"), term("sinusoid")
+    for one, other, same in (
+        (step, term("decay"), True),
+        (swing, swing, True),
+        (swing, term("sinusoid"), False),
+        (step, swing, False),
+        (step, term("decay", 1), False),
+    ):
+        assert _of_one_image(one, other) == _of_one_image(other, one) == same
 
 
 def test_rivals_are_the_best_of_other_kinds_or_images_with_more_than_a_third_of_the_gain() -> None:
-    def of(*rows: tuple[Explanation, float]) -> list[int]:
-        return _rival_states([(one, fitted(), gain) for one, gain in rows])
+    def of(*rows: tuple[Term, float]) -> list[int]:
+        return _rivals([(one, fitted(), gain) for one, gain in rows])
 
-    first = (explained(STRIP, 0, 0.0, 5.0), 30.0)
+    first, swing, decay = (term("step", 0, 0.0, 5.0), 30.0), term("sinusoid"), term("decay")
     assert of(first) == []
-    assert of(first, (explained(FADE), 10.0)) == []
-    assert of(first, (explained(FADE), 10.1)) == [1]
-    assert of(first, (explained(STRIP, 0, 1.0, 6.0), 29.0), (explained(STRIP, 0, 5.0, 6.0), 28.0)) == [2]
-    assert of(first, (explained(MOVING, -1), 29.0), (explained(WANDER), 28.0), (explained(TRANSIENT, -1), 27.0)) == [3]
-    assert of(first, (explained(FADE), 20.0), (explained(FADE), 19.0), (explained(FADE, 1), 18.0)) == [1, 3]
-    assert of(first, (explained(FADE), 20.0), (explained(SWING), 19.0), (explained(FADE, 1), 18.0)) == [1, 2]
+    assert of(first, (decay, 10.0)) == []
+    assert of(first, (decay, 10.1)) == [1]
+    assert of(first, (term("step", 0, 1.0, 6.0), 29.0), (term("step", 0, 5.0, 6.0), 28.0)) == [2]
+    followed = term("transient", -1), 27.0
+    assert of(first, (term("moving_objects", -1), 29.0), (term("low_frequency"), 28.0), followed) == [3]
+    assert of(first, (decay, 20.0), (term("decay"), 19.0), (term("decay", 1), 18.0)) == [1, 3]
+    assert of(first, (decay, 20.0), (swing, 19.0), (term("decay", 1), 18.0)) == [1, 2]
 
 
-# --- states -----------------------------------------------------------------------------------------------------------
-
-
-def state(*gains: float, **given: Any) -> _SearchState:
-    return _SearchState(seen(), fitted(), tuple(taken(gain) for gain in gains), **given)
-
-
-def test_a_state_may_pass_another_with_as_many_more_as_that_has_and_two() -> None:
-    assert state(50.0, 20.0).gain == 70.0
-    assert state().gain == 0.0
+def test_a_combination_may_pass_another_with_as_many_more_as_that_has_and_two() -> None:
     for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):  # 30 and three of 30
         assert state(30.0).may_pass(state(*best)) == may
     for best, may in (((79.0,), True), ((80.0,), False)):  # 40 + 20 and one of 20
@@ -154,575 +302,246 @@ def test_a_state_may_pass_another_with_as_many_more_as_that_has_and_two() -> Non
 
 
 def test_what_gains_as_much_beside_the_best_is_no_other_way() -> None:
-    best = _SearchState(seen(), fitted(), (taken(60.0, SWING, 1),))
-    other = _SearchState(seen(), fitted(), (taken(30.0, FADE),))
-    same = explained(FADE)
+    best, other, same = state(60.0, kind="sinusoid", view=1), state(30.0, kind="decay"), term("decay")
     assert other.adds_to(best, [(same, fitted(), 30.0 - SURE + 0.1)])
     assert not other.adds_to(best, [(same, fitted(), 30.0 - SURE)])
-    assert not other.adds_to(best, [(explained(FADE, 1), fitted(), 40.0)])
-    assert not other.adds_to(best, [(explained(STRIP), fitted(), 40.0)])
+    assert not other.adds_to(best, [(term("decay", 1), fitted(), 40.0), (term("step"), fitted(), 40.0)])
     assert not other.adds_to(best, [])
-    assert other.adds_to(best, [(explained(STRIP), fitted(), 90.0), (same, fitted(), 29.0), (same, fitted(), 2.0)])
-    behind = replace(other, taken=(taken(50.0, SWING), *other.taken))
+    assert other.adds_to(best, [(term("step"), fitted(), 90.0), (same, fitted(), 29.0), (same, fitted(), 2.0)])
+    before = state(50.0, kind="sinusoid").taken
+    behind = replace(other, taken=(*before, *other.taken))
     assert not behind.adds_to(best, [(same, fitted(), 30.0)])  # what went before is another
-    beside = replace(best, taken=(taken(50.0, SWING), *best.taken))
-    assert behind.adds_to(beside, [(same, fitted(), 30.0)])
-    small = replace(other, taken=(taken(4.0, FADE),))
-    assert small.adds_to(best, [])  # of less than is sure there is always as much
+    assert behind.adds_to(replace(best, taken=(*before, *best.taken)), [(same, fitted(), 30.0)])
+    assert state(4.0, kind="decay").adds_to(best, [])  # of less than is sure there is always as much
 
 
 @pytest.mark.parametrize(("second", "smaller"), [(25.1, True), (25.0, False)])
 def test_of_two_parts_of_an_image_that_are_as_good_the_smaller_one_is_taken(second: float, smaller: bool) -> None:
-    large, small = explained(STRIP, rows=[0, 1, 2]), explained(FADE, rows=[3])
-    made, other = fitted(1.0), fitted(2.0)
-    found = state().added([(large, made, 30.0), (small, other, second), (explained(SWING, 1), fitted(), 12.0)])
+    large, small, made, other = term("step", rows=[0, 1, 2]), term("decay", rows=[3]), fitted(1.0), fitted(2.0)
+    assert (large.share(seen_of()), small.share(seen_of())) == (3 / 4, 1 / 4)
+    found = state().added([(large, made, 30.0), (small, other, second), (term("sinusoid", 1), fitted(), 12.0)])
     last = found.taken[-1]
-    assert last.one is (small if smaller else large)
+    assert last.term is (small if smaller else large)
     assert last.gain == (second if smaller else 30.0)
     assert last.gap == pytest.approx(second - 30.0 if smaller else 30.0 - second)
-    assert last.runner_up == (STRIP if smaller else FADE)
+    assert last.runner_up == ("step" if smaller else "decay")
     assert found.seen.base is found.followed is (other if smaller else made)
-    np.testing.assert_array_equal(found.seen.extra, last.one.extra)
+    np.testing.assert_array_equal(found.seen.extra, last.term.columns)
     np.testing.assert_array_equal(found.seen.sigma, [0.5, 0.5])
-    assert not found.ended
 
 
 def test_what_is_taken_stands_behind_what_was_and_the_rest_are_its_rivals() -> None:
-    before = state(40.0)
+    before, one = state(40.0), term("step", 1, rows=[4])
     before = replace(before, seen=replace(before.seen, extra=np.ones((2, 1, 6)), sigma=np.array([0.3])))
-    one = explained(STRIP, 1, rows=[4])
     found = before.added([(one, fitted(), 20.0), (replace(one), fitted(), 18.0)])
-    assert (found.taken[0], found.taken[1].one) == (before.taken[0], one)
+    assert (found.taken[0], found.taken[1].term) == (before.taken[0], one)
     assert (found.taken[1].gap, found.taken[1].runner_up) == (20.0, "")  # the same rows again are no rival
-    np.testing.assert_array_equal(found.seen.extra, np.concatenate([np.ones((2, 1, 6)), one.extra], axis=1))
+    np.testing.assert_array_equal(found.seen.extra, np.concatenate([np.ones((2, 1, 6)), one.columns], axis=1))
     np.testing.assert_array_equal(found.seen.sigma, [0.3, 0.5, 0.5])
-    beaten = before.added([(one, fitted(), 20.0), (explained(SWING), fitted(), -3.0)])
-    assert beaten.taken[1].gap == 20.0  # over nothing, where the runner-up is worse than it
-    pairs = before.added([(one, fitted(), 20.0), (explained(SWING), fitted(), 7.0), (explained(FADE), fitted(), 8.0)])
-    assert (pairs.taken[1].gap, pairs.taken[1].runner_up) == (12.0, FADE)
+    # over nothing, where the runner-up is worse than it
+    assert before.added([(one, fitted(), 20.0), (term("sinusoid"), fitted(), -3.0)]).taken[1].gap == 20.0
+    swings = [(term("sinusoid", v), fitted(), gain) for v, gain in ((5, 30.0), (3, 26.0), (2, 25.1), (1, 25.0))]
+    assert state().added([*swings, (term("step"), fitted(), 29.0)]).taken[0].or_of == (2, 3)
+    assert state().added([(term("step"), fitted(), 31.0), *swings]).taken[0].or_of == ()
 
 
-def test_swings_that_are_as_good_in_other_images_are_named() -> None:
-    tried = [
-        (explained(SWING, 5), fitted(), 30.0),
-        (explained(SWING, 3), fitted(), 26.0),
-        (explained(SWING, 2), fitted(), 25.1),
-        (explained(SWING, 1), fitted(), 25.0),
-        (explained(STRIP, 0), fitted(), 29.0),
-    ]
-    assert state().added(tried).taken[0].or_of == (2, 3)
-    assert state().added(tried[-1:] + tried[:1]).taken[0].or_of == ()
-
-
-@pytest.mark.parametrize(("kind", "before", "ended"), [(STRIP, 4, False), (STRIP, 5, True), (MOVING, 0, True)])
-def test_a_search_ends_with_six_or_with_what_is_not_followed(kind: str, before: int, ended: bool) -> None:
+@pytest.mark.parametrize(
+    ("kind", "before", "ended"), [("step", 4, False), ("step", 5, True), ("moving_objects", 0, True)]
+)
+def test_a_search_ends_with_six_terms_or_with_one_that_no_camera_follows(kind: str, before: int, ended: bool) -> None:
     first, made = state(*[9.0] * before), fitted(1.0)
-    found = first.added([(explained(kind), made, 20.0)])
+    found = first.added([(term(kind), made, 20.0)])
     assert found.ended == ended
     assert found.seen.base is made
-    assert found.followed is (first.followed if kind == MOVING else made)
+    assert found.followed is (first.followed if kind == "moving_objects" else made)
 
 
-# --- the search -------------------------------------------------------------------------------------------------------
+def test_a_term_that_was_not_the_best_by_itself_is_sure_by_what_all_gain_together() -> None:
+    one = state(30.0, 12.0)
+    seen = replace(one.seen, base=fitted(extra=[1.0, 2.0, 3.0, 4.0]))
+    taken = replace(one.taken[0], gap=-2.0), replace(one.taken[1], gap=3.0)
+    first, second = replace(one, seen=seen, taken=taken).findings(7.0)
+    assert (first.gap, second.gap, first.gain) == (7.0, 3.0, 30.0)
+    assert (first.unknowns.tolist(), second.unknowns.tolist()) == ([1.0, 2.0], [3.0, 4.0])
 
 
-def search(**given: Any) -> _ExplanationSearch:
-    return _ExplanationSearch(given.pop("seen", seen()), given.pop("first", []), given.pop("floor", 0.1), 0.1)
+# --- of a block that was solved ---------------------------------------------------------------------------------------
 
 
-def test_what_ends_as_best_is_sure_by_what_the_next_ones_lack(monkeypatch) -> None:
-    """Where it was not the best by itself; all that are followed have their cameras and probabilities."""
-
-    monkeypatch.setattr(judging, "_simplified", lambda state: state)
-
-    def ran(*states: _SearchState) -> tuple[list[_TakenExplanation], Any]:
-        monkeypatch.setattr(_ExplanationSearch, "_grown", lambda self, before: (list(states), True))
-        monkeypatch.setattr(judging, "_findings_of", lambda rows, n, seen: [rows[n]])
-        noise = iter([shared, *beside])
-        monkeypatch.setattr(judging, "_by_neighbours", lambda seen: next(noise))
-        found = search().run()
-        return list(found.findings), found  # type: ignore[arg-type]
-
-    shared, beside = 41.9, [11.9]
-    last, earlier = fitted(right=np.zeros(6)), fitted(step=np.ones((2, 3)))
-    one = _SearchState(replace(seen(), base=last), earlier, (taken(30.0, gap=-2.0), taken(12.0, FADE, gap=3.0)))
-    rows, found = ran(one, state(35.0))
-    assert [row.gap for row in rows] == [7.0, 3.0]
-    assert found.right is last.right
-    assert found.step is last.step
-    assert [row.gap for row in ran(one)[0]] == [42.0, 3.0]
-    shared = 29.0
-    assert [row.gap for row in ran(replace(one, taken=(taken(30.0, gap=0.0),)))[0]] == [30.0]
-    moves, found = ran(replace(one, taken=(taken(30.0), taken(12.0, MOVING, -1))))
-    assert len(moves) == 2
-    assert found.step is earlier.step
-    assert found.right is earlier.right
-    shared, beside = 41.9, [12.0]  # beside the first it explains as much as the second: that stays out
-    rows, found = ran(one)
-    assert [row.gain for row in rows] == [30.0]
-    shared = 42.0  # noise that neighbours share explains as much as all that was taken
-    rows, found = ran(one)
-    assert rows == []
-    assert found.step.size == found.right.size == 0
+@dataclass(frozen=True, eq=False)
+class Solved:
+    block: Block
+    outcome: Outcome
 
 
-def test_what_neighbours_share_is_asked_of_right_ties_in_stated_deviations(monkeypatch) -> None:
-    """Two tracks of three views and one of two: of 16 residuals 3 + 3 + 1 are free."""
-    tracks = [SimpleNamespace(rows=np.array([[0, 1, 2], [3, 4, 5]])), SimpleNamespace(rows=np.array([[6, 7]]))]
-    view = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])  # the last takes no part
-    linear: Any = SimpleNamespace(view=view, tracks=tracks, left=lambda step: np.zeros((2, 9)), sigma=np.ones(9))
-    off, asked = np.zeros((2, 9)), list[Any]()
-    monkeypatch.setattr(judging, "off_from_right", lambda *_: (off, None))
-
-    def told(*given: Any) -> Any:
-        asked.append(given)
-        return np.array([8.0, 0.0, 8.0])
-
-    monkeypatch.setattr(judging, "shared_errors", told)
-    size = np.full((2, 3), 100.0)
-    base = fitted(right=np.ones(9), noise=7.0)
-    place, extra = np.arange(18.0).reshape(2, 9), np.zeros((2, 0, 9))
-    one = replace(seen(), linear=linear, base=base, place=place, size=size, extra=extra)
-    assert judging._by_neighbours(one) == pytest.approx(16.0 * 7 / 16)
-    of_view, place, _, values = asked.pop()
-    assert of_view.tolist() == view[:8].tolist()
-    np.testing.assert_array_equal(place, np.arange(18.0).reshape(2, 9)[:, :8])
-    assert values.shape == (2, 8)
-    off[0, 6] = 5.1  # what is larger is no noise, whatever the noise of all is
-    assert judging._by_neighbours(one) == pytest.approx(16.0 * (1.0 - 1.5 * 3 / 7))
-    assert asked.pop()[0].tolist() == [0, 1, 2, 0, 1, 2, 1]
+@cache
+def solved(*moved: Displacement, views: int = 3, tracks: int = 250) -> Solved:
+    made = simulate_block(views, tracks, seed=3, attitude=1e-6, position=0.2)
+    size = np.array([view.size for view in made.views], dtype=np.float64)
+    at = (made.tracks.xy / size[made.tracks.view]).T
+    away = sum((one(made.tracks.view, at) for one in moved), np.zeros((2, 1)))
+    options = AdjustOptions()
+    block = join(made.views, replace(made.tracks, xy=made.tracks.xy + away.T), None, options)
+    none = block.without(np.ones(len(block.view), dtype=bool))
+    return Solved(block, solve_block(block, none, options, None, None, None).outcome)
 
 
-def grown(
-    monkeypatch, states: list[_SearchState], *tried: list[tuple[Explanation, float]]
-) -> tuple[list[_SearchState], bool]:
-    """States with one more each, where so much is tried, in turn."""
-    left = [[(one, fitted(), gain) for one, gain in rows] for rows in tried]
-    monkeypatch.setattr(_ExplanationSearch, "_tried", lambda self: left.pop(0))
-    found = search()._grown(states)
-    assert not left
-    return found
+def test_rows_that_stand_out_are_said_in_pixels_from_the_floor_on_and_looked_for_once() -> None:
+    one = solved(STEP)
+    found = anomalies.standing_out(one.outcome, one.block, FLOOR)
+    assert found
+    assert found[0].view == 1
+    assert (found[0].start, found[0].stop) == pytest.approx((8000.0, 12000.0), abs=600.0)
+    assert all(row.gain > SURE for row in found)
+    assert anomalies.standing_out(one.outcome, one.block, FLOOR) is found
+    means = [row for row in anomalies.standing_out(one.outcome, one.block, 0.0) if not row.by_share]
+    assert all(0.0 < row.off < 2.1 for row in means)  # no more than what is displaced
+    assert not [row for row in anomalies.standing_out(one.outcome, one.block, 3.0) if not row.by_share]
+    sound = solved()
+    assert anomalies.standing_out(sound.outcome, sound.block, FLOOR) == []
+    assert anomalies.left_over(sound.outcome, sound.block, FLOOR) == []
+    # what was cut there lies off by what it is displaced, as the tracks of the others see it
+    left = anomalies.left_over(one.outcome, one.block, FLOOR)
+    apart = [row.apart for row in left if row.by_share and row.view == 1]
+    assert apart
+    assert 0.8 < max(apart) < 2.2
 
 
-def whats(states: list[_SearchState]) -> list[list[tuple[str, int]]]:
-    return [[row.what for row in one.taken] for one in states]
+def test_periods_and_errors_that_neighbours_share_are_measured_by_the_ties_that_were_kept() -> None:
+    one, sound, celled_ = solved(SWING), solved(), solved(celled(0.3, 1), tracks=400)
+    (period,) = [row for row in anomalies.periods_of(one.outcome, one.block) if row.view == 1]
+    assert period.period == pytest.approx(1000.0, abs=6.0)
+    assert anomalies.periods_of(sound.outcome, sound.block) == []
+    assert anomalies.correlated_noise_gain(sound.outcome, sound.block) < 2.0
+    assert anomalies.correlated_noise_gain(celled_.outcome, celled_.block) > 50.0
+    # means of cells are none of an image's part
+    means = anomalies.standing_out(celled_.outcome, celled_.block, FLOOR)
+    gain = anomalies.correlated_noise_gain(celled_.outcome, celled_.block)
+    expected = [row for row in means if row.by_share or row.gain > gain]
+    assert len(anomalies.left_over(celled_.outcome, celled_.block, FLOOR)) == len(expected)
 
 
-def test_a_search_goes_on_with_the_best_and_its_rivals(monkeypatch) -> None:
-    rows = [(explained(STRIP), 30.0), (explained(SWING, 1), 11.0), (explained(FADE, 1), 9.0), (explained(WANDER), 20.0)]
-    found, ended = grown(monkeypatch, [state()], rows)
-    assert whats(found) == [[(STRIP, 0)], [(SWING, 1)]]
-    assert not ended
-    assert found[1].taken[0].gap == pytest.approx(11.0 - 30.0)
-    many = [(explained(kind, view), 30.0 - view) for view in range(3) for kind in (STRIP, SWING)]
-    assert whats(grown(monkeypatch, [state()], many)[0]) == [[(STRIP, 0)], [(SWING, 0)], [(STRIP, 1)]]
+def test_of_n_views_two_n_less_three_residuals_of_a_track_are_free_of_what_neighbours_share() -> None:
+    """Tracks of two views have one of four; what is no outlier, and right, counts."""
+    rng = np.random.default_rng(0)
+    place, view, size = rng.uniform(0, 1000, (2, 600)), np.arange(600) % 3, np.full((2, 3), 1000.0)
+    off = celled(2.0, 1)(view, place / 1000.0) + rng.normal(0, 1, (2, 600))
+    right = rng.random(600) < 0.9
+    used = right & (np.hypot(*off) < 5.0)
+    whole = float(shared_errors(view[used], place[:, used], size, off[:, used]).sum())
+    assert whole > 30.0
+    for many, track in ((3, np.arange(600) // 3), (2, np.arange(600) // 2)):
+        found = anomalies.correlated_log_ratio(view, place, size, off, right, track)
+        free = 1.0 - 1.5 * len(np.unique(track[used])) / used.sum()
+        assert found == pytest.approx(free * whole)
+        assert 0.0 < free < 1.0 - 1.5 / many + 1e-9
+    assert anomalies.correlated_log_ratio(view, place, size, off, np.zeros(600, dtype=bool), track) == 0.0
 
 
-def test_a_search_ends_where_nothing_gains_enough(monkeypatch) -> None:
-    best = state(30.0)
-    found, ended = grown(monkeypatch, [best, state(12.0)], [(explained(SWING), SURE)])
-    assert ended
-    assert found[0] is best
-    again, ended = grown(monkeypatch, [best], [(explained(SWING), SURE + 0.1)])
-    assert not ended
-    assert whats(again) == [[(STRIP, 0), (SWING, 0)]]
+def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
+    block: Any = SimpleNamespace(point=np.array([0, 0, 0, 1, 1, 2]), num_points=4)
+    outcome: Any = SimpleNamespace(inlier=np.array([True, True, False, True, False, True]))
+    np.testing.assert_array_equal(anomalies._confirmed_observations(outcome, block), [1, 1, 1, 0, 0, 0])
 
 
-def test_another_way_that_finds_nothing_more_has_ended(monkeypatch) -> None:
-    best, other = state(30.0), _SearchState(seen(), fitted(), (taken(12.0, SWING, 1),))
-    found, ended = grown(monkeypatch, [best, other], [(explained(FADE, 1), 10.0)], [])
-    assert whats(found) == [[(STRIP, 0), (FADE, 1)], [(SWING, 1)]]
-    assert [one.ended for one in found] == [False, True]
-    assert not ended
+def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_size(monkeypatch) -> None:
+    for moved, named in ((STEP, [("step", 1)]), (SWING, [("sinusoid", 1)])):
+        one = solved(moved)
+        found = search_terms(one.outcome, one.block, FLOOR)
+        assert kinds(found) == named
+        assert found.right.shape == one.block.view.shape
+        assert found.step.shape[0] == 3
+    sound = solved()
+    assert kinds(search_terms(sound.outcome, sound.block, FLOOR)) == []
+    for limit, value in (("LARGEST", one.outcome.problem.free.size), ("MAX_OBSERVATIONS", len(one.block.view))):
+        with monkeypatch.context() as patch:
+            patch.setattr(search, limit, value)
+            assert kinds(search_terms(one.outcome, one.block, FLOOR)) == named
+            patch.setattr(search, limit, value - 1)
+            assert search_terms(one.outcome, one.block, FLOOR).findings == ()
 
 
-def test_what_has_ended_stays_and_what_may_not_pass_it_is_let_be(monkeypatch) -> None:
-    best, slow = state(90.0, ended=True), _SearchState(seen(), fitted(), (taken(20.0, SWING, 1),))
-    found, ended = grown(monkeypatch, [best, slow])  # 20 and two of 20
-    assert found == [best, slow]
-    assert ended
-    fast = _SearchState(seen(), fitted(), (taken(40.0, SWING, 1),))
-    found, ended = grown(monkeypatch, [best, fast], [(explained(FADE, 1), 60.0)])
-    assert whats(found) == [[(SWING, 1), (FADE, 1)], [(STRIP, 0)]]
-    assert not ended
-
-
-def test_two_ways_with_the_same_parts_are_one_the_better(monkeypatch) -> None:
-    one, other = state(30.0), _SearchState(seen(), fitted(), (taken(25.0, SWING, 1),))
-    found, _ = grown(monkeypatch, [one, other], [(explained(SWING, 1), 12.0)], [(explained(STRIP), 19.0)])
-    assert whats(found) == [[(SWING, 1), (STRIP, 0)]]
-    assert found[0].gain == 44.0
-
-
-def test_a_swing_or_a_motion_below_the_floor_is_nothing() -> None:
-    each = search(floor=0.1)  # of which two and a half are asked
-    for size, nothing in ((0.99, True), (1.01, False)):
-        parts = size * 0.25 * np.array([0.36, 0.48, 0.48, 0.64])
-        assert each._is_nothing(four(), fitted(extra=[7.0, *parts])) == nothing
-        moving = np.array([0.6, 0.4, 0.9, 0.0, 0.0, 0.0])
-        by_move = np.zeros((2, 1, 6))
-        by_move[0, 0, [0, 1]], by_move[1, 0, 2] = [1.0, 50.0], 7.0  # a mean square of 25
-        group: Any = SimpleNamespace(by_move=by_move)
-        found = fitted(moving=moving, move=np.array([0.05 * size]))
-        assert each._is_nothing(explained(MOVING, -1, group=group), found) == nothing
-        still = replace(found, moving=0.5 * np.ones(6))
-        assert not each._is_nothing(explained(MOVING, -1, group=group), still)
-    assert not each._is_nothing(explained(STRIP), fitted(extra=[0.0, 0.0]))
-
-
-def test_parts_of_images_that_hold_what_moves_are_tried_beside_it(monkeypatch) -> None:
-    """Of each image the best rows and columns, by what moves of the ties that take part; groups are looked for once."""
-    rows, moving = np.arange(6) < 5, np.array([0.9, 0.1, 0.2, 0.3, 0.8, 0.7])
-    asked: list[Any] = []
-    best, second = interval(0, 5, by_share=True), replace(interval(2, 5, view=1, by_share=True), gain=30.0)
-    places = [best, replace(best, gain=8.0), interval(0, 9, view=1), second, interval(0, 3, view=2)]
-
-    def scanned(view: Any, place: Any, size: Any, wrong: Any, off: Any, told: Any) -> list[Interval]:
-        asked.append((view.tolist(), place.shape, wrong.tolist(), off.shape, told.tolist()))
-        return [*places, replace(interval(0, 9, view=3, by_share=True), gain=SURE)]
-
-    def proposed(_: Any, intervals: Any, periods: Any, kinds: Any) -> Any:
-        asked.append((intervals, periods, kinds))
-        return (explained(STRIP, one.view) for one in intervals)
-
-    def groups(given: Any, where: Any) -> list[Explanation]:
-        asked.append(where)
-        return [explained(MOVING, -1), explained(MOVING, -2)]
-
-    gains = {-1: 20.0, -2: SURE}
-    monkeypatch.setattr(judging, "scan", scanned)
-    monkeypatch.setattr(judging, "proposed", proposed)
-    monkeypatch.setattr(judging, "EXPLANATIONS", {MOVING: groups})
-    monkeypatch.setattr(_ExplanationSearch, "_sharp", lambda self, made: made)
-
-    def tried(_: Any, made: Any, more: Any) -> list[Any]:
-        return [*made, *((one, fitted(moving=moving), gains.get(one.view, 1.0)) for one in more)]
-
-    monkeypatch.setattr(_ExplanationSearch, "_with", tried)
-    known = seen()
-    known.linear.taking_part = rows  # type: ignore[misc]
-    each = search(seen=known)
-    found = each._moving([best, second], [])
-    assert [(row[0].kind, row[0].view) for row in found] == [
-        (MOVING, -1), (MOVING, -2), (STRIP, 1), (STRIP, 0),
-    ]  # fmt: skip
-    assert asked == [
-        best,
-        ([0, 0, 0, 0, 1], (2, 5), moving[:5].tolist(), (2, 5), [0.0] * 5),
-        ([second, best], [], (MOVING, WANDER)),
-    ]
-    each._moving([second], [])
-    assert asked.count(best) == 1
-    assert second not in asked
-
-
-def four() -> Explanation:
-    """A swing of four unknowns."""
-    return replace(explained(SWING), extra=np.zeros((2, 4, 6)), sigma=np.full(4, 0.5))
-
-
-def test_ends_are_looked_for_where_they_may_gain_most(monkeypatch) -> None:
-    """Of three a kind, and only of what is not far behind what is sure already."""
-    sharp: list[Explanation] = []
-
-    def sharpened(self: _ExplanationSearch, one: Explanation, found: MixtureFit) -> tuple[Explanation, MixtureFit]:
-        sharp.append(one)
-        return one, replace(found, evidence=found.evidence + 1.0)
-
-    monkeypatch.setattr(_ExplanationSearch, "_sharpened", sharpened)
-
-    def of(*gains: float) -> list[int]:
-        kinds = (STRIP, STRIP, STRIP, STRIP, FADE, TRANSIENT, SWING, WANDER, MOVING)
-        rows = [(explained(kind), fitted(gain), gain) for kind, gain in zip(kinds, gains, strict=False)]
-        sharp.clear()
-        made = search()._sharp(rows)
-        assert [row[2] for row in made] == sorted((row[2] for row in made), reverse=True)
-        assert sum(row[2] for row in made) == pytest.approx(sum(gains) + len(sharp))
-        return [next(n for n, row in enumerate(rows) if row[0] is one) for one in sharp]
-
-    assert of(30.0, 29.0, 28.5, 28.0, 27.0, 26.0, 25.0, 24.0, 23.0) == [0, 1, 2, 4, 5, 6, 7]
-    assert of(30.0, 10.0, 9.0, 8.0, 10.1) == [0, 4]
-    assert of(12.0, 5.0, 4.0, 3.0, 5.1) == [0, 4]
-    assert of(5.0, 4.0, 3.0, 2.0, -2.0) == [0, 1, 2, 4]  # where nothing is sure all may be
-    assert search()._sharp([]) == []
-
-
-def test_of_many_explanations_those_are_fitted_that_few_tracks_let_hope(monkeypatch) -> None:
-    monkeypatch.setattr(judging, "fit_mixture", lambda *_: fitted(100.0))
-    monkeypatch.setattr(
-        _ExplanationSearch, "_fit", lambda self, one, linear=None, base=None: fitted(100.0 + one.view + one.price)
-    )
-
-    def of(*gains: int, few: bool = True) -> list[int]:
-        each = search()
-        each.seen = each.seen if few else replace(each.seen, few=each.seen.linear)
-        return [one.view for one in each._worth_more([explained(SWING, gain, price=2.0) for gain in gains])]
-
-    assert of(30, 10, 9) == [30, 10]
-    assert of(5, 4, 1, -9) == [5, 4, 1, -9]  # none is sure: all are
-    assert of(6, 2, 1) == [6, 2]
-    assert of(30, 1) == [30, 1]
-    assert of(30, 2, 1, few=False) == [30, 2, 1]
-
-
-def test_a_mean_stands_out_beyond_the_floor_in_units_of_what_ties_are_known_to(monkeypatch) -> None:
-    asked: list[float] = []
-    monkeypatch.setattr(judging, "off_from_right", lambda linear, left, right: (left, np.zeros(len(VIEW), dtype=bool)))
-    monkeypatch.setattr(judging, "scan", lambda *given: asked.append(given[-1]) or [])
-    monkeypatch.setattr(judging, "swings", lambda *_: [])
-    linear: Any = SimpleNamespace(
-        view=VIEW,
-        sigma=np.ones(len(VIEW)),
-        taking_part=np.arange(len(VIEW)),
-        left=lambda step: np.zeros((2, len(VIEW))),
-    )
-    each = _ExplanationSearch(replace(seen(), linear=linear), [], 0.06, 0.1)
-    each._standing_out(fitted(noise=2.0), np.zeros((2, 0, len(VIEW))))
-    assert asked == [pytest.approx(0.3)]  # 0.06 px of ties that are known to 0.2 px
-
-
-@pytest.mark.parametrize("left", [([], []), ([1], []), ([], [1])])
-def test_nothing_is_left_beside_the_best_where_neither_rows_nor_periods_stand_out(monkeypatch, left) -> None:
-    asked: list[Any] = []
-    monkeypatch.setattr(_ExplanationSearch, "_standing_out", lambda self, found, extra: asked.append(extra) or left)
-    one, found = explained(STRIP), fitted()
-    assert search()._leaves_nothing([(one, found, SURE + 0.1)]) == (left == ([], []))
-    np.testing.assert_array_equal(asked[0], one.extra)
-    assert not search()._leaves_nothing([(one, found, SURE)])
-    assert not search()._leaves_nothing([(explained(WANDER), found, 99.0), (one, found, 98.0)])
-    assert not search()._leaves_nothing([])
-    assert len(asked) == 1
-
-
-def test_gains_are_over_what_is_known_less_the_price_of_a_choice() -> None:
-    each = search(seen=replace(seen(), base=fitted(100.0)))
-    rows = [(explained(STRIP, price=4.0), fitted(110.0)), (explained(FADE, price=1.0), fitted(109.0))]
-    assert [(row[0].kind, row[2]) for row in each._sorted(rows)] == [(FADE, 8.0), (STRIP, 6.0)]
-
-
-# --- which parts of a block are judged --------------------------------------------------------------------------------
+@pytest.mark.slow
+def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(monkeypatch) -> None:
+    """The same terms as of the whole block, under its numbers, and nothing of views far away."""
+    one = solved(stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 4, 20.0), views=6, tracks=300)
+    whole = search_terms(one.outcome, one.block, FLOOR)
+    assert sorted(kinds(whole)) == [("sinusoid", 4), ("step", 1)]
+    a_view = one.outcome.problem.free.size // 6
+    monkeypatch.setattr(search, "SMALL", 4 * a_view)
+    monkeypatch.setattr(search, "_NEAREST", 3)
+    found = search_terms(one.outcome, one.block, FLOOR)
+    assert sorted(kinds(found)) == [("sinusoid", 4), ("step", 1)]
+    for kind in ("step", "sinusoid"):
+        a, b = (next(row for row in of.findings if row.kind == kind) for of in (whole, found))
+        np.testing.assert_allclose(a.size, b.size, atol=0.15)
+    assert found.step.shape == (6, a_view)
+    assert found.right.shape == one.block.view.shape
+    sound = search_terms(solved(views=6, tracks=300).outcome, solved(views=6, tracks=300).block, FLOOR)
+    assert (sound.findings, sound.step.size) == ((), 0)
 
 
 def tied(pairs: list[tuple[int, int]], views: int) -> Any:
     """A block of tracks of two views each."""
     point = np.repeat(np.arange(len(pairs)), 2)
     return SimpleNamespace(
-        views=[SimpleNamespace(size=(100, 200))] * views, view=np.array(pairs).ravel(), point=point,
-        num_points=len(pairs), num_tracks=len(pairs), use=np.ones(len(point), dtype=bool),
+        views=[None] * views, view=np.array(pairs).ravel(), point=point, num_points=len(pairs),
+        num_tracks=len(pairs), use=np.ones(len(point), dtype=bool),
     )  # fmt: skip
 
 
-def test_a_view_is_judged_among_those_that_share_most_tracks_with_it() -> None:
+def test_a_view_is_searched_among_those_that_share_most_tracks_with_it() -> None:
     block = tied([(0, v) for v in range(1, 15) for _ in range(v)], 16)
-    assert _neighbour_views(block, 0).tolist() == [0, *range(4, 15)]
-    assert _neighbour_views(block, 3).tolist() == [0, 3]
+    assert search._neighbour_views(block, 0).tolist() == [0, *range(4, 15)]
+    assert search._neighbour_views(block, 3).tolist() == [0, 3]
     unused = tied([(0, 1), (0, 1), (0, 2), (1, 2)], 4)
-    assert _neighbour_views(unused, 0).tolist() == [0, 1, 2]
+    assert search._neighbour_views(unused, 0).tolist() == [0, 1, 2]
     unused.use[[4, 5]] = False  # its track with view 2
-    assert _neighbour_views(unused, 0).tolist() == [0, 1]
+    assert search._neighbour_views(unused, 0).tolist() == [0, 1]
     control = tied([(0, 1), (0, 2)], 3)
     control.num_tracks = 1
-    assert _neighbour_views(control, 0).tolist() == [0, 1]
+    assert search._neighbour_views(control, 0).tolist() == [0, 1]
 
 
-def test_findings_among_some_views_are_those_of_the_block() -> None:
+def test_terms_among_some_views_are_those_of_the_block() -> None:
     step = np.zeros((5, 2))
     step[3] = 7.0
-    all_of = judging.Selection(("first",), step, np.ones(6))  # type: ignore[arg-type]
-    found = judging.Finding(SWING, 1, None, np.zeros(2), 9.0, 1.0, "", np.zeros(4), 30.0, (0, 2))
-    own = judging.Selection((found,), np.arange(6.0).reshape(3, 2) + 1.0, np.array([0.1, 0.2]))
-    both = _with_findings(all_of, own, np.array([1, 3, 4]), np.array([2, 5]))
+    all_of = Selection(("first",), step, np.ones(6))  # type: ignore[arg-type]
+    found = Finding("sinusoid", 1, None, np.zeros(2), 9.0, 1.0, "", np.zeros(4), 30.0, (0, 2))
+    own = Selection((found,), np.arange(6.0).reshape(3, 2) + 1.0, np.array([0.1, 0.2]))
+    both = search._with_findings(all_of, own, np.array([1, 3, 4]), np.array([2, 5]))
     assert both.findings[0] == "first"
     assert (both.findings[1].view, both.findings[1].or_of) == (3, (1, 4))
-    # of a view that was judged before the first is kept
+    # of a view that was searched before the first is kept
     np.testing.assert_array_equal(both.step, [[0, 0], [1, 2], [0, 0], [7, 7], [5, 6]])
     np.testing.assert_array_equal(both.right, [1, 1, 0.1, 1, 1, 0.2])
     np.testing.assert_array_equal(all_of.right, 1.0)
     assert (all_of.step[[1, 4]] == 0).all()
 
 
-def judged(monkeypatch, size: int, rows: list[int], periods: list[int], views: int = 14, ties: int = 8) -> Any:
-    """Which views are judged together in a block of so many unknowns; whether periods were looked for."""
-    asked: list[list[int]] = []
-
-    def among(outcome: Any, block: Any, floor: float, chosen: np.ndarray) -> judging.Selection:
-        asked.append(chosen.tolist())
-        found = judging.Finding(STRIP, 0, None, np.zeros(2), 9.0, 1.0, "", np.zeros(2))
-        n = len(chosen)
-        rows = np.isin(block.view, chosen)
-        return judging.Selection((found,), np.ones((n, size // views)), np.zeros(int(rows.sum())))
-
-    looked: list[int] = []
-    monkeypatch.setattr(judging, "_judged_among", among)
-    monkeypatch.setattr(judging, "standing_out", lambda *_: [interval(0, 1, view) for view in rows])
-    swings = [SimpleNamespace(view=view) for view in periods]
-    monkeypatch.setattr(judging, "swinging", lambda *_: looked.append(1) or swings)
-    block = tied([(v, v + 1) for v in range(0, views, 2) for _ in range(ties // 2)], views)
-    outcome: Any = SimpleNamespace(problem=SimpleNamespace(free=np.ones(size)), inlier=np.ones(len(block.view), bool))
-    found = judging.judge(outcome, block, 0.0)
-    return asked, bool(looked), found
+def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(monkeypatch) -> None:
+    one = solved(views=6, tracks=300)
+    views = np.array([1, 2, 4])
+    found = linearised_among(one.outcome, one.block, views)
+    assert found is not None
+    linear, _ = found
+    rows = np.unique(np.concatenate([tracks.rows.ravel() for tracks in linear.tracks]))
+    count = np.bincount(one.block.point[np.isin(one.block.view, views)], minlength=one.block.num_points)
+    expected = np.isin(one.block.view, views) & (count[one.block.point] >= 2)
+    np.testing.assert_array_equal(rows, np.flatnonzero(expected))
+    a_view = one.outcome.problem.free.size // 6
+    monkeypatch.setattr(search, "SMALL", 3 * a_view)
+    assert linearised_among(one.outcome, one.block, views) is not None
+    assert linearised_among(one.outcome, one.block, np.arange(4)) is None
+    monkeypatch.setattr(search, "KEPT", 1)
+    assert linearised_among(one.outcome, one.block, views) is None
 
 
-def test_a_small_block_is_judged_whole_where_rows_stand_out_or_else_a_period(monkeypatch) -> None:
-    every = [[*range(14)]]
-    assert judged(monkeypatch, 14 * 9, [3], [])[:2] == (every, False)
-    assert judged(monkeypatch, 14 * 9, [], [3])[:2] == (every, True)
-    asked, looked, found = judged(monkeypatch, 14 * 9, [], [])
-    assert (asked, looked, found.findings) == ([], True, ())
-    assert judged(monkeypatch, 400, [3], [])[0] == every
-    assert judged(monkeypatch, 401, [3], [])[0] == [[2, 3]]
-
-
-def test_a_large_block_is_judged_around_each_view_that_stands_out(monkeypatch) -> None:
-    asked, looked, found = judged(monkeypatch, 14 * 40, [3, 9, 2, 3], [12, 8])
-    assert asked == [[2, 3], [8, 9], [12, 13]]
-    assert looked
-    assert [one.view for one in found.findings] == [2, 8, 12]
-    np.testing.assert_array_equal(found.step.any(axis=1), np.isin(np.arange(14), [2, 3, 8, 9, 12, 13]))
-    assert found.step.shape == (14, 40)
-    assert (found.right == 0.0).sum() == 3 * 8
-    assert judged(monkeypatch, 12_000, [3], [], 12)[0] == [[2, 3]]
-    asked, _, found = judged(monkeypatch, 12_001, [3], [3], 12)
-    assert (asked, found.findings, found.step.shape) == ([], (), (0, 0))
-    monkeypatch.setattr(judging, "MAX_OBSERVATIONS", 4 * 14)
-    assert judged(monkeypatch, 14 * 9, [3], [])[0] == [[*range(14)]]
-    monkeypatch.setattr(judging, "MAX_OBSERVATIONS", 4 * 14 - 1)
-    assert judged(monkeypatch, 14 * 9, [3], [])[0] == []
-
-
-def test_what_was_cut_in_an_interval_is_said_with_its_distance(monkeypatch) -> None:
-    """The median of ties that are used, and finite, from the start of the interval up to its stop."""
-    block = tied([(0, 1)] * 8, 2)
-    n = 16
-    block.xy = np.stack([np.zeros(n), np.repeat(np.arange(8.0) * 10.0, 2)])
-    block.sigma, block.num_tracks = np.ones(n), 7
-    inlier = np.zeros(n, dtype=bool)
-    inlier[6] = True  # view 0, row 30
-    block.use[8] = False  # row 40
-    away = np.zeros((2, n))
-    away[0, ::2], away[1, ::2] = 3.0 * np.arange(8), 4.0 * np.arange(8)  # 5 times the number
-    away[0, 4] = np.nan  # row 20
-    away[:, 1::2] = 1e3
-    monkeypatch.setattr(judging, "retriangulate_rejected", lambda *_: (None, away))
-    monkeypatch.setattr(judging, "correlated_noise_gain", lambda *_: 0.0)
-    outcome: Any = SimpleNamespace(
-        minimum=SimpleNamespace(state=None), problem=None, residual=None, inlier=inlier, standing_out={}
-    )
-
-    def apart(*rows: Interval) -> list[float]:
-        outcome.standing_out[0.25] = list(rows)
-        return [one.apart for one in judging.left_over(outcome, block, 0.25)]
-
-    one = replace(interval(10.0, 60.0), by_share=True)
-    assert apart(one) == [15.0]  # rows 10 and 50: the one at 60 is beyond
-    assert apart(one, replace(one, start=10.1), replace(one, stop=60.1), replace(one, stop=100.0)) == [15, 25, 25, 25]
-    assert apart(replace(one, start=65.0, stop=90.0), replace(one, start=20.0, stop=50.0)) == [0.0, 0.0]
-    assert apart(replace(one, view=1)) == [pytest.approx(np.hypot(1e3, 1e3))]
-    assert apart(interval(10.0, 60.0)) == [0.0]  # none by its share: nothing is measured
-    assert apart(interval(10.0, 60.0), one) == [15.0, 15.0]
-    monkeypatch.setattr(
-        judging, "correlated_noise_gain", lambda *_: 1e9
-    )  # a mean that noise of neighbours explains is none
-    assert apart(interval(10.0, 60.0)) == []
-    assert apart(interval(10.0, 60.0), one) == [15.0]
-
-
-def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
-    block: Any = SimpleNamespace(point=np.array([0, 0, 0, 1, 1, 2]), num_points=4)
-    outcome: Any = SimpleNamespace(inlier=np.array([True, True, False, True, False, True]))
-    np.testing.assert_array_equal(judging._confirmed_observations(outcome, block), [1, 1, 1, 0, 0, 0])
-
-
-def test_what_stands_out_is_asked_and_said_in_pixels(monkeypatch) -> None:
-    """A floor in standard deviations of the median tie; of what is found what gains enough."""
-    asked: list[Any] = []
-    found = [replace(interval(0, 1), gain=gain, off=3.0) for gain in (SURE, SURE + 0.1)]
-    monkeypatch.setattr(judging, "scan", lambda *given: asked.append(given) or found)
-    monkeypatch.setattr(judging, "swings", lambda *given: asked.append(given) or "swings")
-    rows, off = np.array([0, 1, 1, 1], dtype=bool), np.arange(6.0).reshape(2, 3)
-    monkeypatch.setattr(judging, "_whitened", lambda outcome, block: (rows if outcome and block else None, off))
-    block: Any = SimpleNamespace(
-        view=np.array([5, 0, 1, 1]), xy=np.arange(8.0).reshape(2, 4), sigma=np.array([9.0, 0.1, 0.25, 0.4]),
-        views=[SimpleNamespace(size=(100, 200)), SimpleNamespace(size=(300, 400))],
-        point=np.array([0, 1, 1, 1]), num_points=2,
-    )  # fmt: skip
-    outcome: Any = SimpleNamespace(inlier=np.array([1, 1, 0, 1], dtype=bool), noise=2.0, standing_out={})
-    (one,) = judging.standing_out(outcome, block, 0.3)
-    assert one.gain > SURE
-    assert one.off == pytest.approx(3.0 * 0.5)
-    view, place, size, wrong, seen_off, told, floor = asked[0]
-    assert floor == pytest.approx(0.3 / 0.5)
-    np.testing.assert_array_equal(view, [0, 1, 1])
-    np.testing.assert_array_equal(place, block.xy[:, 1:])
-    np.testing.assert_array_equal(size, [[100, 300], [200, 400]])
-    np.testing.assert_array_equal(wrong, [0, 1, 0])
-    np.testing.assert_array_equal(told, [1, 0, 1])
-    assert seen_off is off
-    assert judging.standing_out(outcome, block, 0.3)[0] is one  # looked for once
-    assert len(asked) == 1
-    assert judging.swinging(outcome, block) == "swings"
-    view, row, size, right, seen_off = asked[1]
-    np.testing.assert_array_equal(row, block.xy[1, 1:])
-    np.testing.assert_array_equal(right, [1, 1, 1])
-    rows[:] = False
-    asked.clear()
-    judging.standing_out(outcome, block, 0.7)
-    assert asked[0][-1] == pytest.approx(0.7)  # of no ties a deviation is a pixel
-
-
-def test_ties_among_some_views_are_linearised_where_they_are_not_too_many(monkeypatch) -> None:
-    asked: list[Any] = []
-    monkeypatch.setattr(judging, "retriangulate_rejected", lambda *given: asked.append(given) or ("revived", None))
-    monkeypatch.setattr(judging, "linearise", lambda *given: asked.append(given) or "linear")
-    block = tied([(0, 1), (1, 2), (0, 2), (0, 1)], 3)
-    block.num_tracks, block.sigma, block.alt_range = 3, np.full(8, 0.5), (100.0, 450.0)
-    block.use[0] = False
-    problem = SimpleNamespace(free=np.ones(3 * 200))
-    outcome: Any = SimpleNamespace(problem=problem, minimum=SimpleNamespace(state="s"), residual="r", inlier="i")
-    assert judging.around(outcome, block, np.array([0, 1])) == ("linear", "revived")
-    np.testing.assert_array_equal(asked[0][4], [0, 2, 2, 2, 2, 2, 2, 2])
-    given, state, use, sigma, span = asked[1]
-    assert (given is problem, state, sigma is block.sigma, span) == (True, "revived", True, 350.0)
-    np.testing.assert_array_equal(use, [0, 1, 1, 0, 1, 0, 0, 0])
-    assert judging.around(outcome, block, np.arange(3)) is None  # 600 unknowns
-    counted = list[Any]()
-    monkeypatch.setattr(judging, "array_elements", lambda count: counted.append(count.tolist()) or 3e7)
-    assert judging.around(outcome, block, np.array([0, 1])) is not None
-    assert counted == [[1, 1, 1]]
-    monkeypatch.setattr(judging, "array_elements", lambda count: 3.1e7)
-    assert judging.around(outcome, block, np.array([0, 1])) is None
-
-
-def test_some_views_are_judged_under_numbers_of_their_own(monkeypatch, caplog) -> None:
-    """What stands out in the others is left out; a fit that fails is no judgement."""
-    block = tied([(0, 1), (1, 3), (3, 2)], 4)
-    block.xy, block.sigma = np.arange(12.0).reshape(2, 6), np.array([0.1, 0.2, 0.3, 0.3, 0.4, 0.5])
-    linear = SimpleNamespace(among=lambda views: SimpleNamespace(views=views, thinned=lambda most: ("few", most)))
-    monkeypatch.setattr(judging, "around", lambda *_: (linear, "state"))
-    parts = SimpleNamespace(of=lambda problem, state: SimpleNamespace(part=lambda rows: rows))
-    monkeypatch.setattr(judging, "GroundMotion", parts)
-    monkeypatch.setattr(judging, "standing_out", lambda *_: [interval(0, 1, view) for view in (3, 0, 1)])
-    monkeypatch.setattr(judging, "fit_mixture", lambda linear: "base")
-    asked: list[Any] = []
-    monkeypatch.setattr(
-        judging, "_ExplanationSearch", lambda *given: asked.append(given) or SimpleNamespace(run=lambda: "said")
-    )
-    outcome: Any = SimpleNamespace(problem=None)
-    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])) == "said"
-    ((found, first, floor, sigma),) = asked
-    assert [one.view for one in first] == [1, 0]
-    assert (floor, sigma, found.base, found.few) == (0.07, pytest.approx(0.3), "base", ("few", 2000))
-    np.testing.assert_array_equal(found.ground, [1, 2, 3, 4])
-    np.testing.assert_array_equal(found.place, block.xy[:, 1:5])
-    np.testing.assert_array_equal(found.size, [[100, 100], [200, 200]])
-    assert found.extra.shape == (2, 0, 4)
-    assert found.sigma.shape == (0,)
-
-    def fails(_: Any) -> None:
+def test_a_mixture_that_cannot_be_solved_has_no_terms_and_says_so(monkeypatch, caplog) -> None:
+    def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr(judging, "fit_mixture", fails)
-    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])).findings == ()
-    assert "not judged" in caplog.text
-    monkeypatch.setattr(judging, "around", lambda *_: None)
-    assert judging._judged_among(outcome, block, 0.07, np.array([1, 3])).findings == ()
+    monkeypatch.setattr(search, "fit_mixture", fails)
+    one = solved(STEP)
+    assert search_terms(one.outcome, one.block, FLOOR).findings == ()
+    assert "not explained" in caplog.text

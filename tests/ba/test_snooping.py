@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
-from barpc.ba.judging.snooping import CRITICAL, ControlTest, _together
+from barpc.ba.control.snooping import CRITICAL, ControlTest, _together
 from barpc.base.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize

@@ -168,4 +168,4 @@ def test_the_checks_notice_what_does_not_exist(tmp_path):
 def test_the_names_are_read_from_pages_that_have_them():
     assert sum(len(names(page)) for page in PRESENT) > 60
     assert sum(len(paths(page)) for page in PRESENT) > 40
-    assert "barpc.ba.judging.judge" in names(DOCS / "adjustment.md")
+    assert "barpc.ba.evidence.scan" in names(DOCS / "adjustment.md")

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.apart import FOREIGN_CAMERA, ForeignCamera
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.judging.explanations import EXPLANATIONS, FADE, MOVING, STRIP, SWING, TRANSIENT, WANDER
-from barpc.ba.judging.judge import Finding
-from barpc.ba.judging.moving import Motion
 from barpc.ba.resection import RpcDiagnosis
+from barpc.ba.select.foreign_camera import FOREIGN_CAMERA, ForeignCamera
+from barpc.ba.terms.moving_ground import Motion
+from barpc.ba.terms.term import Finding
 from barpc.report import verdict
-from barpc.report.summary.block import _EXPLANATION_SENTENCES, explanations, left_entries, strangeness
+from barpc.report.summary.block import explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 
@@ -33,27 +32,23 @@ def reasons(found: Any) -> list[str]:
     return list(verdict._of_places(run, found, ()))
 
 
-def test_every_explanation_has_its_words() -> None:
-    assert {*EXPLANATIONS, SWING} == set(_EXPLANATION_SENTENCES)
-
-
 @pytest.mark.parametrize(
     ("kind", "view", "where", "size", "sentence", "ends"),
     [
         (
-            STRIP, 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0),
+            "step", 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0),
             "rows 5000-5999 of east (or the same ground in west) are displaced by 5.00 px", (5000.0, 5999.0),
         ),
         (
-            STRIP, 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5),
+            "step", 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5),
             "columns 0-99 of west (or the same ground in east) are displaced by 0.50 px", (0.0, 99.0),
         ),
         (
-            FADE, 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0),
+            "decay", 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0),
             "rows of west (or the same ground in east) are displaced by 2.00 px at row 0, decaying in 400 rows",
             (0.0, 11999.0),
         ),
-        (WANDER, 1, None, (0.3, 0.4),
+        ("low_frequency", 1, None, (0.3, 0.4),
             "rows of east or west have a low-frequency displacement of 0.50 px", (None, None)),
     ],
 )  # fmt: skip
@@ -94,7 +89,7 @@ def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sent
 )
 def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sentence) -> None:
     size, unknowns = np.array([0.06, 0.08]), np.array([0.06, 0.0, 0.0, 0.08])
-    one = Finding(SWING, 1, None, size, 60.0, 2.0, SWING if or_of else "", unknowns, 199.6, or_of)
+    one = Finding("sinusoid", 1, None, size, 60.0, 2.0, "sinusoid" if or_of else "", unknowns, 199.6, or_of)
     of_names = SimpleNamespace(**{**vars(adjustment([one])), "names": names})
     (found,) = explanations(of_names)  # type: ignore[arg-type]
     assert found.sentence == sentence
@@ -107,7 +102,7 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
 def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     places = (1, -6000.0, 12000.0, 0.0, rate), (1, -3000.0, 6000.0, 0.0, rate)
     sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
-    each = [Finding(TRANSIENT, v, places[v], sizes[v], 90.0, 40.0, "moving_objects", sizes[v]) for v in (0, 1)]
+    each = [Finding("transient", v, places[v], sizes[v], 90.0, 40.0, "moving_objects", sizes[v]) for v in (0, 1)]
     (entry,) = explanations(adjustment(findings=each))
     assert entry.sentence == (f"rows at the {end} of all images are displaced by up to 5.00 px, decaying in 100 rows")
     assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving_objects", 5.0)
@@ -125,7 +120,7 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
     motion = Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)
-    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
+    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
     (found,) = explanations(adjustment([finding]))
     assert found.sentence == (
         f"{said} (a cloud, water or shadows, or, between dates, a glacier, a landslide, a fault?), by 1.1 m from east "
@@ -134,7 +129,7 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
     )
     assert (found.image, found.share, found.moved_m, found.between) == (None, 0.354, 1.14, ("east", "west"))
     assert found.box == (5.0, 43.0, 5.1, 43.2)
-    assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, STRIP)
+    assert (found.axis, found.first, found.size_px, found.runner_up) == (None, None, None, "step")
     assert type(found).read({**vars(found), "box": [5.0, 43.0, 5.1, 43.2]}) == found
 
 
@@ -152,7 +147,7 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
 def test_a_group_that_moves_is_ground_only_between_dates(dates: tuple[str, str], cause: str) -> None:
     """Of less than a third nothing is said of the rest; control points on it are named."""
     motion = Motion(1.14, (1, 0), 0.3, (5.0, 43.0, 5.1, 43.2), "west", ("P1", "P4"), dates)
-    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, 7.0, STRIP, np.zeros(0), motion=motion)
+    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
     (found,) = explanations(adjustment([finding]))
     assert f"together {cause}, by 1.1 m" in found.sentence
     assert found.sentence.endswith("of height, and were excluded, with the GCPs P1, P4")
@@ -161,7 +156,7 @@ def test_a_group_that_moves_is_ground_only_between_dates(dates: tuple[str, str],
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
 def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
     motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
-    finding = Finding(MOVING, -1, None, np.zeros(2), 42.0, gap, STRIP, np.zeros(0), motion=motion)
+    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, gap, "step", np.zeros(0), motion=motion)
     said = reasons(adjustment([finding]))
     assert bool(said) == told
     if told:

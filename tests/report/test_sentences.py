@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.constraints.ground import TerrainTest
-from barpc.ba.judging.snooping import ControlTest
+from barpc.ba.control.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.report import quality_checks

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import adjust_tracks
-from barpc.ba.apart import ForeignCamera
 from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.resection import RpcDiagnosis
+from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import BarpcWarning
 from barpc.base.options import RunOptions
 from barpc.fit import FitOptions

@@ -1,0 +1,256 @@
+"""Terms, splines and steps estimated with the cameras: when they are tried, what is kept, what they displace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from barpc.ba import AdjustOptions
+from barpc.ba.constraints.block import join
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.robust.heldout import keep_out
+from barpc.ba.select import image_terms
+from barpc.ba.select.beam import Selection
+from barpc.ba.select.image_terms import _spline_counts, with_splines, with_terms
+from barpc.ba.select.parts import Parts
+from barpc.ba.select.search import search_terms
+from barpc.ba.solution import Solution, solve_block
+from barpc.ba.terms.term import Finding
+from barpc.simulate import simulate_block
+from tests.ba.residuals import DIRECTION, Displacement, celled, stepped, swinging
+from tests.lanes import rest_slow
+
+# --- how many splines -----------------------------------------------------------------------------------------------
+
+
+def views_of(*counts: int, rows: int = 20000, unused: int = 0) -> Any:
+    """A block of views with so many observations each, of which the first ones are not used."""
+    view = np.repeat(np.arange(len(counts)), counts)
+    sizes = [SimpleNamespace(size=(5000, rows - 10 * v)) for v in range(len(counts))]
+    return SimpleNamespace(views=sizes, view=view, use=np.arange(len(view)) >= unused)
+
+
+@pytest.mark.parametrize(
+    ("options", "waves", "counts"),
+    [
+        ({}, True, [13, 23, 43, 83]),  # knots of 2000 rows, halved three times
+        ({}, False, []),
+        ({"jitter": "off"}, True, []),
+        ({"jitter": "off", "detectors": (9.0,)}, True, [0]),
+        ({"drift": 0}, True, []),  # who has rotations stand still wants to see what they leave
+        ({"drift": 0, "detectors": (9.0,)}, True, [0]),
+        ({"drift": 1}, True, [13, 23, 43, 83]),
+        ({"drift": 0, "jitter": "1000"}, True, [23]),
+        ({"jitter": "1001"}, False, [23]),
+        ({"jitter": "999"}, False, [24]),
+        ({"jitter": "100"}, False, [100]),  # an observation in thirty
+        ({"jitter": "9000"}, False, [7]),  # never fewer
+        ({"detectors": (9.0,)}, False, [0]),
+        ({"detectors": (9.0,)}, True, [13, 23, 43, 83]),
+    ],
+)
+def test_splines_are_as_many_as_asked_for_or_ever_more(options, waves, counts) -> None:
+    assert _spline_counts(views_of(3000, 3000, 3000), AdjustOptions(**options), waves) == counts
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize(
+    ("counts", "expected"),
+    [
+        ((1319, 1320, 1e4), [13, 23, 43, 44]),  # the view in the middle tells
+        ((100, 1289, 1e4), [13, 23, 42]),
+        ((390, 390, 390), [13]),
+        ((389, 389, 389), [12]),
+        ((209, 209, 209), []),
+        ((3000,) * 100, [13, 23, 43, 60]),  # 12,000 unknowns of all
+        ((3000,) * 857, [7]),
+        ((3000,) * 858, []),
+    ],
+)
+def test_a_view_needs_thirty_observations_a_spline(counts, expected) -> None:
+    assert _spline_counts(views_of(*map(int, counts)), AdjustOptions(), True) == expected
+
+
+def test_observations_that_are_not_used_hold_no_spline() -> None:
+    assert _spline_counts(views_of(700, 700, unused=310), AdjustOptions(), True) == [13, 18]
+    assert _spline_counts(views_of(60, 60), AdjustOptions(jitter="1000"), True) == [7]
+
+
+# --- what is kept, of blocks with known displacements -----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A block solved with its cameras alone."""
+
+    found: Solution
+    parts: Parts
+    options: AdjustOptions
+
+    @property
+    def selected(self) -> Selection:
+        return search_terms(self.found.outcome, self.parts.inner, self.options.noise_floor)
+
+    def with_terms(self) -> Solution:
+        selected = self.selected
+        return with_terms(replace(self.found, findings=selected.findings), selected, self.parts, self.options)
+
+    def with_splines(self) -> Solution:
+        return with_splines(self.found, self.parts, self.options)
+
+
+@cache
+def solved(*moved: Displacement, tracks: int = 300, all_of: bool = True, **given: Any) -> Solved:
+    """Three views, of which the check tracks may be displaced as the others are, or may not."""
+    made, options = simulate_block(3, tracks, seed=3, attitude=1e-6, position=0.2), AdjustOptions(**given)
+    block = join(made.views, made.tracks, None, options)
+    out, size = keep_out(block), np.array([view.size for view in block.views], dtype=np.float64).T
+    away = sum((one(block.view, block.xy / size[:, block.view]) for one in moved), np.zeros((2, 1)))
+    parts = Parts(replace(block, xy=block.xy + away * (all_of | ~out)), out, np.zeros(len(out), dtype=np.int64))
+    return Solved(solve_block(parts.inner, parts.outer, options, None, None, None), parts, options)
+
+
+def waves_of(found: Solution) -> AdditionalParameters | None:
+    return found.problem.cameras.unknowns.waves
+
+
+STEP, SWING = stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 1, 20.0)
+
+
+@pytest.mark.parametrize("moved", [STEP, SWING], ids=["step", "sinusoid"])
+def test_terms_that_were_found_are_estimated_with_the_cameras_and_all_ties_come_back(moved: Displacement) -> None:
+    one, sound = solved(moved), solved()
+    found = one.with_terms()
+    (term,) = found.findings
+    waves = waves_of(found)
+    assert waves is not None
+    own = waves.strips[1, 0] if term.kind == "step" else waves.periods[1]
+    np.testing.assert_array_equal(own, term.where if term.kind == "step" else [term.period])
+    assert np.isinf(waves.strips[[0, 2]]).all()
+    assert np.isinf(waves.periods[[0, 2]]).all()
+    assert found.outcome.inlier.mean() > max(0.99, one.found.outcome.inlier.mean())
+    # to check tracks a part of the rows is one of wrong matches, a sinusoid is not
+    assert found.after.error < (1.0 if term.kind == "step" else 0.6) * one.found.after.error
+    assert found.after.error < 1.15 * sound.found.after.error
+    params = found.final.params[1, found.problem.cameras.unknowns.in_waves]
+    px = np.abs(params) if term.kind == "step" else np.hypot(*params.reshape(2, 2).T)
+    np.testing.assert_allclose(px, (2.0 if term.kind == "step" else 0.6) * DIRECTION[:, 0], rtol=0.25)
+
+
+def test_terms_that_check_tracks_contradict_are_refused_and_those_not_asked_for_never_tried() -> None:
+    one = solved(SWING, all_of=False)
+    assert [term.kind for term in one.selected.findings] == ["sinusoid"]
+    found = one.with_terms()
+    assert found.findings == ()
+    assert found.outcome is one.found.outcome
+    for given in ({"jitter": "off"}, {"drift": 0}):
+        off = solved(STEP, **given)
+        found = off.with_terms()
+        assert found.findings  # said all the same
+        assert found.outcome is off.found.outcome
+
+
+@pytest.mark.slow
+def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() -> None:
+    one = solved(STEP, stepped(1.5, 0, 0.1, 0.25), stepped(1.5, 2, 0.7, 0.85))
+    found = one.with_terms()
+    waves = waves_of(found)
+    assert sorted(term.view for term in found.findings) == [0, 1, 2]
+    assert waves is not None
+    assert waves.count == 0
+    assert found.outcome.inlier.mean() > 0.99
+
+
+def shaken(px: float, waves: float) -> Displacement:
+    """All images, each with a phase of its own."""
+    return lambda of, at: (
+        px * np.stack([np.sin(2.0 * np.pi * waves * at[1] + 2.1 * of), np.cos(2.0 * np.pi * waves * at[1] + 1.3 * of)])
+    )
+
+
+def test_splines_and_detectors_that_are_asked_for_are_taken_and_none_in_a_sound_block() -> None:
+    assert solved().with_splines() is solved().found
+    for given, count, edges in (({"jitter": "2000"}, 8, 0), ({"detectors": (2500.0, 9000.0)}, 0, 2)):
+        one = solved(**given)
+        found = one.with_splines()
+        waves = waves_of(found)
+        assert waves is not None
+        assert (waves.count, waves.edges.shape) == (count, (3, edges))
+        assert edges == 0 or waves.edges.tolist() == [[2499.5, 8999.5]] * 3  # between pixels
+        assert found.asked["jitter"] is one.found.outcome.smooth
+        assert found.after.error < 1.02 * one.found.after.error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", rest_slow([(3, 300, 8), (5, 700, 13)], mark=pytest.mark.nightly), ids=str)
+def test_splines_are_as_dense_as_what_shakes_the_images_asks_for(case: tuple[int, int, int]) -> None:
+    waves, tracks, least = case
+    one = solved(shaken(0.5, waves), tracks=tracks)
+    assert one.found.has_waves
+    found = one.with_splines()
+    taken = waves_of(found)
+    assert taken is not None
+    assert least <= taken.count <= 23
+    assert found.after.error < 0.5 * one.found.after.error
+    off = solved(shaken(0.5, waves), tracks=tracks, jitter="off")
+    assert off.with_splines() is off.found
+
+
+@pytest.mark.slow
+def test_errors_that_neighbours_share_are_no_reason_for_splines() -> None:
+    one = solved(celled(0.4, 1))
+    assert one.found.has_waves
+    assert one.with_splines() is one.found
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "error", "kept"),
+    [
+        (100.0, 50.0, 0.99, True),
+        (100.0, 51.0, 0.99, False),  # most of it is left: noise that neighbours share
+        (100.0, 90.0, 0.69, True),  # much is gained
+        (100.0, 90.0, 0.71, False),
+        (0.0, 5.0, 0.99, True),  # too little to tell
+        (0.0, 5.1, 0.99, False),
+    ],
+)
+def test_what_is_taken_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
+    monkeypatch.setattr(image_terms, "correlated_noise_gain", lambda outcome, block: outcome)
+    tried, found = (
+        SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
+    )
+    assert image_terms._explains(tried, found, None) == kept  # type: ignore[arg-type]
+
+
+def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> None:
+    def found(kind: str, view: int, *unknowns: float, where: Any = None, period: float | None = None) -> Finding:
+        return Finding(kind, view, where, np.zeros(2), 9.0, 1.0, "", np.array(unknowns), period)
+
+    strip, fade = (1, 10.0, 20.0, 0.0, 0.0), (1, 30.0, 99.0, 30.0, 0.1)
+    parts = [
+        found("step", 2, 1.0, 2.0, where=strip),
+        found("sinusoid", 0, 3.0, 4.0, 5.0, 6.0, period=50.0),
+        found("decay", 2, 7.0, 8.0, where=fade),
+        found("transient", 1, 9.0, 10.0, where=fade),
+    ]
+    layout = image_terms._layout_of(parts, 4)
+    waves, params = layout.waves, layout.start
+    assert params is not None
+    assert waves.count == 0
+    assert waves.edges.shape == (4, 0)
+    assert waves.strips.shape == (4, 2, 5)
+    np.testing.assert_array_equal(waves.strips[2], [strip, fade])
+    np.testing.assert_array_equal(waves.strips[1, 0], fade)
+    assert np.isinf(waves.strips[[0, 3]]).all()
+    assert np.isinf(waves.strips[1, 1]).all()
+    np.testing.assert_array_equal(waves.periods, [[50.0], [np.inf], [np.inf], [np.inf]])
+    # columns of all strips, then rows; of swings too
+    np.testing.assert_array_equal(params[2], [1, 7, 2, 8, 0, 0, 0, 0])
+    np.testing.assert_array_equal(params[1], [9, 0, 10, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(params[0], [0, 0, 0, 0, 3, 4, 5, 6])
+    assert not params[3].any()
