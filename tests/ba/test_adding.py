@@ -149,7 +149,7 @@ def sixty() -> tuple[SimulatedBlock, IntArray, IntArray, BlockPrior, Adjustment]
     return made, have, new, prior, adjust_tracks(made.views, made.tracks, hold_out=False)
 
 
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_an_image_more_is_adjusted_as_with_the_whole_block(sixty) -> None:
     """Its camera, what is known of it and of its neighbours, and the block of all; by the neighbours alone."""
     made, have, new, prior, whole = sixty
@@ -167,7 +167,7 @@ def test_an_image_more_is_adjusted_as_with_the_whole_block(sixty) -> None:
     assert ratio.max() < 1.02
 
 
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_images_that_move_are_said_to_by_as_much_as_they_do(sixty) -> None:
     """Against the corrected cameras themselves, where each image sees the middle of its scene."""
     made, have, new, prior, _ = sixty
@@ -197,7 +197,7 @@ def test_old_views_need_no_tie_points_and_new_ones_do(sixty) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 @pytest.mark.parametrize("seed", range(12))
 def test_a_block_that_grows_by_one_and_two_knows_its_cameras_as_the_whole_does(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -23,7 +23,7 @@ from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 Change = Callable[[RPC], RPC]
 OFFSET = np.array([400.0, -900.0])
 

@@ -174,7 +174,7 @@ def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tmp_path) -> None:
     made = simulate_block(6, 300, seed=5)
     dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))

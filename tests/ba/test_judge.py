@@ -16,7 +16,7 @@ from barpc.sensor.image_corrections import Splined
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.lanes import rest_slow
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 Displaced = dict[str, Any]
 
 

@@ -28,7 +28,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.lanes import rest_slow
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 GSD = 0.5
 
 

@@ -308,7 +308,7 @@ def test_a_dem_holds_the_height_of_the_scene():
 
 def test_tracks_under_a_small_angle_are_held_and_said_to_be():
     block = simulate_block(3, 300, seed=8)
-    with pytest.warns(BarpcWarning, match="held in height"):
+    with pytest.warns(BarpcWarning, match="constrained in height"):
         found = solve(block, min_convergence=90.0, hold_out=False)
     assert found.held.all()
     assert np.isfinite(found.params).all()

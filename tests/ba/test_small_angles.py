@@ -55,7 +55,7 @@ def height(angle: float, seed: int, **options: float) -> tuple[float, float, Adj
     """How far up the scene ends off, and what is said of that [m]."""
     views, tracks, ground = pair(angle, seed)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", BarpcWarning)  # tracks are held in height
+        warnings.simplefilter("ignore", BarpcWarning)  # tracks are constrained in height
         found = adjust_tracks(views, tracks, AdjustOptions(**options))
     up = ground_from_ecef(found.points)[:, 2] - ground[:, 2]
     return float(np.nanmedian(up)), float(found.gauge.sigma[2]), found

@@ -306,7 +306,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
         monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
         monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", 0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
-    with pytest.warns(BarpcWarning, match="held in height"):  # they share an error, taken off the sparse matrix
+    with pytest.warns(BarpcWarning, match="constrained in height"):  # they share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, options, centers=centers_of(block))
     covariance = found.covariance
     assert covariance.is_large

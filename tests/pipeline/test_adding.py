@@ -25,7 +25,7 @@ from barpc.rpcio.carried import put_tag
 from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 COUNT = 12  # four sites in a square, three views each
 
 

@@ -249,7 +249,7 @@ def test_a_part_of_an_image_is_named_in_the_verdict(scene, tmp_path):
     images = images_of(scene, "")
     part = crop(SAMPLES[0], tmp_path / "part.tif", side=100, start=START + 30)
     options = RunOptions(stop_after="adjustment")
-    with pytest.warns(BarpcWarning, match="held in height"):
+    with pytest.warns(BarpcWarning, match="constrained in height"):
         summary = adjust([*images, part], tmp_path / "out", options).summary
     advice = {view["name"]: view["advice"] for view in summary["views"]}
     assert advice["part"].startswith("shows the same pixels as view_00, moved by 30 columns and 30 rows")

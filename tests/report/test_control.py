@@ -41,7 +41,7 @@ def test_control_that_is_as_stated_is_within_what_chance_allows(block_run):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_a_wrong_position_in_one_image_is_found_there_and_said(block_run):
     run, gcps = block_run.run, block_run.run.gcps
     run = replace(run, tracks=run.tracks.select(run.keep))  # no wrong matches: nothing has to be cut

@@ -122,7 +122,7 @@ def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatc
 
 
 @pytest.mark.nightly
-@pytest.mark.filterwarnings("ignore:.*held in height")
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_fifty_images_make_less_than_3_mb_in_seconds(tmp_path):
     run = run_of_block(50, 20_000, outliers=0.05)
     start = time.process_time()

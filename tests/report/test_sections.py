@@ -219,7 +219,7 @@ def test_what_the_images_cannot_tell_is_said_of_the_weakest():
     section = asked("gauge", scene=scene)
     assert section.points == ["All heights.", "The scene."]
     assert section.answer.endswith(" Ground control points (--gcp) reduce it.")
-    assert "held in height" not in section.answer
+    assert "constrained in height" not in section.answer
     assert section.tables == []
     assert (
         " The heights of 7 tie points with too small a convergence angle were constrained."

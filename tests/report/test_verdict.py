@@ -21,7 +21,7 @@ from barpc.report.summary.words import metres
 from barpc.simulate import simulate_block
 from tests.report.conftest import summarize
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*held in height")
+pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 
 
 def test_a_block_that_came_out_well_needs_no_advice(block_run):
