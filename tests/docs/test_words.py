@@ -37,7 +37,7 @@ DIALECT = (
     r"what (?:is|was|were|are) (?:left|wrong|said|known|asked|seen)",  # remainder, fault, ...
     r"of what (?:is|are)\b",
     r"that was asked\b",  # requested
-    r"constrained in height",  # constrained in height
+    r"held in height",  # constrained in height
     r"meets? under",  # has a convergence angle of
     r"\bsideways\b",  # horizontally
     r"(?:is|are|be) believed",  # is accepted, is valid
