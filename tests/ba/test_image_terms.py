@@ -208,25 +208,6 @@ def test_errors_that_neighbours_share_are_no_reason_for_splines() -> None:
     assert one.with_splines() is one.found
 
 
-@pytest.mark.parametrize(
-    ("before", "left", "error", "kept"),
-    [
-        (100.0, 50.0, 0.99, True),
-        (100.0, 51.0, 0.99, False),  # most of it is left: noise that neighbours share
-        (100.0, 90.0, 0.69, True),  # much is gained
-        (100.0, 90.0, 0.71, False),
-        (0.0, 5.0, 0.99, True),  # too little to tell
-        (0.0, 5.1, 0.99, False),
-    ],
-)
-def test_what_is_taken_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
-    monkeypatch.setattr(image_terms, "correlated_noise_gain", lambda outcome, block: outcome)
-    tried, found = (
-        SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
-    )
-    assert image_terms._explains(tried, found, None) == kept  # type: ignore[arg-type]
-
-
 def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> None:
     def found(kind: str, view: int, *unknowns: float, where: Any = None, period: float | None = None) -> Finding:
         return Finding(kind, view, where, np.zeros(2), 9.0, 1.0, "", np.array(unknowns), period)

@@ -389,6 +389,22 @@ def test_a_decay_may_be_a_step_of_its_rows_and_no_other_term_is_simpler() -> Non
     assert Transient.at_rate(s, 0.01, 1.0).simpler(s) is None
 
 
+def test_terms_differ_by_kind_view_axis_and_rows_that_do_not_overlap() -> None:
+    s, rows = seen(), (1, 2.0, 5.0, 0.0, 0.0)
+    one = Step.at(s, 0, rows)
+    for other, differs in (
+        (Step.at(s, 0, (1, 4.9, 9.0, 0.0, 0.0)), False),
+        (Step.at(s, 0, (1, 5.0, 9.0, 0.0, 0.0)), True),
+        (Step.at(s, 0, (0, 2.0, 5.0, 0.0, 0.0)), True),
+        (Step.at(s, 1, rows), True),
+        (Decay.at(s, 0, rows), True),
+        (replace(one, where=None), False),
+    ):
+        assert one.differs(other) == other.differs(one) == differs
+    swings = [Sinusoid.of(s, Period(view, 300.0, 9.0)) for view in (0, 0, 1)]
+    assert [swings[0].differs(other) for other in swings] == [False, False, True]
+
+
 def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
     s = seen()
     assert Step.at(s, 1, (1, 0.0, 1000.0, 0.0, 0.0)).share(s) == pytest.approx(0.5)
