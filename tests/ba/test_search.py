@@ -25,19 +25,19 @@ from barpc.simulate import simulate_block
 from tests.ba.residuals import (
     DIRECTION,
     Displacement,
-    celled,
-    decaying,
+    cell_errors,
+    decay,
     residuals_at,
     residuals_of,
-    settling,
-    stepped,
-    swinging,
+    sinusoid,
+    step,
+    transient,
 )
 from tests.ba.test_moving import drifting
 from tests.lanes import rest_slow
 
 FLOOR = 0.05  # px
-STEP, SWING = stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 1, 20.0)
+STEP, SWING = step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 1, 20.0)
 
 
 def searched(seen: Residuals, *first: Interval, floor: float = FLOOR) -> Selection:
@@ -61,7 +61,7 @@ def interval(start: float, stop: float, view: int = 0, axis: int = 1, by_share: 
     ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str
 )
 def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start, stop, seed) -> None:
-    seen = residuals_of(stepped(1.0, view, start, stop, axis), seed=seed)
+    seen = residuals_of(step(1.0, view, start, stop, axis), seed=seed)
     found = searched(seen)
     (one,) = found.findings
     assert (one.kind, one.view, one.or_of) == ("step", view, ())
@@ -81,7 +81,7 @@ def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start,
 @pytest.mark.parametrize("seed", rest_slow([1, 2]))
 @pytest.mark.parametrize(("view", "origin", "length"), [(2, 0.4, 0.2), (0, 0.5, -0.15)], ids=str)
 def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, seed) -> None:
-    seen = residuals_of(decaying(3.0, view, origin, length), seed=seed)
+    seen = residuals_of(decay(3.0, view, origin, length), seed=seed)
     (one,) = searched(seen).findings
     assert (one.kind, one.view) == ("decay", view)
     assert one.where is not None
@@ -92,7 +92,7 @@ def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, 
 
 @pytest.mark.parametrize("length", rest_slow([0.05, -0.05]))
 def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
-    seen = residuals_of(settling(6.0, length), views=4, tracks=200)
+    seen = residuals_of(transient(6.0, length), views=4, tracks=200)
     found = searched(seen)
     assert [(one.kind, one.view) for one in found.findings] == [("transient", v) for v in range(4)]
     for one in found.findings:
@@ -105,18 +105,18 @@ def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(l
 
 def test_a_sinusoid_is_found_with_its_image_period_and_amplitude() -> None:
     for seed in (1, 2):
-        (one,) = searched(residuals_of(swinging(0.4, 1, 20.0), seed=seed)).findings
+        (one,) = searched(residuals_of(sinusoid(0.4, 1, 20.0), seed=seed)).findings
         assert (one.kind, one.view, one.where, one.or_of) == ("sinusoid", 1, None, ())
         assert one.period == pytest.approx(1000.0, abs=6.0)
         np.testing.assert_allclose(one.size, 0.4 * DIRECTION[:, 0], atol=0.05)
-    (one,) = searched(residuals_of(swinging(0.5, 1, 20.0), views=2, tracks=300, seed=2)).findings
+    (one,) = searched(residuals_of(sinusoid(0.5, 1, 20.0), views=2, tracks=300, seed=2)).findings
     assert (one.view, one.runner_up) == (1, "sinusoid")  # of a pair the part across epipolar lines is seen
     assert 0.4 < np.hypot(*one.size) < 0.52
 
 
 def test_of_a_part_and_the_rest_of_an_image_the_smaller_is_displaced() -> None:
     for part in (0.1, 0.2):
-        seen = residuals_of(stepped(3.0, 1, part, 1.1), views=2, tracks=300)
+        seen = residuals_of(step(3.0, 1, part, 1.1), views=2, tracks=300)
         (one,) = searched(seen, interval(0.0, 20000 * part, 1)).findings
         assert one.kind == "step"
         assert one.where is not None
@@ -125,15 +125,15 @@ def test_of_a_part_and_the_rest_of_an_image_the_smaller_is_displaced() -> None:
 
 WORLDS: dict[str, tuple[tuple[Displacement, ...], int, dict[tuple[str, int], float]]] = {
     "columns and a sinusoid": (
-        (stepped(1.9, 2, 0.77, 0.97, 0), swinging(0.27, 2, 20.0)), 21, {("sinusoid", 2): 0.27, ("step", 2): 1.9},
+        (step(1.9, 2, 0.77, 0.97, 0), sinusoid(0.27, 2, 20.0)), 21, {("sinusoid", 2): 0.27, ("step", 2): 1.9},
     ),
     "a decay and columns": (
-        (decaying(3.8, 0, 0.64, 0.1), stepped(1.1, 2, 0.43, 0.63, 0)), 12, {("decay", 0): 3.8, ("step", 2): 1.1},
+        (decay(3.8, 0, 0.64, 0.1), step(1.1, 2, 0.43, 0.63, 0)), 12, {("decay", 0): 3.8, ("step", 2): 1.1},
     ),
     "two of one image": (
-        (stepped(1.9, 1, 0.71, 0.91, 0), decaying(1.8, 1, 0.46, 0.1)), 4, {("decay", 1): 1.8, ("step", 1): 1.9},
+        (step(1.9, 1, 0.71, 0.91, 0), decay(1.8, 1, 0.46, 0.1)), 4, {("decay", 1): 1.8, ("step", 1): 1.9},
     ),
-    "rows": ((stepped(1.4, 0, 0.54, 0.75), stepped(2.0, 2, 0.8, 1.1)), 2, {("step", 0): 1.4, ("step", 2): 2.0}),
+    "rows": ((step(1.4, 0, 0.54, 0.75), step(2.0, 2, 0.8, 1.1)), 2, {("step", 0): 1.4, ("step", 2): 2.0}),
 }  # fmt: skip
 """What is displaced, the seed of the block, and what is to be named, with its size [px]."""
 
@@ -165,14 +165,14 @@ def test_nothing_is_found_in_sound_residuals_though_intervals_are_asked_about(ou
 
 
 def test_errors_that_neighbours_share_are_no_term_and_hide_none() -> None:
-    assert kinds(searched(residuals_of(celled(0.3, 1), tracks=400), interval(4000.0, 8000.0, 1))) == []
-    assert kinds(searched(residuals_of(STEP, celled(0.2, 0), tracks=300))) == [("step", 1)]
+    assert kinds(searched(residuals_of(cell_errors(0.3, 1), tracks=400), interval(4000.0, 8000.0, 1))) == []
+    assert kinds(searched(residuals_of(STEP, cell_errors(0.2, 0), tracks=300))) == [("step", 1)]
 
 
 @pytest.mark.slow
 def test_a_sinusoid_or_a_motion_is_taken_from_two_and_a_half_floors_on() -> None:
     """The same residuals, of a sinusoid of 0.16 px and of ground that moved, and floors below and above."""
-    seen = residuals_of(swinging(0.16, 1, 20.0), tracks=400)
+    seen = residuals_of(sinusoid(0.16, 1, 20.0), tracks=400)
     (one,) = searched(seen).findings
     size = float(np.hypot(*one.size))
     assert size == pytest.approx(0.16, abs=0.02)
@@ -205,7 +205,7 @@ def test_ground_that_moves_is_the_last_term_and_no_camera_follows_it() -> None:
 
 @pytest.mark.slow
 def test_ground_that_moves_is_found_beside_a_sinusoid_and_the_cameras_are_those_of_the_sinusoid() -> None:
-    both, moves = moving(swinging(1.0, 1, 20.0))
+    both, moves = moving(sinusoid(1.0, 1, 20.0))
     found = searched(both, interval(10000.0, 20000.0, 1))
     assert [one.kind for one in found.findings] == ["sinusoid", "moving_objects"]
     assert found.findings[1].moved is not None
@@ -234,7 +234,7 @@ def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
 
 @pytest.mark.parametrize(("seed", "also"), [(2, (0,)), (1, ())])
 def test_a_sinusoid_of_a_pair_may_be_that_of_the_other_where_the_evidence_is_no_surer(seed: int, also: Any) -> None:
-    (one,) = searched(residuals_of(swinging(0.11, 1, 20.0), views=2, tracks=300, seed=seed), floor=0.03).findings
+    (one,) = searched(residuals_of(sinusoid(0.11, 1, 20.0), views=2, tracks=300, seed=seed), floor=0.03).findings
     assert (one.kind, one.view, one.or_of) == ("sinusoid", 1, also)
     assert (one.gap < SURE) == bool(also)
 
@@ -282,24 +282,24 @@ def test_rows_that_stand_out_are_said_in_pixels_from_the_floor_on_and_looked_for
 
 
 def test_periods_and_errors_that_neighbours_share_are_measured_by_the_ties_that_were_kept() -> None:
-    one, sound, celled_ = solved(SWING), solved(), solved(celled(0.3, 1), tracks=400)
+    one, sound, shared = solved(SWING), solved(), solved(cell_errors(0.3, 1), tracks=400)
     (period,) = [row for row in anomalies.periods_of(one.outcome, one.block) if row.view == 1]
     assert period.period == pytest.approx(1000.0, abs=6.0)
     assert anomalies.periods_of(sound.outcome, sound.block) == []
     assert anomalies.correlated_noise_gain(sound.outcome, sound.block) < 2.0
-    assert anomalies.correlated_noise_gain(celled_.outcome, celled_.block) > 50.0
+    assert anomalies.correlated_noise_gain(shared.outcome, shared.block) > 50.0
     # means of cells are none of an image's part
-    means = anomalies.standing_out(celled_.outcome, celled_.block, FLOOR)
-    gain = anomalies.correlated_noise_gain(celled_.outcome, celled_.block)
+    means = anomalies.standing_out(shared.outcome, shared.block, FLOOR)
+    gain = anomalies.correlated_noise_gain(shared.outcome, shared.block)
     expected = [row for row in means if row.by_share or row.gain > gain]
-    assert len(anomalies.left_over(celled_.outcome, celled_.block, FLOOR)) == len(expected)
+    assert len(anomalies.left_over(shared.outcome, shared.block, FLOOR)) == len(expected)
 
 
 def test_of_n_views_two_n_less_three_residuals_of_a_track_are_free_of_what_neighbours_share() -> None:
     """Tracks of two views have one of four; what is no outlier, and right, counts."""
     rng = np.random.default_rng(0)
     place, view, size = rng.uniform(0, 1000, (2, 600)), np.arange(600) % 3, np.full((2, 3), 1000.0)
-    off = celled(2.0, 1)(view, place / 1000.0) + rng.normal(0, 1, (2, 600))
+    off = cell_errors(2.0, 1)(view, place / 1000.0) + rng.normal(0, 1, (2, 600))
     right = rng.random(600) < 0.9
     used = right & (np.hypot(*off) < 5.0)
     whole = float(shared_errors(view[used], place[:, used], size, off[:, used]).sum())
@@ -338,7 +338,7 @@ def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_s
 @pytest.mark.slow
 def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(monkeypatch) -> None:
     """The same terms as of the whole block, under its numbers, and nothing of views far away."""
-    one = solved(stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 4, 20.0), views=6, tracks=300)
+    one = solved(step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 4, 20.0), views=6, tracks=300)
     whole = search_terms(one.outcome, one.block, FLOOR)
     assert sorted(kinds(whole)) == [("sinusoid", 4), ("step", 1)]
     a_view = one.outcome.problem.free.size // 6
