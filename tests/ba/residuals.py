@@ -23,12 +23,12 @@ Displacement = Callable[[IntArray, Array], Array]
 DIRECTION = np.array([[0.8], [0.6]])
 
 
-def stepped(px: float, view: int, start: float, stop: float, axis: int = 1) -> Displacement:
+def step(px: float, view: int, start: float, stop: float, axis: int = 1) -> Displacement:
     """Rows (axis 1) or columns of a view are displaced."""
     return lambda of, at: DIRECTION * px * ((of == view) & (at[axis] >= start) & (at[axis] < stop))
 
 
-def decaying(px: float, view: int, origin: float, length: float) -> Displacement:
+def decay(px: float, view: int, origin: float, length: float) -> Displacement:
     """Rows of a view are displaced from an origin on, less and less: downwards, or of a negative length upwards."""
 
     def moved(of: IntArray, at: Array) -> Array:
@@ -38,12 +38,12 @@ def decaying(px: float, view: int, origin: float, length: float) -> Displacement
     return moved
 
 
-def swinging(px: float, view: int, waves: float) -> Displacement:
+def sinusoid(px: float, view: int, waves: float) -> Displacement:
     """Rows of a view have a sinusoid of so many waves an image."""
     return lambda of, at: DIRECTION * px * np.sin(2.0 * np.pi * waves * at[1] + 1.0) * (of == view)
 
 
-def settling(px: float, length: float) -> Displacement:
+def transient(px: float, length: float) -> Displacement:
     """The first rows of all views are displaced, the last ones of a negative length, each view in a direction."""
 
     def moved(of: IntArray, at: Array) -> Array:
@@ -53,7 +53,7 @@ def settling(px: float, length: float) -> Displacement:
     return moved
 
 
-def celled(px: float, view: int, seed: int = 5) -> Displacement:
+def cell_errors(px: float, view: int, seed: int = 5) -> Displacement:
     """Observations of a view share errors with their neighbours in 8 x 8 cells."""
     cells = np.random.default_rng(seed).normal(0.0, px, (2, 8, 8))
     return lambda of, at: cells[:, *np.clip(8.0 * at[::-1], 0, 7).astype(int)] * (of == view)

@@ -22,7 +22,7 @@ from barpc.ba.select.search import search_terms
 from barpc.ba.solution import Solution, solve_block
 from barpc.ba.terms.term import Finding
 from barpc.simulate import simulate_block
-from tests.ba.residuals import DIRECTION, Displacement, celled, stepped, swinging
+from tests.ba.residuals import DIRECTION, Displacement, cell_errors, sinusoid, step
 from tests.lanes import rest_slow
 
 # --- how many splines -----------------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ def waves_of(found: Solution) -> AdditionalParameters | None:
     return found.problem.cameras.unknowns.waves
 
 
-STEP, SWING = stepped(2.0, 1, 0.4, 0.6), swinging(0.6, 1, 20.0)
+STEP, SWING = step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 1, 20.0)
 
 
 @pytest.mark.parametrize("moved", [STEP, SWING], ids=["step", "sinusoid"])
@@ -157,7 +157,7 @@ def test_terms_that_check_tracks_contradict_are_refused_and_those_not_asked_for_
 
 @pytest.mark.slow
 def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() -> None:
-    one = solved(STEP, stepped(1.5, 0, 0.1, 0.25), stepped(1.5, 2, 0.7, 0.85))
+    one = solved(STEP, step(1.5, 0, 0.1, 0.25), step(1.5, 2, 0.7, 0.85))
     found = one.with_terms()
     waves = waves_of(found)
     assert sorted(term.view for term in found.findings) == [0, 1, 2]
@@ -203,53 +203,32 @@ def test_splines_are_as_dense_as_what_shakes_the_images_asks_for(case: tuple[int
 
 @pytest.mark.slow
 def test_errors_that_neighbours_share_are_no_reason_for_splines() -> None:
-    one = solved(celled(0.4, 1))
+    one = solved(cell_errors(0.4, 1))
     assert one.found.has_waves
     assert one.with_splines() is one.found
-
-
-@pytest.mark.parametrize(
-    ("before", "left", "error", "kept"),
-    [
-        (100.0, 50.0, 0.99, True),
-        (100.0, 51.0, 0.99, False),  # most of it is left: noise that neighbours share
-        (100.0, 90.0, 0.69, True),  # much is gained
-        (100.0, 90.0, 0.71, False),
-        (0.0, 5.0, 0.99, True),  # too little to tell
-        (0.0, 5.1, 0.99, False),
-    ],
-)
-def test_what_is_taken_explains_most_of_what_neighbours_share(monkeypatch, before, left, error, kept) -> None:
-    monkeypatch.setattr(image_terms, "correlated_noise_gain", lambda outcome, block: outcome)
-    tried, found = (
-        SimpleNamespace(outcome=o, after=SimpleNamespace(error=e)) for o, e in ((left, error), (before, 1.0))
-    )
-    assert image_terms._explains(tried, found, None) == kept  # type: ignore[arg-type]
 
 
 def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> None:
     def found(kind: str, view: int, *unknowns: float, where: Any = None, period: float | None = None) -> Finding:
         return Finding(kind, view, where, np.zeros(2), 9.0, 1.0, "", np.array(unknowns), period)
 
-    strip, fade = (1, 10.0, 20.0, 0.0, 0.0), (1, 30.0, 99.0, 30.0, 0.1)
+    rows, decay = (1, 10.0, 20.0, 0.0, 0.0), (1, 30.0, 99.0, 30.0, 0.1)
     parts = [
-        found("step", 2, 1.0, 2.0, where=strip),
+        found("step", 2, 1.0, 2.0, where=rows),
         found("sinusoid", 0, 3.0, 4.0, 5.0, 6.0, period=50.0),
-        found("decay", 2, 7.0, 8.0, where=fade),
-        found("transient", 1, 9.0, 10.0, where=fade),
+        found("decay", 2, 7.0, 8.0, where=decay),
+        found("transient", 1, 9.0, 10.0, where=decay),
     ]
     layout = image_terms._layout_of(parts, 4)
     waves, params = layout.waves, layout.start
     assert params is not None
-    assert waves.count == 0
-    assert waves.edges.shape == (4, 0)
-    assert waves.strips.shape == (4, 2, 5)
-    np.testing.assert_array_equal(waves.strips[2], [strip, fade])
-    np.testing.assert_array_equal(waves.strips[1, 0], fade)
+    assert (waves.count, waves.edges.shape, waves.strips.shape) == (0, (4, 0), (4, 2, 5))
+    np.testing.assert_array_equal(waves.strips[2], [rows, decay])
+    np.testing.assert_array_equal(waves.strips[1, 0], decay)
     assert np.isinf(waves.strips[[0, 3]]).all()
     assert np.isinf(waves.strips[1, 1]).all()
     np.testing.assert_array_equal(waves.periods, [[50.0], [np.inf], [np.inf], [np.inf]])
-    # columns of all strips, then rows; of swings too
+    # columns of all strips, then rows; of sinusoids too
     np.testing.assert_array_equal(params[2], [1, 7, 2, 8, 0, 0, 0, 0])
     np.testing.assert_array_equal(params[1], [9, 0, 10, 0, 0, 0, 0, 0])
     np.testing.assert_array_equal(params[0], [0, 0, 0, 0, 3, 4, 5, 6])
