@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba import AdjustOptions
+from barpc.ba import AdjustOptions, terms
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.scan import Interval
@@ -19,7 +19,7 @@ from barpc.ba.select import anomalies, beam, search
 from barpc.ba.select.beam import Selection, TermSearch, _same, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
-from barpc.ba.terms.term import Finding, Residuals
+from barpc.ba.terms.term import SIZE_PRICE, Finding, Residuals, Term, in_both_coordinates
 from barpc.base.statistics import SURE
 from barpc.simulate import simulate_block
 from tests.ba.residuals import (
@@ -51,6 +51,38 @@ def kinds(found: Selection) -> list[tuple[str, int]]:
 
 def interval(start: float, stop: float, view: int = 0, axis: int = 1, by_share: bool = False) -> Interval:
     return Interval(view, axis, start, stop, 9.0, 0.1, 0.5, by_share)
+
+
+class Fan(Term):
+    """A bend of the columns of one image, as of an optical distortion."""
+
+    NAME = "fan"
+    NOUN, SENTENCE = "a bend of the columns", "columns of {image} are bent by {size:.2f} px"
+
+    @classmethod
+    def propose(cls, residuals: Residuals, interval: Interval) -> list[Fan]:
+        rows = np.flatnonzero(residuals.linear.view == interval.view)
+        u = 2.0 * residuals.place[0, rows] / residuals.size[0, interval.view] - 1.0
+        columns = in_both_coordinates(residuals, rows, (u**2 - 1.0 / 3.0)[None])
+        return [cls(interval.view, columns, np.ones(2), SIZE_PRICE + np.log(residuals.linear.choices))]
+
+
+def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is proposed, beats those that resemble it and is recorded; without it they are taken in its place."""
+
+    def bent(of: Any, at: Any) -> Any:
+        return DIRECTION * 1.5 * ((2.0 * at[0] - 1.0) ** 2 - 1.0 / 3.0) * (of == 1)
+
+    seen = residuals_of(bent)
+    middle = Interval(1, 0, *(share * float(seen.size[0, 1]) for share in (0.25, 0.75)), 9.0, 0.1, 0.5, False)
+    assert "fan" not in dict(kinds(searched(seen, middle)))
+    monkeypatch.setitem(terms.TERMS, "fan", Fan)
+    found = searched(seen, middle)
+    assert kinds(found) == [("fan", 1)]
+    (one,) = found.findings
+    np.testing.assert_allclose(one.unknowns, 1.5 * DIRECTION[:, 0], atol=0.15)
+    assert one.runner_up in terms.TERMS
+    assert terms.TERMS[one.kind].SENTENCE.format(image="b", size=1.5) == "columns of b are bent by 1.50 px"
 
 
 # --- what is named ----------------------------------------------------------------------------------------------------

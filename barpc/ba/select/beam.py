@@ -17,7 +17,7 @@ from barpc.ba.evidence.mixture import LIKELIHOOD_TOLERANCE, MixtureFit, fit_mixt
 from barpc.ba.evidence.periods import Period, find_periods
 from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.select.anomalies import correlated_log_ratio
-from barpc.ba.terms import IN_IMAGES, TERMS, LowFrequency, MovingObjects, Sinusoid, proposed
+from barpc.ba.terms import TERMS, LowFrequency, MovingObjects, Sinusoid, proposed
 from barpc.ba.terms.term import Finding, Residuals, Term
 from barpc.base.geodesy import Array
 from barpc.base.statistics import BACKFITTING, RIVALS, STANDS, SURE, TRIED
@@ -288,7 +288,7 @@ class TermSearch:
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
-        return proposed(seen, intervals, [], [kind for kind in IN_IMAGES if kind is not LowFrequency])
+        return proposed(seen, intervals, [], (LowFrequency,))
 
     def _with(self, made: list[_Tried], more: list[Term]) -> list[_Tried]:
         """Return the terms tried so far and more, the best first."""

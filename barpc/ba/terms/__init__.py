@@ -14,25 +14,24 @@ from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Residuals, Term
 from barpc.ba.terms.transient import Transient
 
-__all__ = ["IN_IMAGES", "TERMS", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
+__all__ = ["TERMS", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
 
 TERMS: dict[str, type[Term]] = {
     term.NAME: term for term in (Step, Decay, Transient, LowFrequency, Sinusoid, MovingObjects)
 }
 """Name -> term, in the order in which they are proposed."""
-IN_IMAGES = Step, Decay, Transient, LowFrequency
-"""Those that are proposed for significant intervals of images."""
 
 
 def proposed(
     residuals: Residuals,
     intervals: list[Interval],
     periods: list[Period],
-    kinds: Sequence[type[Term]] = IN_IMAGES,
+    without: Sequence[type[Term]] = (),
 ) -> Iterator[Term]:
     """Yield the terms that intervals and periods propose; those of a whole image, or of the block, once."""
     for period in periods:
         yield Sinusoid.of(residuals, period)
+    kinds = [kind for kind in TERMS.values() if kind.BY_INTERVAL and kind not in without]
     known = set[tuple[object, ...]]()
     for interval in intervals:
         for kind in kinds:

@@ -24,6 +24,7 @@ class MovingObjects(Term):
         "{between[1]} apart from an effect of height, and were excluded{control}{larger}"
     )
     OF_BLOCK: ClassVar[bool] = True
+    BY_INTERVAL: ClassVar[bool] = False
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:

@@ -56,6 +56,7 @@ class Term:
     FOLLOWED: ClassVar[bool] = False  # whether it is estimated with the cameras and corrected
     LOCAL: ClassVar[bool] = False  # whether it is of a part of an image
     OF_BLOCK: ClassVar[bool] = False  # whether it is of all images
+    BY_INTERVAL: ClassVar[bool] = True  # whether significant intervals of an image propose it
 
     @classmethod
     def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
