@@ -16,9 +16,10 @@ from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, beam, search
-from barpc.ba.select.beam import Selection, TermSearch, _same, _uncovered
+from barpc.ba.select.beam import Selection, TermSearch, _same, _SearchState, _Taken, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
+from barpc.ba.terms import TERMS
 from barpc.ba.terms.term import SIZE_PRICE, Finding, Residuals, Term, in_both_coordinates
 from barpc.base.statistics import SURE
 from barpc.simulate import simulate_block
@@ -122,7 +123,8 @@ def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, 
     np.testing.assert_allclose(one.size, 3.0 * DIRECTION[:, 0], rtol=0.06)
 
 
-@pytest.mark.parametrize("length", rest_slow([0.05, -0.05]))
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [0.05, -0.05])
 def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
     seen = residuals_of(transient(6.0, length), views=4, tracks=200)
     found = searched(seen)
@@ -269,6 +271,35 @@ def test_a_sinusoid_of_a_pair_may_be_that_of_the_other_where_the_evidence_is_no_
     (one,) = searched(residuals_of(sinusoid(0.11, 1, 20.0), views=2, tracks=300, seed=seed), floor=0.03).findings
     assert (one.kind, one.view, one.or_of) == ("sinusoid", 1, also)
     assert (one.gap < SURE) == bool(also)
+
+
+@cache
+def combined(*rows: tuple[str, int, float]) -> _SearchState:
+    """A combination of terms, each of a kind and view, with what it gains."""
+    seen = residuals_of(tracks=30)
+    taken = tuple(_Taken(placed(kind, view), gain, 1.0, "", (), seen) for kind, view, gain in rows)
+    return _SearchState(seen, seen.base, taken)
+
+
+def placed(kind: str, view: int = 0) -> Term:
+    none = np.zeros((2, 2, len(residuals_of(tracks=30).linear.view)))
+    return TERMS[kind](view, none, np.full(2, 0.5), 0.0, (1, 2.0, 5.0, 0.0, 0.0))
+
+
+def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
+    base = combined().seen.base
+    for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):
+        found = combined(*[("step", 0, 9.0)] * count).added([(placed(kind), base, 20.0)])
+        assert (found.ended, found.gain) == (ended, 9.0 * count + 20.0)
+    # as many more as the other has and two, none gaining more than the last
+    for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):
+        assert combined(("step", 0, 30.0)).may_pass(combined(*[("step", 0, gain) for gain in best])) == may
+    best, other = combined(("sinusoid", 1, 60.0)), combined(("decay", 0, 30.0))
+    for beside, adds in ((30.0 - SURE + 0.1, True), (30.0 - SURE, False)):  # beside the best: no other way
+        assert other.adds_to(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
+    assert not other.adds_to(best, [(placed("decay", 1), base, 40.0)])
+    behind = combined(("step", 2, 50.0), ("decay", 0, 30.0))
+    assert not behind.adds_to(best, [(placed("decay"), base, 30.0)])  # what went before is another
 
 
 # --- of a block that was solved ---------------------------------------------------------------------------------------
