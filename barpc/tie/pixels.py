@@ -127,7 +127,7 @@ class PixelReader(ExitStack):
 
 
 class OpenReaders(ExitStack):
-    """Each `PixelReader` that was asked for, opened once and kept open."""
+    """Readers (`PixelReader`), each opened once and kept open."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -142,13 +142,13 @@ class OpenReaders(ExitStack):
 
 
 def _picture_factors(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
+    """Return the columns and rows of a raster in a pixel of its picture of a size (width, height)."""
     width, height = size or (dataset.width, dataset.height)
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
 
 def _block_means(band: _RasterBand, box: Box, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
-    """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
+    """Return the pixels of a window, means of `pixel` (columns, rows) of the file's; valid where all of these are."""
     if pixel == (1, 1):
         return band.read(box, level)
     (col, row, width, height), (wide, high), parts = box, pixel, []
@@ -166,7 +166,7 @@ def _block_means(band: _RasterBand, box: Box, pixel: tuple[int, int], level: int
 
 @dataclass(frozen=True, eq=False)
 class _RasterBand:
-    """A band of an open raster, and what is known of all its windows."""
+    """A band of an open raster, and its properties common to all windows."""
 
     dataset: Any
     number: int
@@ -251,7 +251,7 @@ def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | 
 
 
 def _overview_factor(dataset: Any, band: int) -> int:
-    """Return so many pixels a side are seen as one at less cost: 4 (and 2, then) where decoding is dear, else 1."""
+    """Return the side [px] of pixels that overviews average at less cost: 4 (and 2) where decoding is dear, else 1."""
     return 4 if getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
 
 

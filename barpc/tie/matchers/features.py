@@ -1,4 +1,4 @@
-"""Keypoints: found tile by tile, evenly by a quota, kept in files that the matching of a pair reads."""
+"""Keypoints: detected tile by tile, evenly by a quota, stored in files for the matching of pairs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Keypoints:
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def strongest(self, most: int) -> Keypoints:
-        """Return so many keypoints, the strongest."""
+        """Return the `most` strongest keypoints."""
         return self.select(np.argsort(-self.response, kind="stable")[:most])
 
     boxes: ClassVar[tuple[Box, ...]] = ()  # of tiles: there are none in memory
@@ -97,7 +97,7 @@ class Sift:
 
 
 def _an_octave_up(keypoint: Any) -> Any:
-    """Return the keypoint with its octave raised by one: described by a quarter of the samples, and as distinct.
+    """Return a keypoint with its octave raised by one: a quarter of the samples describe it, as distinctly.
 
     OpenCV packs the octave (signed) and its picture, 1 to 3, into a byte each; picture 3 is the next octave's 0.
     """
@@ -113,14 +113,14 @@ def _keypoint_arrays(found: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class KeypointDensity:
-    """How densely a tile's keypoints are looked for."""
+    """Density and resolution at which the keypoints of a tile are detected."""
 
     density: float  # keypoints a px of the image
     zoom: int = 1  # px of the image a side of a pixel that is looked at
 
     @staticmethod
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> KeypointDensity:
-        """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
+        """Return the density for an image of `size` (width, height); `coarse`: at reduced resolution."""
         area = size[0] * size[1]
         wanted = min(PER_IMAGE, AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
@@ -134,7 +134,7 @@ class KeypointDensity:
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> KeypointDensity:
-        """Return the share where only a part of the image is used, in powers of two, so that it seldom changes."""
+        """Return the density where only a part of the image is used, in powers of two, so that it seldom changes."""
         return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
 
     def most(self, box: Box) -> int:
@@ -143,17 +143,17 @@ class KeypointDensity:
 
     @property
     def cell(self) -> int:
-        """Side of the quota's cells [px]: each holds one keypoint, about, where they are few."""
+        """Side of the quota's cells [px]: about one keypoint each at a low density."""
         return CELL * max(1, round(float(np.sqrt(1.0 / self.density)) / CELL))
 
 
 def ample_matches(options: TieOptions) -> int:
-    """Return the number of verified matches at a first look that makes a closer one needless."""
+    """Return the number of verified matches at reduced resolution that replaces matching at full resolution."""
     return max(MANY, int(np.ceil(_PART * options.points_per_image)))
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
-    """Return whether images of `sizes` (width, height) are large enough for a first look at less detail."""
+    """Return whether images of `sizes` (width, height) are large enough to be matched at reduced resolution first."""
     needed = _MIN_KEYPOINT_RATIO * ample_matches(options)
     return all(KeypointDensity.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
@@ -208,7 +208,7 @@ def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array,
 
 
 def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
-    """Return the place of every point (N, 2) [px] among those of its cell, the strongest first, from 0."""
+    """Return the rank, from 0, of every point (N, 2) [px] by strength within its cell."""
     cells = np.floor((xy + 0.5) / cell).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     key = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
@@ -221,19 +221,19 @@ def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Return the indices, ascending, of the strongest of points (N, 2) [px] in every cell, at most so many each."""
+    """Return the indices, ascending, of the `most` strongest points (N, 2) [px] of every cell."""
     return np.flatnonzero(_cell_ranks(xy, response, cell) < most)
 
 
 def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Return the indices of so many points (N, 2) [px]: of every cell the strongest, then the second, and so on."""
+    """Return the indices of `most` points (N, 2) [px]: the strongest of every cell, then the second, and so on."""
     order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
     return order[:most]
 
 
 @dataclass(frozen=True)
 class KeypointFiles:
-    """Keypoints of a view kept in files: of every tile the first so many count."""
+    """Keypoints of a view stored in files, a tile each; `counts` of them, the first, are used."""
 
     store: Store
     boxes: tuple[Box, ...] = ()

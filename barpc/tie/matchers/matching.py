@@ -53,7 +53,7 @@ MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStruc
 
 
 def matcher_named(name: str) -> type[Matcher] | Hook:
-    """Return the matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
+    """Return the matcher that an option names: a row of `MATCHERS`, or the function or class `module:name`."""
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
@@ -81,13 +81,13 @@ Points = tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles]
 
 @dataclass(frozen=True, eq=False)
 class GroundAltitudes:
-    """What is known of the altitudes of the ground: a terrain, and the matches of pairs that have enough."""
+    """Sources of the altitudes of the ground: a terrain, and the matches of pairs with enough of them."""
 
     terrain: Terrain | None = None
     ties: Sequence[tuple[Ends, Matches]] = ()
 
     def altitudes(self) -> tuple[float, float] | None:
-        """Return the lowest and the highest altitude [m] that most matches lie at."""
+        """Return the 2nd and 98th percentile [m] of the altitudes of the matches."""
         found = []
         for views, matches in self.ties:
             where, (low, high) = epipolar_segments(*views, matches.xy[:, 0]), common_range(*views)
@@ -97,7 +97,7 @@ class GroundAltitudes:
         return (float(np.min(found)), float(np.max(found))) if found else None
 
     def within(self, views: Ends, known: tuple[float, float] | None, margin: float) -> Ends:
-        """Return two views with fewer altitudes: those of the terrain, or else `known` ones, with a margin [m]."""
+        """Return two views restricted to the altitudes of the terrain, or else to `known` ones, with a margin [m]."""
         low, high = common_range(*views)
         if self.terrain is not None:
             axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
@@ -136,7 +136,7 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
 
 
 def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions) -> Placing | None:
-    """Return how the second picture lies if it matches so, and by the keypoints' own looks not as its camera says."""
+    """Return the placing of the second picture, if it differs from its camera's and verified matches confirm it."""
     a, b = keypoints
     placing, count = likeliest_placing(views, keypoints) if len(a) and len(b) else (None, 0)
     if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options)):
@@ -174,7 +174,7 @@ def _attempt(
     looked: dict[str, _PairSearch] | None = None,
     loosened: float = 0.0,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt.
+    """Match a pair by all passes of one matcher; searches in `looked` are shared between attempts.
 
     `loosened`: the share of false matches that a second attempt accepts.
     """
@@ -223,7 +223,7 @@ def _overlap_keypoints(
 
 
 def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
-    """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
+    """Return the number of matches, at most 5 % of them false, among a few keypoints: a cheap forecast for a pair."""
     few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
@@ -235,7 +235,7 @@ def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], opt
 def first_look(
     views: Sequence[View], keypoints: Sequence[KeypointFiles], pairs: Sequence[Pair], options: TieOptions, work: Work
 ) -> list[tuple[Matches, PairReport]]:
-    """Try each pair's keypoints of a first look once: `ample` says of which pairs that is all that they need."""
+    """Match keypoints of reduced resolution once for each pair: those with `ample` matches need no more."""
     return work.ordered(_attempt, _tasks(views, keypoints, pairs, options), "match")
 
 
@@ -279,7 +279,7 @@ def match_pairs(
 def _match_within(
     several: Sequence[Ends], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
-    """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
+    """Match two views within an altitude range, and within narrower ones where that finds few."""
     tried = [match_pair(several[0], keypoints, pair, options)]
     for views in several[1:]:
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
@@ -288,7 +288,7 @@ def _match_within(
 
 
 def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], EpipolarSegments]:
-    """Return a function of points that remembers its last value: a matcher asks about the same array again."""
+    """Return the function with a cache of its last value: matchers ask for the same array again."""
     known: list[tuple[Array, EpipolarSegments]] = []
 
     def remembered(xy: Array) -> EpipolarSegments:
@@ -324,7 +324,7 @@ class _PairSearch:
         self._frame = _latest(lambda xy: first if xy is points else epipolar_segments(*views, xy, first.axis))
 
     def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _PairSearch:
-        """Return the search at looser thresholds, which do not change where it looks."""
+        """Return the search with looser thresholds; its predictions stay the same."""
         other = copy(self)
         if self._matcher.detects:
             other._matcher = matcher_named(options.matcher)(options, keypoints)
@@ -334,11 +334,11 @@ class _PairSearch:
 
     @property
     def patch(self) -> float:
-        """Side of what is compared about a point [px]; 0: it has no extent."""
+        """Side of the template about a point [px]; 0: none."""
         return float(getattr(self._matcher, "patch", 0.0))
 
     def errors(self, found: Matches) -> Array:
-        """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""
+        """Return the distances (M, 2) [px] of matches from the predictions, along and across epipolar lines."""
         return epipolar_segments(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
 
     def _predicted(self, where: Callable[[Array], EpipolarSegments], half_width: float) -> Prediction:
@@ -369,7 +369,7 @@ class _PairSearch:
 
     @cached_property
     def offset(self) -> Prediction | None:
-        """Where to search, by blind passes of growing width for the cameras' error.
+        """Corrected prediction by blind passes of growing width for the cameras' relative error.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -384,7 +384,7 @@ class _PairSearch:
         return None if best is None else best.prediction
 
     def further(self, tight: Matches) -> Matches:
-        """Return matches and those of other offsets: of points that have none near them, where these show a peak.
+        """Return the matches with those at other offsets: of points without matches near them, where these show a peak.
 
         From some row on, or column, an image may lie elsewhere.
         """
@@ -398,7 +398,7 @@ class _PairSearch:
         return tight
 
     def _beside(self, found: Matches) -> _Peak | None:
-        """Return a blind pass over the points that have none of some matches near them, about the offset of these."""
+        """Return a blind pass over the points without matches near them, about the offset of the matches found."""
         places, offset = found.xy[:, 0], float(np.median(self.errors(found)[:, 1]))
         tree = cKDTree(places)
 
@@ -415,7 +415,7 @@ class _PairSearch:
         )
 
     def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
-        """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one.
+        """Return the peak of the errors across the epipolar lines of some points, if it is significant.
 
         Only of points that are `bare` where that is given.
         """

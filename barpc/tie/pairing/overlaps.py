@@ -41,7 +41,7 @@ GIVEN_PAIR = "given"
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """What of a block is looked at, and what is known of it beside its cameras.
+    """Restrictions of the search for tie points, and information beside the cameras.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def reach_of(view: View, options: TieOptions) -> float:
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
-    """Return the middle, lowest and highest altitude [m] of what the views' ranges have in common."""
+    """Return the middle, lowest and highest altitude [m] of the common range of the views."""
     low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
@@ -132,7 +132,7 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 def overlapping_pairs(
     views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
-    """Return all pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
+    """Return all pairs with enough overlap at some altitude, under an allowed convergence angle, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
         for pair in _overlapping_at(Footprints(views, alt, reaches, area), views, options):
@@ -211,9 +211,7 @@ def _candidates(
 def require_connected(
     views: Sequence[View], links: Sequence[tuple[int, int]], why: str, said: Mapping[str, str] | None = None
 ) -> None:
-    """Raise DisconnectedError unless the links connect all views; `why` says what is missing and what to do, `said` of
-    single views what is wrong with them.
-    """
+    """Raise DisconnectedError unless links connect all views; `why`: reason and remedy, `said`: faults of views."""
     groups = connected_groups(len(views), links)
     if len(groups) < 2:
         return
@@ -282,7 +280,7 @@ def scored_pair(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
 
 
 def _order(pair: Pair) -> tuple[int, int, float, Link]:
-    """Return the order: one date, then by what is in common, then by overlap and angle; last who have nothing."""
+    """Return the sort key: one date, then by likeness, then by overlap and angle; no likeness last."""
     if not isfinite(pair.score):
         return 3, 0, 0.0, pair.views
     if pair.reason == SAME_DATE:

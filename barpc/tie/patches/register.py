@@ -63,7 +63,7 @@ class PatchRegistration:
 def register_places(
     files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, patch: int
 ) -> PatchRegistration:
-    """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
+    """Register patches of two image files, each a path and its size, by `register_patches`, tile by tile.
 
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
@@ -102,7 +102,7 @@ def _window_pixels(reader: PixelReader, size: tuple[int, int], xy: Array, margin
 
 
 def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> ReadWindow:
-    """Return the pixels about every point, side by side in one picture: what lies between points is not worked on."""
+    """Return the pixels about every point, side by side in one picture without those between points."""
     side = 2 * margin + 1
     columns = int(np.ceil(np.sqrt(len(xy))))
     shape = -(-len(xy) // columns) * side, columns * side
@@ -144,7 +144,7 @@ def _by_tile(xy: Array, tile: int) -> list[IntArray]:
 
 
 def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
-    """Return the groups that follow each other as one, as far as they hold so many together."""
+    """Merge consecutive groups while they hold at most `most` rows together."""
     parts: list[list[IntArray]] = []
     for group in groups:
         if not parts or sum(map(len, parts[-1])) + len(group) > most:
@@ -412,7 +412,7 @@ class _Registrations:
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
-        """Return the observations that are as certain as others, at one altitude with their track.
+        """Return the mask of observations as certain as their neighbours and at one altitude with their track.
 
         Those off their epipolar line stay: whether the match or the camera is wrong, the adjustment judges, and what it
         holds out is not to agree by selection.
@@ -481,7 +481,7 @@ def _shared_variance(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Arr
 
 
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
-    """Return the row of the reference observation of every track (P,): the view that is most like the others.
+    """Return the row of the reference observation of every track (P,): that of the view most like the others.
 
     That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
     and with all else that makes them look different.
