@@ -31,6 +31,7 @@ VOTE_RADIUS = 150.0  # m: how far a camera may be off
 PEAK = 6.5  # a vote whose peak has fewer standard deviations is none: other places reach 5.1
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _VOTE_RESOLUTION, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
+_VOTE_REFINEMENT = 4.0  # times, the second vote
 _MIN_PICTURE_SHARES = 0.5, 0.3  # of a block and of the reference around it
 _MIN_AGREEING_POINTS = TieOptions().min_matches  # points that agree in a view
 _DECOY_MARGIN = 0.1  # by which a correlation beats its decoy's
@@ -220,7 +221,9 @@ class _ReferenceWork:
         if coarse == self.step:
             return found
         near = [shift for _, shift in found]
-        again = self._votes(near, max(self.step, coarse / 4.0), 4.0 * coarse, "reference: second vote")
+        again = self._votes(
+            near, max(self.step, coarse / _VOTE_REFINEMENT), _VOTE_REFINEMENT * coarse, "reference: second vote"
+        )
         return [(z, shift) for (z, _), (_, shift) in zip(found, again, strict=True)]
 
     def _votes(self, moved: Sequence[Array], step: float, reach: float, stage: str) -> list[tuple[float, Array]]:

@@ -119,12 +119,14 @@ def _registered_tracks(
     theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN_PAIR}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
-    if unlike := _with_pictures(looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options, work):
+    if unlike := _with_pictures(
+        looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options.band, work
+    ):
         tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
         counts = pair_counts(tracks)
         if trials.rematch({pair: counts.get(pair, 0) for pair in _unlike(linked, tracks, unlike)}):
             return _registered_tracks(trials, scope, options, work)
-    needed = theirs | _needed(looks, tracks, list(verified), options)
+    needed = theirs | _needed(looks, tracks, list(verified), options.min_matches)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
     bare = {
@@ -134,12 +136,10 @@ def _registered_tracks(
     return looks.tracks(thin(tracks_inside(looks.views, tracks, area), sizes, most)), bare
 
 
-def _needed(
-    looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
-) -> set[tuple[int, int]]:
+def _needed(looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], least: int) -> set[tuple[int, int]]:
     """Return the pairs of looks between views not connected by pairs with enough registered tracks."""
     counts = pair_counts(tracks)
-    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches]
+    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= least]
     part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
     return {(i, j) for i, j in pairs if part[i] != part[j]}
 
@@ -292,7 +292,9 @@ class _Trials:
 
     def _is_ample(self, pair: Pair, found: Matches, report: PairReport) -> bool:
         i, j = pair.views
-        return ample(report, self._options) and not stretched((self.looks.views[i], self.looks.views[j]), *found.ends)
+        return ample(report, self._options.points_per_image) and not stretched(
+            (self.looks.views[i], self.looks.views[j]), *found.ends
+        )
 
     def _looked_closer(self, pairs: Sequence[Pair], ground: GroundAltitudes) -> list[tuple[Matches, PairReport]]:
         """Match pairs of looks by keypoints of their own."""
@@ -324,11 +326,11 @@ def _of_two(tracks: Tracks) -> Tracks:
 
 
 def _with_pictures(
-    views: Sequence[View], pairs: Sequence[tuple[int, int]], options: TieOptions, work: Work
+    views: Sequence[View], pairs: Sequence[tuple[int, int]], band: int, work: Work
 ) -> list[tuple[int, int]]:
     """Return the pairs of images with detail: structure compares no uniform image either."""
     some = sorted({view for pair in pairs for view in pair})
-    stretches = work.ordered(sample_stretch, [(views[i].path, options.band, views[i].size) for i in some], "survey")
+    stretches = work.ordered(sample_stretch, [(views[i].path, band, views[i].size) for i in some], "survey")
     blank = {i for i, stretch in zip(some, stretches, strict=True) if stretch is None}
     return [pair for pair in pairs if not blank & set(pair)]
 

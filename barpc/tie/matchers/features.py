@@ -117,6 +117,7 @@ class KeypointDensity:
 
     density: float  # keypoints a px of the image
     zoom: int = 1  # px of the image a side of a pixel that is looked at
+    tile: int = TIE_DEFAULTS.tile  # side of the parts that share a quota [px of that size]
 
     @staticmethod
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> KeypointDensity:
@@ -126,8 +127,8 @@ class KeypointDensity:
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
         zoom = next(zooms, 1)
         if coarse:
-            return KeypointDensity(wanted, min(2 * zoom, max(_HOLDS)))
-        return KeypointDensity(PER_IMAGE / area, zoom)
+            return KeypointDensity(wanted, min(2 * zoom, max(_HOLDS)), options.tile)
+        return KeypointDensity(PER_IMAGE / area, zoom, options.tile)
 
     def expected(self, size: tuple[int, int]) -> float:
         """Estimate the number of keypoints of an image of `size` (width, height) with detail all over."""
@@ -147,20 +148,18 @@ class KeypointDensity:
         return CELL * max(1, round(float(np.sqrt(1.0 / self.density)) / CELL))
 
 
-def ample_matches(options: TieOptions) -> int:
+def ample_matches(points_per_image: int) -> int:
     """Return the number of verified matches at reduced resolution that replaces matching at full resolution."""
-    return max(MANY, int(np.ceil(_PART * options.points_per_image)))
+    return max(MANY, int(np.ceil(_PART * points_per_image)))
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
     """Return whether images of `sizes` (width, height) are large enough to be matched at reduced resolution first."""
-    needed = _MIN_KEYPOINT_RATIO * ample_matches(options)
+    needed = _MIN_KEYPOINT_RATIO * ample_matches(options.points_per_image)
     return all(KeypointDensity.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
 
-def detect_tile(
-    path: str, size: tuple[int, int], box: Box, found: Survey, share: KeypointDensity, options: TieOptions
-) -> Keypoints:
+def detect_tile(path: str, size: tuple[int, int], box: Box, found: Survey, share: KeypointDensity) -> Keypoints:
     """Detect the keypoints of one tile of an image of `size` (width, height), the most important first.
 
     Coordinates and `found` are those of the whole image.
@@ -168,9 +167,9 @@ def detect_tile(
     cv2.setNumThreads(1)
     zoom = share.zoom
     window = box if found.levels else grow(box, zoom * CELL, size)
-    picture, valid = read_picture(path, window, found, zoom, options.band)
+    picture, valid = read_picture(path, window, found, zoom)
     middle = 0.0 if found.levels else 0.5 * (zoom - 1)  # a wavelet's level holds the even pixels
-    parts, side = [], zoom * options.tile
+    parts, side = [], zoom * share.tile
     for row in range(box[1], box[1] + box[3], side):
         for col in range(box[0], box[0] + box[2], side):
             part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
@@ -264,9 +263,7 @@ class KeypointFiles:
         return join_keypoints(parts), np.concatenate(numbers)
 
 
-def keep_tile(
-    store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity, TieOptions]
-) -> int:
+def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity]) -> int:
     """Detect the keypoints of a tile by `detect_tile(*task)` and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
@@ -307,13 +304,13 @@ def locate(
     found = work.ordered(survey, [(v.path, options.band, v.size) for v in views], "read")
     shares = [KeypointDensity.of(view.size, options, coarse) for view in views]
     each = zip(views, found, shares, strict=True)
-    boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
+    boxes = [tiles(v.size, options.tile, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:
-        boxes = shared_tiles(views, pairs, options, area, boxes)
+        boxes = shared_tiles(views, pairs, boxes, options.search, area)
     used = [sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)]
     shares = [share.within(part) for share, part in zip(shares, used, strict=True)]
     tasks = [
-        (view.path, view.size, box, known, share, options)
+        (view.path, view.size, box, known, share)
         for view, known, share, of_view in zip(views, found, shares, boxes, strict=True)
         for box in of_view
     ]

@@ -46,6 +46,8 @@ from barpc.tie.pairing.epipolar import (
     robust_affine,
 )
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
+from barpc.tie.patches.channels import INVALID_MARGIN
+from barpc.tie.pixels import tiles
 from barpc.tie.tasks import HERE, Work
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
@@ -139,7 +141,7 @@ def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, op
     """Return the placing of the second picture, if it differs from its camera's and verified matches confirm it."""
     a, b = keypoints
     placing, count = likeliest_placing(views, keypoints) if len(a) and len(b) else (None, 0)
-    if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options)):
+    if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options.search)):
         return None
     return placing if _attempt(views, (a, placing.undone(b)), pair, options)[1].status == "ok" else None
 
@@ -184,7 +186,7 @@ def _attempt(
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
-    loaded, numbers = _overlap_keypoints(views, keypoints, options)
+    loaded, numbers = _overlap_keypoints(views, keypoints, options.search)
     looked = {} if looked is None else looked
     before = looked.get(options.matcher)
     search = _PairSearch(views, loaded, options) if before is None else before.loosened(loaded, options)
@@ -213,11 +215,11 @@ def _attempt(
 
 
 def _overlap_keypoints(
-    views: Ends, keypoints: Points, options: TieOptions
+    views: Ends, keypoints: Points, search: float | None
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray]]:
     """Return the keypoints of the tiles that both views may see, or all in memory, and their numbers."""
     boxes = [points.boxes for points in keypoints]
-    seen = shared_tiles(views, [_BOTH], options, boxes=boxes) if any(boxes) else boxes
+    seen = shared_tiles(views, [_BOTH], boxes, search) if any(boxes) else boxes
     first, second = (points.load(some) for points, some in zip(keypoints, seen, strict=True))
     return (first[0], second[0]), (first[1], second[1])
 
@@ -227,7 +229,7 @@ def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], opt
     few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
-    search = _PairSearch(views, _overlap_keypoints(views, few, options)[0], replace(options, ratio=_LOOSE_RATIO))
+    search = _PairSearch(views, _overlap_keypoints(views, few, options.search)[0], replace(options, ratio=_LOOSE_RATIO))
     coarse = search.offset
     return 0 if coarse is None else len(search.trusted(coarse, _LOOSE_FALSE_SHARE)[0])
 
@@ -313,9 +315,10 @@ class _PairSearch:
     def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
         self._matcher = matcher_named(options.matcher)(options, keypoints)
-        self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
+        self.reach = min(reach_of(views[1], options.search), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
-        self._windows = cache(lambda: shared_tiles(views, [_BOTH], options)[0])
+        boxes = [tiles(view.size, options.tile) for view in views]
+        self._windows = cache(lambda: shared_tiles(views, [_BOTH], boxes, options.search)[0])
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
@@ -357,7 +360,7 @@ class _PairSearch:
         Bands shifted to either side hold no true match: theirs tell how many false ones come with a score. (The
         "decoys" of peptide identification: Elias and Gygi 2007.)
         """
-        found, aside = self._distinct(prediction), 2.0 * prediction.half_width + 6.0
+        found, aside = self._distinct(prediction), 2.0 * prediction.half_width + INVALID_MARGIN
         decoys = [np.sort(self._distinct(replace(prediction, aside=side * aside)).score) for side in (-1.0, 1.0)]
         few, many = np.sort([np.searchsorted(decoy, found.score, side="right") for decoy in decoys], axis=0)
         # some in one of them are true where an image's rows lie as far off
@@ -463,7 +466,7 @@ class _PairSearch:
             near = tree.query(xy, k=min(FEW, len(tight)))[1]
             along = errors[near, 0]
             middle = np.median(along, axis=1)
-            half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
+            half = 2 * DUPLICATE_DISTANCE + SURELY * robust_spread(along, middle[:, None])
             where = every(xy).moved(xy @ slope + np.median(level[near], axis=1))
             return replace(where, before=middle - half, after=middle + half)
 

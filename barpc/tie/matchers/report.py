@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from barpc.base.errors import TiePointError
-from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, MANY
 from barpc.scene import View
 from barpc.tie.matchers.features import ample_matches
@@ -60,9 +59,9 @@ class PairReport:
         return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
-def ample(report: PairReport, options: TieOptions) -> bool:
+def ample(report: PairReport, points_per_image: int) -> bool:
     """Return whether matching at reduced resolution found enough matches."""
-    return report.status == "ok" and report.verified >= ample_matches(options)
+    return report.status == "ok" and report.verified >= ample_matches(points_per_image)
 
 
 def enough(report: PairReport) -> bool:

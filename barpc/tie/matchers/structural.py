@@ -21,7 +21,8 @@ from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
-from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
+from barpc.tie.patches.channels import INVALID_MARGIN
+from barpc.tie.patches.oriented import HALF, MAX_PATCH_SHIFT, PatchTile, Sampling, found_about, resolution
 from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
 GRID_POINTS = 200, 500, 1000
@@ -60,7 +61,7 @@ class GradientStructure:
         if not len(found):
             return NO_MATCHES
         across = prediction.at(found.xy[:, 0]).errors(found.xy[:, 1])[:, 1]
-        return found.select(np.abs(across) <= max(prediction.half_width, 1.5))
+        return found.select(np.abs(across) <= max(prediction.half_width, MAX_PATCH_SHIFT))
 
 
 class FineStructure(GradientStructure):
@@ -149,7 +150,7 @@ class _GridSearch:
         linear = sampling.linear
         axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
         half = max(asked.half_width, 0.75 * self._step)
-        wide = half if asked.probes else 2.0 * asked.half_width + 6.0 + half
+        wide = half if asked.probes else 2.0 * asked.half_width + INVALID_MARGIN + half
         wide = min(wide, float(np.abs(axes[1]) @ self._files[1][1]))  # B is no wider
         shift, longest = self._part_in_b(where, middle, rows, wide)
         turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
@@ -166,7 +167,7 @@ class _GridSearch:
         if self._whole:
             surface = _supported(surface, _adjacency(at, _RING * self.pitch), _SAY)
         elif asked.probes:  # neighbours are moved alike
-            near = _adjacency(at, 1.5 * self.pitch)
+            near = _adjacency(at, self.pitch)
             surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
         off = tile.offsets() @ axes.T  # along, across
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]

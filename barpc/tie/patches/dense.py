@@ -204,9 +204,9 @@ def _resampled(
 def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int) -> tuple[FloatImage, BoolArray]:
     """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
     matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
-    there = matcher.compute(left, right).astype(np.float32) / 16.0
+    there = matcher.compute(left, right).astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
-    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
+    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
     good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)

@@ -281,7 +281,7 @@ class _Template:
         normal += _SINGLE_PRECISION_EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
-        noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
+        noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - normal.shape[-1])
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_SINGLE_PRECISION_EPS)
         moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= oriented.MAX_PATCH_SHIFT) & np.isfinite(sigma)
@@ -351,7 +351,7 @@ def refine(
     of_track = references(tracks, exact, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
-    found = links.register(options, work)
+    found = links.register(options.band, options.tile, work)
     good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
     return _shared_variance(tracks, of_track, other[good], found.xy[good], sigma[good])
@@ -384,7 +384,7 @@ class _Registrations:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(self, options: TieOptions, work: Work) -> PatchRegistration:
+    def register(self, band: int, tile: int, work: Work) -> PatchRegistration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -392,14 +392,14 @@ class _Registrations:
             linear[group] = linear_map(*self.of(group), origin[group])
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
-        parts = [part for group in self.groups() for part in _task_parts(origin[group], group, options.tile)]
+        parts = [part for group in self.groups() for part in _task_parts(origin[group], group, tile)]
         tasks = []
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
             ends = sorted(int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other))
-            tasks.append((images, options.band, *places, tuple(ends) in self.structural))
+            tasks.append((images, band, *places, tuple(ends) in self.structural))
         done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
