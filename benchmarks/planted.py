@@ -12,6 +12,7 @@ by those adjusted, and that of the worst 5 % of rows or columns.
 
     python -m benchmarks.planted --data DATA                       # all sets, one of each kind and size an image
     python -m benchmarks.planted --data DATA --set triplet --kind jump --seeds 0-4 --json planted.json
+    python -m tests.scenes large --views 2 --size 5000 5000 && python -m benchmarks.planted --images large/view_0*.tif
 """
 
 from __future__ import annotations
@@ -180,7 +181,8 @@ def shared(clean: Clean, view: int) -> Array:
 
 def _shown(clean: Clean, view: int, size: tuple[int, int], plant: Plant | None) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Return places on a grid over a view (N, 2) [px], and which of them all views see."""
-    axes = [np.arange(4.0, length - 4.0, 8.0) for length in size]
+    step = max(8.0, max(size) / 128.0)
+    axes = [np.arange(4.0, length - 4.0, step) for length in size]
     xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     places = _places(clean, view, xy, plant)
     inside = [((p > 10) & (p < np.array(v.size) - 11)).all(axis=1) for p, v in zip(places, clean.views, strict=True)]
@@ -281,7 +283,8 @@ def _summary(results: Sequence[Result]) -> str:
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder that holds optical/")
+    parser.add_argument("--data", type=Path, default=Path(), help="folder that holds optical/")
+    parser.add_argument("--images", nargs="+", help="a set of these images instead")
     parser.add_argument("--set", nargs="*", choices=[*SETS], default=[*SETS])
     parser.add_argument("--kind", nargs="*", choices=[*SIZES], default=[*SIZES])
     parser.add_argument("--sizes", nargs="*", type=float, help="of the plants [px]; all by default")
@@ -290,8 +293,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     given = parser.parse_args(argv)
     first, _, last = given.seeds.partition("-")
     warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    SETS["images"] = [str(Path(path).resolve()) for path in given.images or ()]
     results = []
-    for name in given.set:
+    for name in ["images"] if given.images else given.set:
         start = clean(name, given.data)
         print(f"{name}: untouched {start.seconds:.1f} CPU s", flush=True)
         for seed in range(int(first), int(last or first) + 1):

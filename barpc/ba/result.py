@@ -112,7 +112,7 @@ class Adjustment:
     control : ControlTest or None
         Ground control points against each other and the cameras.
     gcp_w, reference_w : (M,), (R,)
-        Baarda's w of the observations of GCPs and of a reference's points (`judging.snooping.image_test`);
+        Baarda's w of the observations of GCPs and of a reference's points (`control.snooping.image_test`);
         NaN for those that do not count, and of a large reference for all but every n-th.
     gcp_inlier : (M,)
         Observations of GCPs that were kept.

@@ -117,7 +117,9 @@ class Earlier:
 
     def near(self, views: Sequence[View], tie: TieOptions) -> list[int]:
         """Return the images whose outlines meet those of views that may be off, the largest common areas of each."""
-        grown = Footprints(views, float(np.median([v.altitude for v in views])), [reach_of(v, tie) for v in views])
+        grown = Footprints(
+            views, float(np.median([v.altitude for v in views])), [reach_of(v, tie.search) for v in views]
+        )
         usable = [image for image in self.images if image.outline]
         rings = np.array([image.outline for image in usable]).reshape(len(usable), -1, 2)
         outlines = np.atleast_1d(np.asarray(shapely.polygons(grown.plane(rings)), dtype=object))
@@ -270,7 +272,7 @@ def chosen_pairs(views: Sequence[View], is_old: Sequence[bool], tie: TieOptions)
     """Return the pairs to match: of each new view the best partners, old or new."""
     pairs = sorted(overlapping_pairs(views, tie), key=lambda pair: (-pair.score, pair.views))
     if not any(is_old[i] != is_old[j] for i, j in (pair.views for pair in pairs)):
-        reaches = [reach_of(view, tie) for view in views]
+        reaches = [reach_of(view, tie.search) for view in views]
         pairs = sorted(overlapping_pairs(views, tie, reaches), key=lambda pair: (-pair.score, pair.views))
     taken, chosen = [0] * len(views), []
     for pair in pairs:

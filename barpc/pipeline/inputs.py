@@ -302,7 +302,7 @@ def _load_control(
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
     points, said = _with_altitudes(_with_height_above_dem(dem, points, options), views, options, dem)
     out, keep = [], np.ones(len(points.names), dtype=bool)
-    search = np.array([reach_of(view, options.tie) for view in views])[points.view]
+    search = np.array([reach_of(view, options.tie.search) for view in views])[points.view]
     for wrong, what in _implausible(points, views, search):
         names = [points.names[g] for g in np.flatnonzero(wrong & keep)]
         if names:

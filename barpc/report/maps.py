@@ -149,6 +149,7 @@ def ground_map(files: RunFiles) -> str:
         dots=plane(evenly(files.points, MAX_MARKS)[:, :2]).tolist(),
         groups=[(sentence, *plane(ends).ravel()[[0, 3, 2, 1]].tolist()) for sentence, ends in groups],
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
+        gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
         pairs=_pair_lines(middles, files),
         shown=_map_labels([(view, middles[view.name]) for view in named], taken, triangles),
         marks=[(kind, point.name, x, y, up) for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)],
@@ -315,6 +316,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         for (i, j), rms in np.ndenumerate(cells.rms)
         if np.isfinite(rms)
     ]
+    gaps = [((np.array(view.gap)[:, 2:] + 0.5) * (box / view.size)).tolist()] if view.gap else []
     found = np.argwhere(cells.systematic)
     arrows = [_arrow(side * (j + 0.5, i + 0.5), cells.mean[i, j] * (2 * _ARROW_LENGTH / longest)) for i, j in found]
     text: str = template("drawings.svg.j2").module.panel(
@@ -324,10 +326,11 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         width=box[0],
         height=box[1],
         cells=heat,
+        gaps=gaps,
         shafts=np.hstack([start, start + drawn[:, 2:] * (_ARROW_LENGTH / longest)]).tolist(),
         arrows=arrows,
         bar=_ARROW_LENGTH,
-        described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}.",
+        described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}{'; shaded: few tie points' * len(gaps)}.",
     )
     return text
 

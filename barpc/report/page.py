@@ -175,8 +175,9 @@ def _map_section(files: RunFiles) -> Section:
     lonely = [view.name for view, n in zip(summary.views, partners, strict=True) if n == 1 and num > 2]
     caption = (
         "Footprints at the altitude of the scene, those that need review on top; dots: tie points; triangles: GCPs; "
-        "inverted triangles: check points; thicker lines: more matches; dashed: tie points that move."
+        "inverted triangles: check points; thicker lines: more matches; dashed: tie points that move"
     )
+    caption += "; shaded: rows or columns with few tie points." if any(view.gap for view in summary.views) else "."
     if num > MAX_SHOWN:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
     facts = {"groups": len(connected_groups(num, links)), "lonely": lonely, "by_length": summary.tracks.by_length}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from barpc.report.quality_checks import (
 from barpc.report.ranking import flagged
 from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
-from barpc.report.summary.block import explanations, held_out_places, left_entries
+from barpc.report.summary.block import AXES, explanations, held_out_places, left_entries
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
@@ -106,7 +107,12 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if (found := run.adjustment) is None:
         return
     if len(run.tracks):
-        yield from (*_of_cameras(found), *_of_places(run, found, views), *_of_solution(run, found))
+        yield from (
+            *_of_cameras(found),
+            *_of_places(run, found, views),
+            *_of_same_ground(run, found),
+            *_of_solution(run, found),
+        )
     yield from dem_reasons(found)
     yield from datum_reasons(run.datums, found)
 
@@ -174,6 +180,23 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
             f"Moving objects explain the tie points that move together hardly better than {TERMS[rival].NOUN}: "
             "check where these tie points lie."
         )
+
+
+def _of_same_ground(run: Run, found: Adjustment) -> Iterator[str]:
+    """Yield displaced rows of several images that show the same ground: cameras err by their times, not by places."""
+    rows = [one for one in explanations(found) if (term := TERMS.get(one.name)) and term.LOCAL and one.axis == AXES[1]]
+    for one, other in combinations(rows, 2):
+        first, second = (run.number[str(each.image)] for each in (one, other))
+        middle = np.array([(0.5 * run.views[first].size[0], row) for row in (one.first, one.last)])
+        ground = run.cameras[first].localize(middle, np.full(2, run.altitude))
+        low, high = np.sort(run.cameras[second].project(ground)[:, 1])
+        common = min(high, other.last) - max(low, other.first)
+        if first != second and 2.0 * common > max(high, other.last) - min(low, other.first):
+            said = " and ".join(f"{each.first:.0f}-{each.last:.0f} of {each.image}" for each in (one, other))
+            yield (
+                f"Rows {said} show the same ground: moving objects there (clouds, water) are a likelier cause than "
+                "displaced rows in both images."
+            )
 
 
 def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Expected density of tie points, by detail that partners see, and gaps in it."""
+"""Expected density of tie points, by the keypoints that partners see, and its gaps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Seen = tuple[Array, Array, tuple[int, int]]
 
 @dataclass(frozen=True)
 class Gap:
-    """Columns (axis 0) or rows (1), `first` to `last` [px], with few tie points where many are to be expected."""
+    """Columns (axis 0) or rows (1), `first` to `last` [px], with few tie points where keypoints make many expected."""
 
     axis: int
     first: float
@@ -33,7 +33,7 @@ class Gap:
 
 
 def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[Seen]) -> IntArray:
-    """Count the keypoints that any partner sees, as its matches let expect, in parts of columns and rows (2, PARTS).
+    """Count the keypoints that any partner sees, by an affine of its matches, in parts of columns and rows (2, PARTS).
 
     Those count that are as strong as most that tie: on water noise is found, too.
     """
@@ -62,7 +62,7 @@ def in_parts(xy: Array, size: tuple[int, int]) -> IntArray:
 
 
 def gap(detail: IntArray, ties: IntArray, size: tuple[int, int]) -> Gap | None:
-    """Return the columns or rows in which tie points (2, PARTS) lack most surely, if any do, by their keypoints.
+    """Return the columns or rows with the most significant lack of tie points (2, PARTS), given the keypoints, if any.
 
     They are to be as many a keypoint as beside it, over its own length on either side, or in all, where these are
     fewer; the keypoints of all its parts are taken to be those of its poorest: water, with a shore, has none to lack.

@@ -15,7 +15,6 @@ from rasterio.windows import Window
 
 from barpc.base.errors import ImageError
 from barpc.base.geodesy import Array
-from barpc.base.options import TieOptions
 from barpc.rasters.raster import BLOCK_SIZE, open_raster
 from barpc.scene import BoolArray
 
@@ -33,6 +32,8 @@ SPAN = BLOCK_SIZE
 PIECE = 1 << 22
 """Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
 _STRETCH_BLOCKS = 5  # blocks a side whose pixels make the stretch
+_PERCENT = 0.5, 99.5  # of them that are black and white
+_WHITE = 255.0
 _NEGLIGIBLE = 8.0  # a range below so many steps of a float type is a constant image
 
 
@@ -46,10 +47,10 @@ class Stretch:
     @staticmethod
     def of(values: Pixels) -> Stretch | None:
         """Return the stretch of the middle 99 % of some 100,000 of the values (N,); None where nothing varies."""
-        return Stretch.between(values[:: 1 + len(values) // 100_000], (0.5, 99.5))
+        return Stretch.between(values[:: 1 + len(values) // 100_000])
 
     @staticmethod
-    def between(values: Pixels, percent: tuple[float, float], least: float = 0.0) -> Stretch | None:
+    def between(values: Pixels, least: float = 0.0, percent: tuple[float, float] = _PERCENT) -> Stretch | None:
         """Return the stretch between two percentiles of values (N,); None where they differ by `least` or less."""
         low, high = np.percentile(values, percent) if len(values) else (0.0, 0.0)
         varies = high / 2 - low / 2 > least * max(abs(low), abs(high)) / 2  # halves: a difference may have no number
@@ -58,7 +59,7 @@ class Stretch:
     def apply(self, pixels: Pixels, valid: BoolArray) -> ByteImage:
         """Return an 8-bit picture; invalid pixels take the mean of the valid ones, so that they make few edges."""
         if pixels.dtype == np.float32:
-            scaled = (pixels - np.float32(self.low)) * np.float32(255.0 / (self.high - self.low))
+            scaled = (pixels - np.float32(self.low)) * np.float32(_WHITE / (self.high - self.low))
         else:
             scaled = _contrast_stretched(pixels, self.low, self.high)
         if not valid.all():
@@ -71,8 +72,8 @@ def _contrast_stretched(pixels: Pixels, low: float, high: float) -> FloatImage:
     """Return `low` and `high` as black and white; whatever the scale, nothing overflows."""
     with np.errstate(over="ignore"):
         share = (pixels / 2 - low / 2) / (high / 2 - low / 2)  # halves: a difference may have no number
-    most = 255.0**2  # beyond it a pixel would drown its surroundings
-    return np.clip(share * 255.0, -most, most).astype(np.float32)
+    most = _WHITE**2  # beyond it a pixel would drown its surroundings
+    return np.clip(share * _WHITE, -most, most).astype(np.float32)
 
 
 def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
@@ -83,7 +84,7 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
     if pixels.dtype == np.float32:
         return pixels.astype(np.float32, copy=False)
     known = pixels[valid]
-    stretch = Stretch.of(known) or Stretch.between(known, (0.0, 100.0))
+    stretch = Stretch.of(known) or Stretch.between(known, percent=(0.0, 100.0))
     if stretch is None:
         return np.zeros(pixels.shape, np.float32)
     return np.where(valid, _contrast_stretched(pixels, stretch.low, stretch.high), np.float32(0.0))
@@ -127,7 +128,7 @@ class PixelReader(ExitStack):
 
 
 class OpenReaders(ExitStack):
-    """Each `PixelReader` that was asked for, opened once and kept open."""
+    """Readers (`PixelReader`), each opened once and kept open."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -142,13 +143,13 @@ class OpenReaders(ExitStack):
 
 
 def _picture_factors(dataset: Any, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the columns and rows of a raster that one pixel of its picture of a size (width, height) holds."""
+    """Return the columns and rows of a raster in a pixel of its picture of a size (width, height)."""
     width, height = size or (dataset.width, dataset.height)
     return max(1, dataset.width // width), max(1, dataset.height // height)
 
 
 def _block_means(band: _RasterBand, box: Box, pixel: tuple[int, int], level: int = 1) -> tuple[Pixels, BoolArray]:
-    """Return the pixels of a window whose sides hold so many of the file's, as means; valid where all of these are."""
+    """Return the pixels of a window, means of `pixel` (columns, rows) of the file's; valid where all of these are."""
     if pixel == (1, 1):
         return band.read(box, level)
     (col, row, width, height), (wide, high), parts = box, pixel, []
@@ -166,7 +167,7 @@ def _block_means(band: _RasterBand, box: Box, pixel: tuple[int, int], level: int
 
 @dataclass(frozen=True, eq=False)
 class _RasterBand:
-    """A band of an open raster, and what is known of all its windows."""
+    """A band of an open raster, and its properties common to all windows."""
 
     dataset: Any
     number: int
@@ -226,7 +227,7 @@ def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int,
                 pixels, valid = _block_means(read, box, pixel, zoom)
                 found.append(pixels[valid][::7].astype(np.float64))
     step = float(np.finfo(kind).eps) if kind.kind == "f" else 0.0
-    return Stretch.between(np.concatenate(found), (0.5, 99.5), _NEGLIGIBLE * step)
+    return Stretch.between(np.concatenate(found), _NEGLIGIBLE * step)
 
 
 @dataclass(frozen=True)
@@ -237,6 +238,7 @@ class Survey:
     block: tuple[int, int]  # width and height of what is decoded at a time [px]
     levels: bool  # decoding is dear, and every second or fourth pixel costs less (JPEG 2000)
     pixel: tuple[int, int] = (1, 1)  # columns and rows of the file that a pixel holds
+    band: int = 1
 
 
 def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
@@ -247,17 +249,15 @@ def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | 
         wide, high = pixel = _picture_factors(dataset, size)
         levels = pixel == (1, 1) and _overview_factor(dataset, band) > 1
     block = max(1, width // wide), max(1, height // high)
-    return None if stretch is None else Survey(stretch, block, levels, pixel)
+    return None if stretch is None else Survey(stretch, block, levels, pixel, band)
 
 
 def _overview_factor(dataset: Any, band: int) -> int:
-    """Return so many pixels a side are seen as one at less cost: 4 (and 2, then) where decoding is dear, else 1."""
+    """Return the side [px] of pixels that overviews average at less cost: 4 (and 2) where decoding is dear, else 1."""
     return 4 if getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
 
 
-def read_picture(
-    path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1, band: int = 1
-) -> tuple[ByteImage, BoolArray]:
+def read_picture(path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1) -> tuple[ByteImage, BoolArray]:
     """Read an 8-bit picture of a window and its valid pixels, each of `zoom` px a side; see `read_pixels`.
 
     `box` begins at whole multiples of `zoom`. Blocks are decoded once, row by row of them.
@@ -267,7 +267,7 @@ def read_picture(
     valid = np.empty(picture.shape, dtype=bool)
     level = zoom if found.levels else 1
     with open_raster(path) as dataset:
-        read = _RasterBand.of(dataset, path, band)
+        read = _RasterBand.of(dataset, path, found.band)
         step = zoom * found.block[1]
         step *= max(1, SPAN // step)
         top = row
@@ -303,13 +303,13 @@ def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
-def tiles(size: tuple[int, int], options: TieOptions, zoom: int = 1, found: Survey | None = None) -> list[Box]:
+def tiles(size: tuple[int, int], tile: int, zoom: int = 1, found: Survey | None = None) -> list[Box]:
     """Return the boxes that cover an image of `size` (width, height) without overlap, cut at whole cells.
 
-    A side is `options.tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
+    A side is `tile` times `zoom` px; strips are taken whole, and so are blocks that are dear to
     decode.
     """
-    sides = [zoom * options.tile] * 2
+    sides = [zoom * tile] * 2
     if found is not None and found.block[0] >= size[0]:
         sides[0] = max(sides[0], size[0])
     if found is not None and found.levels:

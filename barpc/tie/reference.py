@@ -28,9 +28,10 @@ from barpc.tie.pixels import CELL, SPAN, FloatImage
 from barpc.tie.tasks import HERE, Work
 
 VOTE_RADIUS = 150.0  # m: how far a camera may be off
-PEAK = 6.5  # a vote that stands out by fewer standard deviations is none: other places reach 5.1
+PEAK = 6.5  # a vote whose peak has fewer standard deviations is none: other places reach 5.1
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _VOTE_RESOLUTION, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
+_VOTE_REFINEMENT = 4.0  # times, the second vote
 _MIN_PICTURE_SHARES = 0.5, 0.3  # of a block and of the reference around it
 _MIN_AGREEING_POINTS = TieOptions().min_matches  # points that agree in a view
 _DECOY_MARGIN = 0.1  # by which a correlation beats its decoy's
@@ -41,7 +42,7 @@ class ViewMatch:
     """Result of matching a view to a reference."""
 
     name: str
-    peak: float  # standard deviations by which the vote's peak stands out
+    peak: float  # standard deviations of the vote's peak above the median
     offset: tuple[float, float]  # how far off the camera shows everything, east, north [m]
     tried: int = 0  # points looked for
     passed: int = 0  # that beat their decoys and came back
@@ -76,16 +77,16 @@ class ReferenceControl:
 
     @property
     def refusal(self) -> str:
-        """Reason why a reference is no control, in words without an end."""
+        """Reason why a reference is no control, as a clause."""
         best = max(self.views, key=lambda view: view.peak, default=ViewMatch("", 0.0, (0.0, 0.0)))
         if best.peak < PEAK:
             return (
-                f"does not show what the images show (its highest peak stands out by {best.peak:.1f} standard "
-                f"deviations, {PEAK:g} are needed)"
+                f"does not show what the images show (its highest peak has {best.peak:.1f} standard deviations, "
+                f"{PEAK:g} are needed)"
             )
         tried, passed = sum(view.tried for view in self.views), max(view.passed for view in self.views)
         return (
-            f"shows the place of the images (its highest peak stands out by {best.peak:.1f} standard deviations), but "
+            f"shows the place of the images (its highest peak has {best.peak:.1f} standard deviations), but "
             f"of {tried} points looked for there no {_MIN_AGREEING_POINTS} of an image agree with "
             f"each other ({passed} found at most)"
         )
@@ -155,7 +156,7 @@ def vote(view: View, band: int, paths: tuple[str, ...], patch: Patch, reach: int
 def search(
     view: View, band: int, paths: tuple[str, ...], patch: Patch, points: Array, reach: int
 ) -> tuple[Array, BoolArray]:
-    """Find points x, y (n, 2) [px] of the reference on a patch in an image: shifts, and whether they beat decoys."""
+    """Match points x, y (n, 2) [px] of the reference on a patch with an image: shifts, and whether they beat decoys."""
     tile = PatchTile.same((of_reference(paths, patch), of_image(view, band, patch)), points, reach, HALF)
     place, ok, score = tile.found()
     return place - tile.at, ok & (score > tile.decoys() + _DECOY_MARGIN) & tile.shown(1, place) & tile.returns(place)
@@ -191,7 +192,7 @@ def peak(votes: Sequence[FloatImage | None]) -> tuple[float, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _PointTile:
-    """Points of a view that are looked for together."""
+    """Points of a view that are searched together."""
 
     points: IntArray  # which
     patch: Patch
@@ -200,7 +201,7 @@ class _PointTile:
 
 @dataclass(frozen=True, eq=False)
 class _ReferenceWork:
-    """Views and what they are registered to."""
+    """Views, and the orthoimages and terrain that they are registered to."""
 
     views: tuple[View, ...]
     sheets: list[Sheet]
@@ -220,7 +221,9 @@ class _ReferenceWork:
         if coarse == self.step:
             return found
         near = [shift for _, shift in found]
-        again = self._votes(near, max(self.step, coarse / 4.0), 4.0 * coarse, "reference: second vote")
+        again = self._votes(
+            near, max(self.step, coarse / _VOTE_REFINEMENT), _VOTE_REFINEMENT * coarse, "reference: second vote"
+        )
         return [(z, shift) for (z, _), (_, shift) in zip(found, again, strict=True)]
 
     def _votes(self, moved: Sequence[Array], step: float, reach: float, stage: str) -> list[tuple[float, Array]]:
@@ -254,7 +257,7 @@ class _ReferenceWork:
         ]
 
     def search(self, votes: Sequence[tuple[float, Array]], accuracy: Accuracy) -> ReferenceControl:
-        """Return the points looked for in every view whose vote stands out, and what they make."""
+        """Return the control from points searched in every view with a significant vote."""
         places, heights = self._lattice([view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK])
         reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
         tiles = [

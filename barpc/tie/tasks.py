@@ -53,7 +53,7 @@ def one_by_one(
     progress: Progress | None = None,
     ahead: int | None = None,
 ) -> Iterator[Any]:
-    """Run tasks as `ordered`, but yield each result as it comes; at most `ahead` are handed in at a time."""
+    """Run tasks as `ordered`, but yield each result once it is known; at most `ahead` are submitted at a time."""
     waiting, futures = iter(tasks), deque[Future[Any]]()
     try:
         for done, task in enumerate(tasks, start=1):
@@ -106,7 +106,7 @@ class Store:
         return found
 
     def clear(self) -> None:
-        """Remove what lies under `scratch`."""
+        """Remove the files under `scratch`."""
         shutil.rmtree(Path(self.folder) / self.scratch, ignore_errors=True)
 
 
@@ -130,7 +130,7 @@ def names_of(executor: Executor | None, function: Callable[..., Any], tasks: Seq
 
 @dataclass(frozen=True)
 class Work:
-    """Who works on tasks (None: this process), who is told, and where results lie that travel by reference."""
+    """Executor of tasks (None: this process), listener for progress, and store of results that travel by reference."""
 
     executor: Executor | None = None
     progress: Progress | None = None

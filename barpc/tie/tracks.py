@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 NEEDED = 4
 """Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
 _QUOTAS = (4, 8, 16)
-"""Tracks that a cell takes, round by round; with the first an image of full cells holds what is asked for."""
+"""Tracks that a cell takes, round by round; with the first an image of full cells holds the number wanted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,14 @@ def _registered_tracks(
     theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN_PAIR}
     verified = {ends: found for ends, found, _ in tried if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
-    if unlike := _with_pictures(looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options, work):
+    if unlike := _with_pictures(
+        looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options.band, work
+    ):
         tracks = refine(looks.views, linked, spreads, options, structural=[*structural, *unlike], work=work)
         counts = pair_counts(tracks)
         if trials.rematch({pair: counts.get(pair, 0) for pair in _unlike(linked, tracks, unlike)}):
             return _registered_tracks(trials, scope, options, work)
-    needed = theirs | _needed(looks, tracks, list(verified), options)
+    needed = theirs | _needed(looks, tracks, list(verified), options.min_matches)
     known = {ends: found for ends, found in verified.items() if ends in needed}
     exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
     bare = {
@@ -134,18 +136,16 @@ def _registered_tracks(
     return looks.tracks(thin(tracks_inside(looks.views, tracks, area), sizes, most)), bare
 
 
-def _needed(
-    looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], options: TieOptions
-) -> set[tuple[int, int]]:
-    """Return the pairs of looks between views that no pair with enough registered tracks connects."""
+def _needed(looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], least: int) -> set[tuple[int, int]]:
+    """Return the pairs of looks between views not connected by pairs with enough registered tracks."""
     counts = pair_counts(tracks)
-    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= options.min_matches]
+    firm = [(int(looks.of[i]), int(looks.of[j])) for i, j in pairs if counts.get((i, j), 0) >= least]
     part = connected_labels(int(looks.of.max()) + 1, firm)[looks.of]
     return {(i, j) for i, j in pairs if part[i] != part[j]}
 
 
 class _Trials:
-    """Pairs that are tried, round by round, until the views are tied or nothing is left to try."""
+    """Matching of pairs, round by round, until the views are tied or no pair remains."""
 
     def __init__(self, views: Sequence[View], options: TieOptions, scope: Scope, work: Work) -> None:
         self._views, self._options, self._work = views, options, work
@@ -214,7 +214,7 @@ class _Trials:
         return tuple(count.astype(int).tolist())
 
     def detail(self) -> tuple[IntArray, ...]:
-        """Return the keypoints of every view that partners see with which keypoints tie it, as `seen_detail` counts.
+        """Return the counts of keypoints of every view seen by partners that keypoints tie to it: `seen_detail`.
 
         None of an area of interest: beside it no tie points are wanted.
         """
@@ -255,8 +255,9 @@ class _Trials:
             self.tried[pair.views] = pair, *beside_given(one, self._beside.get(pair.views))
 
     def rematch(self, registered: Mapping[tuple[int, int], int]) -> bool:
-        """Match pairs of looks of whose matches given only so many could be `registered`; return whether own matches
-        took the place of any: of these more can be, and enough.
+        """Match pairs of looks with only so many `registered` given matches; return whether own matches replace any.
+
+        They do where more of them can be registered, and enough.
         """
         looks, options, of = self.looks, self._options, self.looks.of
         pairs = [self.tried[int(of[i]), int(of[j])][0] for i, j in registered]
@@ -275,7 +276,7 @@ class _Trials:
     def _matched(
         self, pairs: Sequence[Pair], before: Sequence[tuple[tuple[View, View], Matches]]
     ) -> list[tuple[Matches, PairReport]]:
-        """Return matches of pairs of looks by a first look, and by a closer one where that shows too little."""
+        """Match pairs of looks at reduced resolution, and at full resolution where that finds too few."""
         views, options, keypoints = self.looks.views, self._options, self._keypoints
         first = first_look(views, keypoints, pairs, options, self._work) if self._coarse else []
         found = {p.views: one for p, one in zip(pairs, first, strict=False) if self._is_ample(p, *one)}
@@ -291,7 +292,9 @@ class _Trials:
 
     def _is_ample(self, pair: Pair, found: Matches, report: PairReport) -> bool:
         i, j = pair.views
-        return ample(report, self._options) and not stretched((self.looks.views[i], self.looks.views[j]), *found.ends)
+        return ample(report, self._options.points_per_image) and not stretched(
+            (self.looks.views[i], self.looks.views[j]), *found.ends
+        )
 
     def _looked_closer(self, pairs: Sequence[Pair], ground: GroundAltitudes) -> list[tuple[Matches, PairReport]]:
         """Match pairs of looks by keypoints of their own."""
@@ -304,7 +307,7 @@ class _Trials:
 
 
 def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the pairs whose grey values do not compare: too few of their matches could be registered by these.
+    """Return the pairs with unlike grey values, by which too few of their matches could be registered.
 
     Of tracks that only both see, where there are enough: in others a third view may be what does not compare.
     """
@@ -323,17 +326,17 @@ def _of_two(tracks: Tracks) -> Tracks:
 
 
 def _with_pictures(
-    views: Sequence[View], pairs: Sequence[tuple[int, int]], options: TieOptions, work: Work
+    views: Sequence[View], pairs: Sequence[tuple[int, int]], band: int, work: Work
 ) -> list[tuple[int, int]]:
-    """Return the pairs of images that vary: where nothing does, nothing else can be compared either."""
+    """Return the pairs of images with detail: structure compares no uniform image either."""
     some = sorted({view for pair in pairs for view in pair})
-    stretches = work.ordered(sample_stretch, [(views[i].path, options.band, views[i].size) for i in some], "survey")
+    stretches = work.ordered(sample_stretch, [(views[i].path, band, views[i].size) for i in some], "survey")
     blank = {i for i, stretch in zip(some, stretches, strict=True) if stretch is None}
     return [pair for pair in pairs if not blank & set(pair)]
 
 
 def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatches, options: TieOptions) -> Tracks:
-    """Return the tracks, and the verified matches of those of some pairs of which too few could be registered."""
+    """Return the tracks with the verified matches of those given pairs with too few registered tracks."""
     counts = pair_counts(tracks)
     lost = [pair for pair in given if counts.get(pair, 0) < options.min_matches]
     if not lost:
@@ -348,7 +351,7 @@ def _with_unregistered(views: Sequence[View], tracks: Tracks, given: GivenMatche
 
 
 def _merge_registered(views: Sequence[View], tracks: Tracks, others: Tracks) -> Tracks:
-    """Return the registered tracks and others: those that stand beside a registered one are the same point."""
+    """Merge registered and other tracks: observations beside a registered one are the same point."""
     reach = MAX_PATCH_SHIFT + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
     known, asked = (np.array([2 * reach * part.view, *part.xy.T]).T for part in (tracks, others))
     near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=reach))
@@ -373,7 +376,7 @@ def _merge_registered(views: Sequence[View], tracks: Tracks, others: Tracks) -> 
 
 
 def tracks_inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
-    """Return the tracks whose ground points lie in an area, all without one; TiePointError where none does."""
+    """Return the tracks with ground points in an area (None: all); TiePointError where there is none."""
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
+import warnings
+from dataclasses import replace
+from pathlib import Path
 
-from benchmarks.planted import FOLLOWED, GOOD, Clean, clean, planted, plants
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from barpc.scene import View
+from benchmarks.planted import FOLLOWED, GOOD, Clean, Plant, clean, planted, plants, run
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +53,50 @@ def test_what_is_planted_is_followed_and_named(start, tmp_path, name, kind, size
     assert found.error <= FOLLOWED, found.line()
     assert found.worst <= GOOD, found.line()
     assert found.image in found.words[2], found.line()
+
+
+def moved(untouched: Clean, box: tuple[int, int, int, int], by: tuple[float, float], folder: Path) -> list[View]:
+    """The images with the ground of a box (first and last col and row of the first image) moved by `by` (col, row) px
+    from each to the next, as clouds move while a satellite passes."""
+    inside = np.stack(np.meshgrid(*(np.linspace(*ends, 9) for ends in (box[:2], box[2:]))), axis=-1).reshape(-1, 2)
+    ground, views = untouched.on_ground(0, inside), []
+    for number, (view, sensor) in enumerate(zip(untouched.views, untouched.sensors, strict=True)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(view.path) as file:
+                pixels, profile = file.read(1), {**file.profile, "driver": "GTiff"}
+            step = (number * by[0], number * by[1])
+            shifted = Plant("jump", number, 1, 0, step).pixels(pixels.astype(np.float64))
+            there = np.rint(np.median(sensor.project(ground) - inside, axis=0)).astype(int)
+            (left, top), (right, bottom) = ([box[::2], box[1::2]] + there).clip(0)
+            part = np.s_[top:bottom, left:right]
+            pixels[part] = np.rint(shifted[part]).clip(1, 60000)
+            path = folder / f"{view.name}.tif"
+            with rasterio.open(path, "w", **profile) as file:
+                file.write(pixels, 1)
+        views.append(replace(view, path=str(path)))
+    return views
+
+
+@pytest.mark.slow
+@pytest.mark.landing(3)
+@pytest.mark.parametrize(
+    ("name", "box", "by", "said"),
+    [
+        ("triplet", (300, 620, 150, 330), (2.0, 0.0), "8 % of the tie points"),  # across the baseline
+        ("triplet", (0, 1024, 200, 300), (2.0, 0.0), "show the same ground: moving objects"),  # of all columns
+        ("pair 12", (0, 1024, 200, 300), (2.0, 0.0), "or it moves) are displaced by"),  # two images do not tell
+        ("pair 12", (300, 620, 150, 330), (1.0, 1.0), "of the tie points"),
+        ("triplet", (300, 620, 150, 330), (0.0, 6.0), "of the tie points"),  # along it: a height, and an image too far
+        ("triplet", (0, 1024, 200, 300), (1.0, 1.0), "show the same ground: moving objects"),
+    ],
+)
+def test_ground_that_moves_within_a_pass_is_said_to_move(start, tmp_path, name, box, by, said) -> None:
+    result = run(moved(start(name), box, by, tmp_path))[0]
+    words = result.summary["verdict"]
+    assert any(said in text for text in words), words
+    local = "of the tie points" in said
+    assert any("move together" in text for text in words) is local
+    assert any("displaced" in text for text in words) is not local
+    if local:
+        assert sum(view["num_moving"] for view in result.summary["views"]) > 0

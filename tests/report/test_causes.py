@@ -37,15 +37,17 @@ def reasons(found: Any) -> list[str]:
     [
         (
             "step", 1, (1, 4999.4, 12000.0, 0.0, 0.0), (3.0, 4.0),
-            "rows 5000-5999 of east (or the same ground in west) are displaced by 5.00 px", (5000.0, 5999.0),
+            "rows 5000-5999 of east (or the same ground in west, or it moves) are displaced by 5.00 px",
+            (5000.0, 5999.0),
         ),
         (
             "step", 0, (0, -8000.0, 100.0, 0.0, 0.0), (0.0, -0.5),
-            "columns 0-99 of west (or the same ground in east) are displaced by 0.50 px", (0.0, 99.0),
+            "columns 0-99 of west (or the same ground in east, or it moves) are displaced by 0.50 px", (0.0, 99.0),
         ),
         (
             "decay", 0, (1, -12000.0, 24000.0, 0.0, 1 / 400.0), (2.0, 0.0),
-            "rows of west (or the same ground in east) are displaced by 2.00 px at row 0, decaying in 400 rows",
+            "rows of west (or the same ground in east, or it moves) are displaced by 2.00 px at row 0, decaying in 400 "
+            "rows",
             (0.0, 11999.0),
         ),
         ("low_frequency", 1, None, (0.3, 0.4),
@@ -96,6 +98,35 @@ def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sente
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
     assert found.candidates == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
+
+
+def same_ground(run: Any, *found: tuple[str, int, int, float, float]) -> list[str]:
+    """What is said of findings: kind, view, axis, first and last row."""
+    size, rate = np.ones(2), 0.01
+    findings = [Finding(kind, v, (axis, *ends, 0.0, rate), size, 9.0, 9.0, "", size) for kind, v, axis, *ends in found]
+    return list(verdict._of_same_ground(run, replace(run.adjustment, findings=tuple(findings))))
+
+
+def test_rows_of_two_images_over_the_same_ground_are_said_to_move(block_run) -> None:
+    """Neither rows over other ground, nor columns, nor two parts of one image; rows that run on past an end count."""
+    run = block_run.run
+    (width, height), (one, two) = run.views[0].size, (run.cameras[v] for v in (0, 1))
+
+    def there(first: float, last: float) -> tuple[float, float]:
+        ground = one.localize(np.column_stack([np.full(2, width / 2), (first, last)]), np.full(2, run.altitude))
+        return tuple(np.sort(two.project(ground)[:, 1]))
+
+    low, high = 0.4 * height, 0.5 * height
+    (said,) = same_ground(run, ("step", 0, 1, low, high), ("decay", 1, 1, *there(low, high)))
+    (first, last), (a, b) = np.ceil(there(low, high)), [view.name for view in run.views[:2]]
+    assert said.startswith(f"Rows {low:.0f}-{high - 1:.0f} of {a} and {first:.0f}-{last - 1:.0f} of {b} show the same")
+    half = there(low + 0.6 * (high - low), high + 0.6 * (high - low))  # of which less than half is in common
+    assert same_ground(run, ("step", 0, 1, low, high), ("step", 1, 1, *half)) == []
+    assert same_ground(run, ("step", 0, 1, low, high), ("step", 0, 1, low, high)) == []
+    assert same_ground(run, ("step", 0, 0, low, high), ("step", 1, 0, *there(low, high))) == []
+    assert same_ground(run, ("low_frequency", 0, 1, low, high), ("step", 1, 1, *there(low, high))) == []
+    past = ("step", 0, 1, -9.0 * height, height / 2), ("step", 1, 1, -9.0 * height, there(0, height / 2)[1])
+    assert len(same_ground(run, *past)) == 1
 
 
 @pytest.mark.parametrize(("rate", "end"), [(0.01, "beginning"), (-0.01, "end")])

@@ -13,6 +13,7 @@ import pytest
 
 from barpc.report import maps
 from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
+from barpc.report.page import _map_section
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.ground_points import CheckPointEntry
 
@@ -177,6 +178,31 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     )
     assert (drawn.titles("gcps"), drawn.titles("check_points")) == (["P"], ["Q"])
     assert drawn.described == "3 outlines, 3 pairs, 1 GCPs, 1 check points."
+
+
+def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
+    """Across the antimeridian, too; images without any have none, and a page says so only where there are some."""
+    pixels = [(-0.5, 199.5), (999.5, 199.5), (999.5, 299.5), (-0.5, 299.5)]
+    for lon in (10.0, 180.0):
+        ground = [(lon - 0.01, 0.005), (lon + 0.01, 0.005), (lon + 0.01, 0.0025), (lon - 0.01, 0.0025)]
+        band = tuple((*place, *pixel) for place, pixel in zip(ground, pixels, strict=True))
+        views, outlines = [a_view("A"), a_view("B", gap=band, status="doubtful")], [a_square(lon, 0.0)] * 2
+        files = files_of(a_summary(views), outlines)
+        drawn = Drawing(ground_map(files))
+        (shaded,) = drawn.points("gap")
+        assert np.array(shaded) == pytest.approx(
+            maps._plane_of(np.concatenate([*chain(*outlines)]))(np.array(ground)), abs=0.006
+        )
+        assert drawn.titles("gap") == ["B: few tie points here"]
+        (first, _), (second, _) = residual_panels(views, files.observations, "after")[0]
+        assert Drawing(first).points("gap") == []
+        assert "few tie points" not in Drawing(first).described
+        assert Drawing(second).points("gap") == [[(0, 36), (180, 36), (180, 54), (0, 54)]]  # 800 rows on 144 units
+        assert Drawing(second).described.endswith("; shaded: few tie points.")
+        caption = _map_section(files).charts[0][1]
+        assert caption.endswith("; shaded: rows or columns with few tie points.")
+        plain = _map_section(files_of(a_summary(views[:1]), outlines[:1])).charts[0][1]
+        assert plain.endswith("dashed: tie points that move.")
 
 
 def test_where_tie_points_move_is_outlined_and_says_so():

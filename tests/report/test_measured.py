@@ -22,6 +22,7 @@ from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbe
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.image_corrections import RowSpline
+from barpc.tie.detail import Gap
 from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm
 
@@ -103,6 +104,26 @@ def test_the_circle_of_ninety_per_cent_is_that_of_an_integral(minor):
     inside = np.mean((1.0 - np.exp(-0.5 * radius**2 * inverse)) / (inverse * minor))
     assert inside == pytest.approx(0.9, abs=1e-5)
     assert ce90(3.0, 3.0 * minor) == pytest.approx(3.0 * radius)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_rows_with_few_tie_points_are_placed_by_the_new_camera(check_run, block_run, axis: int) -> None:
+    """From the first row's upper edge to the last one's lower edge, on the ground of the scene."""
+    for finished in (check_run, block_run):
+        run = replace(finished.run)
+        run.__dict__["gaps"] = {1: Gap(axis, 100.0, 199.0, 0, 50)}
+        first, second = measure_run(run).views[:2]
+        assert first.gap is None
+        corners = np.array(second.gap)
+        model, (width, height) = (run.after or run.before)[1], run.views[1].size
+        low, high = corners[:, 2:].min(axis=0), corners[:, 2:].max(axis=0)
+        wanted = [[-0.5, -0.5], [width - 0.5, height - 0.5]]
+        wanted[0][axis], wanted[1][axis] = 99.5, 199.5
+        assert [low.tolist(), high.tolist()] == wanted
+        ground = np.column_stack([corners[:, :2], np.full(4, run.altitude)])
+        assert model.project(ground) == pytest.approx(corners[:, 2:], abs=1e-3)
+        x, y = corners[:, 2:].T
+        assert 0.5 * abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) == pytest.approx((high - low).prod())  # a ring
 
 
 @pytest.mark.parametrize("rows", [50, 333])

@@ -404,12 +404,12 @@ def test_control_that_scatters_is_said_to_unless_one_is_named():
 def test_a_reference_that_shows_something_else_is_of_no_use():
     matches = tuple(ViewMatch(name, peak, (0.0, 0.0)) for name, peak in (("A", 3.2), ("B", 5.1)))
     (line,) = reasons(reference=ReferenceControl(None, matches, 1.0, 1.0))
-    assert f"(its highest peak stands out by 5.1 standard deviations, {PEAK:g} are needed)" in line
+    assert f"(its highest peak has 5.1 standard deviations, {PEAK:g} are needed)" in line
     assert "another place, too old, or without texture. It was not used" in line
     (line,) = reasons(reference=ReferenceControl(None, (ViewMatch("A", PEAK, (0.0, 0.0)), *matches), 1.0, 1.0))
     assert "the DEM under it is of another place, or it is too old or too coarse. It was not used" in line
     (line,) = reasons(reference=ReferenceControl(None, (), 1.0, 1.0))
-    assert "by 0.0 standard" in line
+    assert "has 0.0 standard" in line
     of_use = (ViewMatch("A", 9.0, (0.0, 0.0), tried=9, points=4),)
     assert reasons(reference=ReferenceControl(SimpleNamespace(), of_use, 1.0, 1.0)) == []
 

@@ -205,7 +205,10 @@ def test_only_windows_in_the_area_are_read(tmp_path, lon) -> None:
     area = read_area(written(tmp_path / "a.json", box(west, south, east, north)))
     with chosen(TieOptions, search=10, tile=250, cell=50) as options:
         (pair,) = select_pairs(two, options, Scope(area=area))
-        boxes, shared = tiles((1000, 1000), options), shared_tiles(two, [pair], options, area)
+        boxes, shared = (
+            tiles((1000, 1000), options.tile),
+            shared_tiles(two, [pair], [tiles((1000, 1000), options.tile)] * 2, options.search, area),
+        )
     assert pair.overlap == pytest.approx(1.0)
     for kept in shared:
         assert [box in kept for box in boxes] == [True, False, False, False] * 4

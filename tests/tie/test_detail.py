@@ -113,6 +113,56 @@ def test_rows_of_another_texture_are_told_of_the_image_that_has_them(
         assert 180 <= found[1].last <= 210
 
 
+def cloud(pixels: np.ndarray) -> np.ndarray:
+    """Brighter than all else, with a texture of its own."""
+    rng, bright = np.random.default_rng(2), np.percentile(pixels, 99)
+    soft, fine = (ndimage.gaussian_filter(rng.normal(0, 1, pixels.shape), blur) for blur in (6.0, 0.8))
+    return bright * (1.0 + 0.1 * soft / soft.std()) + 6.0 * fine / fine.std()
+
+
+def sea(pixels: np.ndarray) -> np.ndarray:
+    noise = ndimage.gaussian_filter(np.random.default_rng(3).normal(0, 1, pixels.shape), 0.5)
+    return np.percentile(pixels, 2) + 3.0 * noise / noise.std()
+
+
+def turned(pixels: np.ndarray) -> np.ndarray:
+    """The same ground, in a place where no matcher looks for it."""
+    return pixels[::-1, ::-1]
+
+
+BANDS = (
+    (turned, 1, 200, 300),
+    (cloud, 1, 200, 300),
+    (cloud, 1, 200, 240),
+    (cloud, 1, 0, 60),  # strips along the edges, of which partners show the ground
+    (cloud, 1, 480, 530),
+    (cloud, 0, 0, 80),
+    (turned, 0, 400, 500),
+    (sea, 1, 200, 300),
+)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(("content", "axis", "first", "last"), BANDS)
+def test_bands_of_a_real_image_are_told_and_water_is_not(triplet, tmp_path, content, axis, first, last) -> None:
+    """Of the image that has them alone; at its ends as far as partners see its rows."""
+    views = list(triplet)
+    with open_raster(views[1].path) as image:
+        pixels = image.read(1)
+    part = np.s_[first:last] if axis else np.s_[:, first:last]
+    pixels[part] = np.rint(content(pixels[part].astype(float)).clip(1, 60000))
+    views[1] = replace(views[1], path=str(write_image(tmp_path / "changed.tif", pixels)))
+    without, found, other = lacking(views, find_tracks(views))
+    assert (without, other) == (None, None)
+    assert (found is None) is (content is sea)
+    if found is not None:
+        side = pixels.shape[1 - axis] / PARTS_PER_SIDE
+        assert found.axis == axis
+        assert first - 2 * side <= found.first <= first + 2.5 * side
+        assert last - 2 * side <= found.last <= last + 2 * side
+        assert 30 < found.expected < 300
+
+
 def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
     scene = render(views=3, size=(300, 300))
     for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):

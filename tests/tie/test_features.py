@@ -35,7 +35,7 @@ def view(path, size=(500, 400)) -> View:
 def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
     options = TieOptions(tile=256)
     count = np.zeros((700, 1000), int)
-    for col, row, width, height in tiles((1000, 700), options):
+    for col, row, width, height in tiles((1000, 700), options.tile):
         count[row : row + height, col : col + width] += 1
         assert col % 64 == 0
         assert row % 64 == 0
@@ -151,7 +151,7 @@ def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, 
     within = KeypointDensity.within
     monkeypatch.setattr(KeypointDensity, "within", lambda self, part: parts.append(part) or within(self, part))
     one = view(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:200, :300])), (300, 200))
-    monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, options, area, boxes: [boxes[0][:1]])
+    monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, boxes, *_: [boxes[0][:1]])
     with store_of(None) as store:
         locate([one], TieOptions(tile=128), Work(store=store))
         locate([one], TieOptions(tile=128), Work(store=store), pairs=[])
@@ -159,14 +159,18 @@ def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, 
 
 
 @pytest.mark.slow
-def test_keypoints_are_kept_for_a_later_pass_with_another_camera(tmp_path, texture) -> None:
+def test_keypoints_are_kept_for_a_later_pass_with_another_camera_or_threshold(tmp_path, texture) -> None:
     blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}
     first = view(write_image(tmp_path / "a.tif", texture, **blocks))
     options = TieOptions(tile=192)
     with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
-        for sensor in (None, "corrected"):
-            detect([replace(first, sensor=sensor)], options, executor=executor)
-            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options))
+        for sensor, chosen in (
+            (None, options),
+            ("corrected", options),
+            (None, replace(options, ratio=0.7, search=9.0)),
+        ):
+            detect([replace(first, sensor=sensor)], chosen, executor=executor)
+            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options.tile))
 
 
 # --- how many, and how closely an image is looked at ---------------------------------------------------------
@@ -233,7 +237,7 @@ def test_a_spot_is_found_where_it_stands_however_closely_it_is_looked_at(tmp_pat
     path = write_image(tmp_path / "a.tif", (100 + 2000 * np.asarray(picture)).astype(np.uint16))
     known = survey(path)
     assert known is not None
-    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, zoom), TieOptions())
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, zoom))
     near = np.abs(found.xy[:, None] - spots).max(axis=2)
     assert (near.min(axis=0) < 0.3 * zoom).all()  # a quarter of it is OpenCV's own
     scale = found.scale[near.argmin(axis=0)]
@@ -251,7 +255,7 @@ def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, sh
     path = write_image(tmp_path / "a.tif", (100 + 20000 * (share * picture + (col > 420))).astype(np.uint16))
     known = survey(path)
     assert known is not None
-    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, 1), TieOptions())
+    found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, 1))
     near = np.abs(found.xy[:, None] - spots).max(axis=2) < 1.0
     assert least <= near.any(axis=0).sum() <= most
 
@@ -262,7 +266,7 @@ def test_a_box_looked_at_in_parts_has_the_keypoints_that_the_whole_has_there(tmp
     assert known is not None
     boxes, sides = [(0, 0, *size), box, box], [512, 512, 128]
     whole, once, parts = (
-        detect_tile(str(path), size, each, known, KeypointDensity(1.0, 1), TieOptions(tile=side))
+        detect_tile(str(path), size, each, known, KeypointDensity(1.0, 1, side))
         for each, side in zip(boxes, sides, strict=True)
     )
     first, last = np.array(box[:2]) - 0.5, np.add(box[:2], box[2:]) - 0.5

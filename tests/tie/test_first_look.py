@@ -80,7 +80,7 @@ def test_a_first_look_takes_half_the_detail_and_what_is_wanted_alone(side, point
 )  # fmt: skip
 def test_a_tenth_of_the_points_wanted_is_ample(points, verified, status, is_ample) -> None:
     report = PairReport(("a", "b"), status, (0, 0), verified=verified)
-    assert ample(report, TieOptions(points_per_image=points)) == is_ample
+    assert ample(report, points) == is_ample
 
 
 def test_a_closer_look_is_at_pairs_that_lack_and_knows_the_altitudes_of_the_others(monkeypatch) -> None:

@@ -145,7 +145,7 @@ def test_cells_take_their_strongest_in_turns() -> None:
 )  # fmt: skip
 def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None:
     with chosen(TieOptions, tile=tile, cell=cell) as options:
-        boxes = tiles(size, options)
+        boxes = tiles(size, options.tile)
     assert [(c, r) for c, r, _, _ in boxes] == [(c, r) for r in edges[1] for c in edges[0]]
     for c, r, w, h in boxes:
         right = min((e for e in edges[0] if e > c), default=size[0])
@@ -175,8 +175,10 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     stored = survey(path)
     assert stored is not None
     with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
-        boxes = tiles((320, 320), options)
-        found = [detect_tile(str(path), (320, 320), box, stored, KeypointDensity(0.1), options) for box in boxes]
+        boxes = tiles((320, 320), options.tile)
+        found = [
+            detect_tile(str(path), (320, 320), box, stored, KeypointDensity(0.1, 1, options.tile)) for box in boxes
+        ]
     for (col, row, width, height), part in zip(boxes, found, strict=True):
         assert (part.xy >= [col - 0.5, row - 0.5]).all()
         assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()

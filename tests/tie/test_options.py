@@ -173,14 +173,14 @@ def test_names_are_those_of_the_tables() -> None:
 
 
 def test_tiles_are_as_large_as_asked_for(scene: Rendered) -> None:
-    boxes = tiles((1000, 700), TieOptions(tile=256))
+    boxes = tiles((1000, 700), 256)
     assert {(c, r) for c, r, _, _ in boxes} == {(c, r) for c in range(0, 1000, 256) for r in range(0, 700, 256)}
     assert max(w for _, _, w, _ in boxes) == 256
     assert sum(w * h for _, _, w, h in boxes) == 700_000
     view = scene.views[0]
     stored = survey(view.path, 1)
     assert stored is not None
-    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stored, KeypointDensity(0.1), TieOptions(tile=128))
+    small = detect_tile(view.path, view.size, (0, 0, 128, 128), stored, KeypointDensity(0.1, 1, 128))
     assert (small.xy < 128).all()
 
 

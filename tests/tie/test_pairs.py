@@ -132,7 +132,7 @@ def test_only_windows_that_a_partner_may_see_are_read() -> None:
     two = views(camera(0.0, lean=0.0), camera(250 * METRE, lean=0.0))
     with chosen(TieOptions, search=50, tile=250, cell=50) as options:
         pairs = select_pairs(two, options)
-        boxes = tiles((1000, 1000), options)
-        left, right = ([box in kept for box in boxes] for kept in shared_tiles(two, pairs, options))
+        boxes = tiles((1000, 1000), options.tile)
+        left, right = ([box in kept for box in boxes] for kept in shared_tiles(two, pairs, [boxes] * 2, options.search))
     assert left == [False, True, True, True] * 4  # the second one within the search
     assert right == [True, True, True, False] * 4

@@ -44,7 +44,7 @@ GEOID = 28.2
 )  # fmt: skip
 def test_a_camera_may_be_wrong_by_so_many_metres_whatever_its_pixel(pixel, asked, reach) -> None:
     (view,) = views(camera(0.0, lean=0.0).window(0, 0, 2 * pixel, 2 * pixel))
-    assert reach_of(view, TieOptions(search=asked)) == pytest.approx(reach, rel=0.01)
+    assert reach_of(view, asked) == pytest.approx(reach, rel=0.01)
 
 
 def test_the_pixel_is_that_in_the_middle_of_the_image() -> None:
@@ -55,13 +55,13 @@ def test_the_pixel_is_that_in_the_middle_of_the_image() -> None:
     coeffs[1, 1] = coeffs[3, 1] = -0.5
     (view,) = views(replace(rpc, coeffs=coeffs))
     (plain,) = views(rpc)
-    assert reach_of(view, TieOptions()) == pytest.approx(reach_of(plain, TieOptions()), rel=0.01)
-    assert reach_of(plain, TieOptions()) == pytest.approx(70.0, rel=0.01)
+    assert reach_of(view, None) == pytest.approx(reach_of(plain, None), rel=0.01)
+    assert reach_of(plain, None) == pytest.approx(70.0, rel=0.01)
 
 
 def test_a_camera_that_sees_no_ground_is_searched_as_far_as_any() -> None:
     (view,) = views(camera(0.0).crop(1e12, 0.0))
-    assert reach_of(view, TieOptions()) == 700.0
+    assert reach_of(view, None) == 700.0
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import TieOptions
 from barpc.tie.pairing.epipolar import (
     epipolar_segments,
 )
@@ -216,7 +215,7 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
 
     monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
     monkeypatch.setattr("barpc.tie.patches.register.CHUNK", 1)
-    found = links.register(TieOptions(tile=256), SimpleNamespace(ordered=ordered))
+    found = links.register(1, 256, SimpleNamespace(ordered=ordered))
     assert len(found.xy) == 160
     for _, band, origin, start, linear, structural in seen:
         assert (np.ptp(np.floor(origin / 256), axis=0) == 0).all()

@@ -13,7 +13,7 @@ from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import altitude_range, epipolar_offset
-from barpc.tie import Matches, Pair, Scope, TieOptions, common_tracks, find_tracks
+from barpc.tie import Matches, Pair, Scope, common_tracks, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
 from barpc.tie.tracks import _needed
@@ -212,8 +212,8 @@ def test_pairs_that_registered_ones_leave_apart_keep_their_matches_and_no_others
     view, point = np.array(rows).T
     tracks = Tracks(view, point, np.zeros((len(rows), 2)), np.full(len(rows), 0.1))
     pairs = [(0, 1), (0, 2), (1, 2), (2, 3)]
-    assert _needed(looks, tracks, pairs, TieOptions(min_matches=12)) == {(0, 2), (1, 2), (2, 3)}
-    assert _needed(looks, tracks, pairs, TieOptions(min_matches=6)) == {(2, 3)}
+    assert _needed(looks, tracks, pairs, 12) == {(0, 2), (1, 2), (2, 3)}
+    assert _needed(looks, tracks, pairs, 6) == {(2, 3)}
 
 
 # --- real images --------------------------------------------------------------------------------------------

@@ -140,8 +140,8 @@ def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, monkeypatch) -> No
 @pytest.mark.parametrize("damage", rest_slow(["cut", "gone", "empty", "other"], keep=2))
 def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path, damage: str) -> None:
     store, view, box = Store(str(tmp_path / "kept"), str(tmp_path)), pair[0], (0, 0, 256, 256)
-    found, options = survey(view.path), TieOptions()
-    task = (store, "tile/a", (view.path, view.size, box, found, KeypointDensity(0.002), options))
+    found = survey(view.path)
+    task = (store, "tile/a", (view.path, view.size, box, found, KeypointDensity(0.002)))
     count = keep_tile(*task)
     path = tmp_path / "kept/tile/a.npz"
     whole = path.read_bytes()
@@ -213,11 +213,8 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, sid
         out.write(data, 1)
     found = [survey(path) for path in paths]
     assert [known and known.levels for known in found] == [False, True]
-    options, share = TieOptions(), KeypointDensity(1.0, zoom)
-    at = [
-        detect_tile(str(p), (side, side), (0, 0, side, side), f, share, options)
-        for p, f in zip(paths, found, strict=True)
-    ]  # type: ignore[arg-type]
+    share = KeypointDensity(1.0, zoom)
+    at = [detect_tile(str(p), (side, side), (0, 0, side, side), f, share) for p, f in zip(paths, found, strict=True)]  # type: ignore[arg-type]
     apart = at[0].xy[:, None] - at[1].xy
     near = np.hypot(*apart.T).T
     mutual = [(i, j) for i, j in enumerate(near.argmin(axis=1)) if near[i, j] < zoom]
@@ -296,8 +293,8 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     assert known is not None
     assert 0.0 < decoded(log)[views[0].path] <= surveyed
     log.clear()
-    for box in tiles((SIDE, SIDE), options, zoom, known):
-        detect_tile(views[0].path, (SIDE, SIDE), box, known, KeypointDensity(0.004, zoom), options)
+    for box in tiles((SIDE, SIDE), options.tile, zoom, known):
+        detect_tile(views[0].path, (SIDE, SIDE), box, known, KeypointDensity(0.004, zoom, options.tile))
     assert 0.99 <= decoded(log)[views[0].path] <= found
     if zoom > 1:  # enough for the fast lane
         return
@@ -319,7 +316,7 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
     ],
 )  # fmt: skip
 def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zoom, found, widths, heights) -> None:
-    boxes = tiles(size, TieOptions(), zoom, found)
+    boxes = tiles(size, TieOptions().tile, zoom, found)
     assert {w for _, _, w, _ in boxes} == widths
     assert {h for _, _, _, h in boxes} == heights
     assert sum(w * h for _, _, w, h in boxes) == size[0] * size[1]
@@ -327,12 +324,10 @@ def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zo
 
 @pytest.mark.slow
 def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
-    found, options = survey(pair[0].path), TieOptions(tile=128)
+    found = survey(pair[0].path)
     assert found is not None
-    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1), options)
-    whole = detect_tile(
-        pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1), replace(options, tile=1024)
-    )
+    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 128))
+    whole = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 1024))
     small = whole.scale < 8
     seen = {tuple(p) for p in np.round(wide.xy, 1)}
     assert np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)]) > 0.95

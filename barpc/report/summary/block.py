@@ -300,7 +300,7 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
     words: dict[str, Any] = {"size": size, "least": "at least " if len(names) == 2 else "", **fields}
     words["image"] = " or ".join([image, *others])
     if others and TERMS[one.kind].LOCAL:  # places are those of the first
-        words["image"] = f"{image} (or the same ground in {' or '.join(others)})"
+        words["image"] = f"{image} (or the same ground in {' or '.join(others)}{', or it moves' * of_pair})"
     if one.motion is not None:
         box = one.motion.box
         middle = wrap_longitude(box[0] + (box[2] - box[0]) % 360.0 / 2.0), (box[1] + box[3]) / 2.0

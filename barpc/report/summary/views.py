@@ -275,7 +275,7 @@ class ViewEntry(Record):
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
     cause: str | None = column("Name of the reservation; null without one", default=None, enum=[*CAUSES, None])
-    num_moving: Count = column("Observations of tie points that move together, which were excluded", default=0)
+    num_moving: Count = column("Excluded observations of tie points that move together", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
     systematic_p: Number = column(
@@ -289,6 +289,9 @@ class ViewEntry(Record):
     date: str | None = column("Acquisition date, where its metadata state it", default=None)
     certified: tuple[tuple[float, float, float, float, float], ...] | None = column(
         "Ground points (lon, lat, alt) and their image points (col, row)", default=None
+    )
+    gap: tuple[tuple[float, float, float, float], ...] | None = column(
+        "Corners of rows or columns with few tie points (lon, lat, col, row)", default=None
     )
 
 
@@ -339,12 +342,29 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             stated_ce90_m=stated_ce90(view),
             control_w=control[i].w if i in control else None,
             control_w_point=control[i].point if i in control else None,
+            gap=_gap_corners(run, i),
             status="adjusted",
             advice="",
             **adjusted,
         )
         for i, (view, adjusted) in enumerate(zip(run.views, _adjustment_values(run, middle), strict=True))
     )
+
+
+def _gap_corners(run: Run, i: int) -> tuple[tuple[float, float, float, float], ...] | None:
+    """Return the corners of the rows or columns of view i with few tie points, by its final camera."""
+    if i not in run.gaps:
+        return None
+    gap, size = run.gaps[i], run.views[i].size
+    ends = [(-0.5, length - 0.5) for length in size]
+    ends[gap.axis] = gap.first - 0.5, gap.last + 0.5
+    (left, right), (top, bottom) = ends
+    corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+    ground = (run.after or run.before)[i].localize(corners, np.full(4, run.altitude))[:, :2]
+    found = tuple(
+        (lon, lat, col, row) for (lon, lat), (col, row) in zip(ground.tolist(), corners.tolist(), strict=True)
+    )
+    return found if np.isfinite(ground).all() else None
 
 
 def _fit_entry(fit: RpcFit) -> FitEntry:

@@ -1,1 +1,1 @@
-"""What finds the same ground in two views: keypoints, structure, given matches, a matcher of the user."""
+"""Matchers of two views: keypoints, structure, given matches, a matcher of the user."""

@@ -1,4 +1,4 @@
-"""Keypoints: found tile by tile, evenly by a quota, kept in files that the matching of a pair reads."""
+"""Keypoints: detected tile by tile, evenly by a quota, stored in files for the matching of pairs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Keypoints:
         return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def strongest(self, most: int) -> Keypoints:
-        """Return so many keypoints, the strongest."""
+        """Return the `most` strongest keypoints."""
         return self.select(np.argsort(-self.response, kind="stable")[:most])
 
     boxes: ClassVar[tuple[Box, ...]] = ()  # of tiles: there are none in memory
@@ -97,7 +97,7 @@ class Sift:
 
 
 def _an_octave_up(keypoint: Any) -> Any:
-    """Return the keypoint with its octave raised by one: described by a quarter of the samples, and as distinct.
+    """Return a keypoint with its octave raised by one: a quarter of the samples describe it, as distinctly.
 
     OpenCV packs the octave (signed) and its picture, 1 to 3, into a byte each; picture 3 is the next octave's 0.
     """
@@ -113,28 +113,29 @@ def _keypoint_arrays(found: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class KeypointDensity:
-    """How densely a tile's keypoints are looked for."""
+    """Density and resolution at which the keypoints of a tile are detected."""
 
     density: float  # keypoints a px of the image
     zoom: int = 1  # px of the image a side of a pixel that is looked at
+    tile: int = TIE_DEFAULTS.tile  # side of the parts that share a quota [px of that size]
 
     @staticmethod
     def of(size: tuple[int, int], options: TieOptions, coarse: bool = False) -> KeypointDensity:
-        """Return the share of a whole image of `size` (width, height); `coarse`: of a first look."""
+        """Return the density for an image of `size` (width, height); `coarse`: at reduced resolution."""
         area = size[0] * size[1]
         wanted = min(PER_IMAGE, AMPLE * options.points_per_image) / area
         zooms = (zoom for below, zoom in _ZOOMS if wanted < below and min(size) > zoom * options.tile)
         zoom = next(zooms, 1)
         if coarse:
-            return KeypointDensity(wanted, min(2 * zoom, max(_HOLDS)))
-        return KeypointDensity(PER_IMAGE / area, zoom)
+            return KeypointDensity(wanted, min(2 * zoom, max(_HOLDS)), options.tile)
+        return KeypointDensity(PER_IMAGE / area, zoom, options.tile)
 
     def expected(self, size: tuple[int, int]) -> float:
         """Estimate the number of keypoints of an image of `size` (width, height) with detail all over."""
         return min(self.density, _HOLDS.get(self.zoom, np.inf)) * size[0] * size[1]
 
     def within(self, used: float) -> KeypointDensity:
-        """Return the share where only a part of the image is used, in powers of two, so that it seldom changes."""
+        """Return the density where only a part of the image is used, in powers of two, so that it seldom changes."""
         return replace(self, density=self.density * 2.0 ** float(np.floor(-np.log2(min(max(used, 1e-6), 1.0)))))
 
     def most(self, box: Box) -> int:
@@ -143,24 +144,22 @@ class KeypointDensity:
 
     @property
     def cell(self) -> int:
-        """Side of the quota's cells [px]: each holds one keypoint, about, where they are few."""
+        """Side of the quota's cells [px]: about one keypoint each at a low density."""
         return CELL * max(1, round(float(np.sqrt(1.0 / self.density)) / CELL))
 
 
-def ample_matches(options: TieOptions) -> int:
-    """Return the number of verified matches at a first look that makes a closer one needless."""
-    return max(MANY, int(np.ceil(_PART * options.points_per_image)))
+def ample_matches(points_per_image: int) -> int:
+    """Return the number of verified matches at reduced resolution that replaces matching at full resolution."""
+    return max(MANY, int(np.ceil(_PART * points_per_image)))
 
 
 def worth_a_first_look(sizes: Sequence[tuple[int, int]], options: TieOptions) -> bool:
-    """Return whether images of `sizes` (width, height) are large enough for a first look at less detail."""
-    needed = _MIN_KEYPOINT_RATIO * ample_matches(options)
+    """Return whether images of `sizes` (width, height) are large enough to be matched at reduced resolution first."""
+    needed = _MIN_KEYPOINT_RATIO * ample_matches(options.points_per_image)
     return all(KeypointDensity.of(size, options, coarse=True).expected(size) >= needed for size in sizes)
 
 
-def detect_tile(
-    path: str, size: tuple[int, int], box: Box, found: Survey, share: KeypointDensity, options: TieOptions
-) -> Keypoints:
+def detect_tile(path: str, size: tuple[int, int], box: Box, found: Survey, share: KeypointDensity) -> Keypoints:
     """Detect the keypoints of one tile of an image of `size` (width, height), the most important first.
 
     Coordinates and `found` are those of the whole image.
@@ -168,9 +167,9 @@ def detect_tile(
     cv2.setNumThreads(1)
     zoom = share.zoom
     window = box if found.levels else grow(box, zoom * CELL, size)
-    picture, valid = read_picture(path, window, found, zoom, options.band)
+    picture, valid = read_picture(path, window, found, zoom)
     middle = 0.0 if found.levels else 0.5 * (zoom - 1)  # a wavelet's level holds the even pixels
-    parts, side = [], zoom * options.tile
+    parts, side = [], zoom * share.tile
     for row in range(box[1], box[1] + box[3], side):
         for col in range(box[0], box[0] + box[2], side):
             part = (col, row, min(side, box[0] + box[2] - col), min(side, box[1] + box[3] - row))
@@ -208,7 +207,7 @@ def _detect_part(picture: ByteImage, valid: BoolArray, part: Box, origin: Array,
 
 
 def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
-    """Return the place of every point (N, 2) [px] among those of its cell, the strongest first, from 0."""
+    """Return the rank, from 0, of every point (N, 2) [px] by strength within its cell."""
     cells = np.floor((xy + 0.5) / cell).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     key = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
@@ -221,19 +220,19 @@ def _cell_ranks(xy: Array, response: Array, cell: float) -> IntArray:
 
 
 def quota(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Return the indices, ascending, of the strongest of points (N, 2) [px] in every cell, at most so many each."""
+    """Return the indices, ascending, of the `most` strongest points (N, 2) [px] of every cell."""
     return np.flatnonzero(_cell_ranks(xy, response, cell) < most)
 
 
 def ranked(xy: Array, response: Array, cell: float, most: int) -> IntArray:
-    """Return the indices of so many points (N, 2) [px]: of every cell the strongest, then the second, and so on."""
+    """Return the indices of `most` points (N, 2) [px]: the strongest of every cell, then the second, and so on."""
     order = np.lexsort((xy[:, 0], xy[:, 1], -response, _cell_ranks(xy, response, cell)))
     return order[:most]
 
 
 @dataclass(frozen=True)
 class KeypointFiles:
-    """Keypoints of a view kept in files: of every tile the first so many count."""
+    """Keypoints of a view stored in files, a tile each; `counts` of them, the first, are used."""
 
     store: Store
     boxes: tuple[Box, ...] = ()
@@ -264,9 +263,7 @@ class KeypointFiles:
         return join_keypoints(parts), np.concatenate(numbers)
 
 
-def keep_tile(
-    store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity, TieOptions]
-) -> int:
+def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity]) -> int:
     """Detect the keypoints of a tile by `detect_tile(*task)` and keep them in the store; return their number."""
     known = store.read(name)
     if known is not None and "xy" in known:
@@ -307,13 +304,13 @@ def locate(
     found = work.ordered(survey, [(v.path, options.band, v.size) for v in views], "read")
     shares = [KeypointDensity.of(view.size, options, coarse) for view in views]
     each = zip(views, found, shares, strict=True)
-    boxes = [tiles(v.size, options, share.zoom, known) if known else [] for v, known, share in each]
+    boxes = [tiles(v.size, options.tile, share.zoom, known) if known else [] for v, known, share in each]
     if pairs is not None:
-        boxes = shared_tiles(views, pairs, options, area, boxes)
+        boxes = shared_tiles(views, pairs, boxes, options.search, area)
     used = [sum(b[2] * b[3] for b in some) / (v.size[0] * v.size[1]) for v, some in zip(views, boxes, strict=True)]
     shares = [share.within(part) for share, part in zip(shares, used, strict=True)]
     tasks = [
-        (view.path, view.size, box, known, share, options)
+        (view.path, view.size, box, known, share)
         for view, known, share, of_view in zip(views, found, shares, boxes, strict=True)
         for box in of_view
     ]

@@ -1,4 +1,4 @@
-"""Third-party matches: verified as our own, and used as given where patches cannot be registered."""
+"""Third-party matches: verified as own matches are, unregistered where patches cannot be registered."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _GIVEN_MATCHER = f"{__name__}:{GivenMatcher.__name__}"
 def verify_given(
     views: Sequence[View], given: GivenMatches, pairs: Sequence[Pair], options: TieOptions, work: Work
 ) -> list[tuple[Matches, PairReport]]:
-    """Verify given matches of each pair against the cameras, with its report: `match_pair` with what is given."""
+    """Verify the given matches of each pair against the cameras, by `match_pair`, with its report."""
     chosen = replace(options, matcher=_GIVEN_MATCHER)
     tasks = []
     for pair in pairs:
@@ -71,7 +71,7 @@ def verify_given(
 def beside_given(
     own: tuple[Matches, PairReport], given: tuple[Matches, PairReport] | None
 ) -> tuple[Matches, PairReport]:
-    """Return own matches of a pair or those given, of which too few were verified: whichever are more; it is said."""
+    """Return the larger set of own matches of a pair and of given ones, few of which were verified; log the choice."""
     if given is None:
         return own
     best, report = better(own, given), given[1]
@@ -82,8 +82,9 @@ def beside_given(
 
 
 def _stand_out(ends: Ends, given: Matches, found: Matches) -> bool:
-    """Return whether more of the matches given lie as near to the fit of those verified as the farthest of these than
-    lie as far again from it, and not by chance: false ones are as many here as there, wherever a matcher looked.
+    """Return whether the given matches are significantly denser about the fit of the verified ones than beside it.
+
+    The band holds all verified matches; a margin beside it, as wide, holds as many false ones, whatever their origin.
     """
     rows, places = found.index[:, 0], given.xy[:, 0]
     across = epipolar_segments(*ends, places).errors(given.xy[:, 1])[:, 1]

@@ -1,4 +1,4 @@
-"""The best counterpart of every keypoint inside a band about its epipolar segment."""
+"""Matching of descriptors: the best counterpart of every keypoint in a band about its epipolar segment."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Guided:
 
 @dataclass(frozen=True, eq=False)
 class _Described:
-    """Descriptors and their lengths, with the orientation that they should have in B."""
+    """Descriptors, their lengths, and their orientations as predicted in B."""
 
     values: FloatArray  # whole numbers: their products are exact in any order of summing, on any machine
     length: FloatArray
@@ -76,12 +76,12 @@ class _Described:
         return _Described(values, length, (turned / np.maximum(np.abs(turned), 1e-9)).astype(np.complex64))
 
     def sector(self, turn: float) -> IntArray:
-        """Return the sectors (n,), as wide as all turns that are allowed, of orientations turned by an angle [rad]."""
+        """Return the sectors (n,), twice the allowed turn wide, of orientations turned by an angle [rad]."""
         sector: IntArray = np.floor((np.angle(self.direction) + turn) / (2.0 * _MAX_TURN)).astype(np.int64) % _SECTORS
         return sector
 
     def is_turned_like(self, other: _Described, rows: IntArray, cols: IntArray) -> BoolArray:
-        """Tell the pairs (P,) of rows and others' cols whose orientation is as expected."""
+        """Return the mask of pairs (P,) of rows and others' cols with the predicted orientation."""
         cosine = (self.direction[rows] * other.direction.conj()[cols]).real
         return np.asarray(cosine >= np.cos(_MAX_TURN))
 
@@ -101,7 +101,7 @@ class _Best:
         self._top_b = np.full(size_b, -np.inf, np.float32)
 
     def update(self, rows: IntArray, cols: IntArray, likeness: FloatArray, du: Array, dw: Array) -> None:
-        """Take in pairs (P,), row by row of A, with all candidates of a row, and their places about the predicted."""
+        """Add candidate pairs (P,), all of a row of A together, and their offsets from the predicted places."""
         begin = np.flatnonzero(np.diff(rows, prepend=-1))
         of, row = np.repeat(np.arange(len(begin)), np.diff(begin, append=len(rows))), rows[begin]
         top = np.maximum.reduceat(likeness, begin)

@@ -47,7 +47,7 @@ class Prediction:
         return self.where(xy).moved(self.aside)
 
     def chosen(self, count: int) -> IntArray:
-        """Return the indices of the wanted ones of `count` points, ascending."""
+        """Return the ascending indices of the probes among `count` points."""
         return np.linspace(0, count - 1, min(count, self.probes or count)).astype(np.int64)
 
     def contains(self, xy: Array) -> BoolArray:
@@ -67,7 +67,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Points of two views that show the same ground."""
+    """Corresponding image points of two views."""
 
     xy: Array  # (M, 2, 2) col, row in the first and in the second view [px]
     score: Array  # (M,) how unlike the two places look: 0 or more, comparable among all calls for a pair
@@ -91,7 +91,7 @@ class Matches:
         return Matches(xy, score, (pixel[..., 1] << 32) + pixel[..., 0])
 
     def and_others(self, more: Matches) -> Matches:
-        """Return the matches, and those of `more` whose points are neither of these in either view."""
+        """Return the union with the matches of `more` whose points are new in both views."""
         new = ~(np.isin(more.index[:, 0], self.index[:, 0]) | np.isin(more.index[:, 1], self.index[:, 1]))
         some = more.select(new)
         columns = ((getattr(one, name) for one in (self, some)) for name in ("xy", "score", "index"))
@@ -147,7 +147,7 @@ class Hook:
 
 
 def _match_coordinates(found: Any) -> tuple[Any, Any]:
-    """Return the places (M, 2, 2) [px] and how unlike they look (M,), or None, of what a function gave back."""
+    """Return the places (M, 2, 2) [px] and dissimilarities (M,), or None, in the result of a user's function."""
     if isinstance(found, Matches):
         found = found.xy, found.score
     xy, score = found if isinstance(found, tuple) else (found, None)

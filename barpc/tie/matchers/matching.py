@@ -46,6 +46,8 @@ from barpc.tie.pairing.epipolar import (
     robust_affine,
 )
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
+from barpc.tie.patches.channels import INVALID_MARGIN
+from barpc.tie.pixels import tiles
 from barpc.tie.tasks import HERE, Work
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
@@ -53,7 +55,7 @@ MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStruc
 
 
 def matcher_named(name: str) -> type[Matcher] | Hook:
-    """Return the matcher that an option names: a row of `MATCHERS`, or what `module:name` stands for."""
+    """Return the matcher that an option names: a row of `MATCHERS`, or the function or class `module:name`."""
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
@@ -81,13 +83,13 @@ Points = tuple[Keypoints | KeypointFiles, Keypoints | KeypointFiles]
 
 @dataclass(frozen=True, eq=False)
 class GroundAltitudes:
-    """What is known of the altitudes of the ground: a terrain, and the matches of pairs that have enough."""
+    """Sources of the altitudes of the ground: a terrain, and the matches of pairs with enough of them."""
 
     terrain: Terrain | None = None
     ties: Sequence[tuple[Ends, Matches]] = ()
 
     def altitudes(self) -> tuple[float, float] | None:
-        """Return the lowest and the highest altitude [m] that most matches lie at."""
+        """Return the 2nd and 98th percentile [m] of the altitudes of the matches."""
         found = []
         for views, matches in self.ties:
             where, (low, high) = epipolar_segments(*views, matches.xy[:, 0]), common_range(*views)
@@ -97,7 +99,7 @@ class GroundAltitudes:
         return (float(np.min(found)), float(np.max(found))) if found else None
 
     def within(self, views: Ends, known: tuple[float, float] | None, margin: float) -> Ends:
-        """Return two views with fewer altitudes: those of the terrain, or else `known` ones, with a margin [m]."""
+        """Return two views restricted to the altitudes of the terrain, or else to `known` ones, with a margin [m]."""
         low, high = common_range(*views)
         if self.terrain is not None:
             axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
@@ -136,10 +138,10 @@ def match_pair(views: Ends, keypoints: Points, pair: Pair, options: TieOptions) 
 
 
 def _placing(views: Ends, keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions) -> Placing | None:
-    """Return how the second picture lies if it matches so, and by the keypoints' own looks not as its camera says."""
+    """Return the placing of the second picture, if it differs from its camera's and verified matches confirm it."""
     a, b = keypoints
     placing, count = likeliest_placing(views, keypoints) if len(a) and len(b) else (None, 0)
-    if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options)):
+    if placing is None or count < options.min_matches or placing.is_stated(reach_of(views[1], options.search)):
         return None
     return placing if _attempt(views, (a, placing.undone(b)), pair, options)[1].status == "ok" else None
 
@@ -174,7 +176,7 @@ def _attempt(
     looked: dict[str, _PairSearch] | None = None,
     loosened: float = 0.0,
 ) -> tuple[Matches, PairReport]:
-    """Return all passes over a pair with one matcher; what it `looked` at is known to the next attempt.
+    """Match a pair by all passes of one matcher; searches in `looked` are shared between attempts.
 
     `loosened`: the share of false matches that a second attempt accepts.
     """
@@ -184,7 +186,7 @@ def _attempt(
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
-    loaded, numbers = _overlap_keypoints(views, keypoints, options)
+    loaded, numbers = _overlap_keypoints(views, keypoints, options.search)
     looked = {} if looked is None else looked
     before = looked.get(options.matcher)
     search = _PairSearch(views, loaded, options) if before is None else before.loosened(loaded, options)
@@ -213,21 +215,21 @@ def _attempt(
 
 
 def _overlap_keypoints(
-    views: Ends, keypoints: Points, options: TieOptions
+    views: Ends, keypoints: Points, search: float | None
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray]]:
     """Return the keypoints of the tiles that both views may see, or all in memory, and their numbers."""
     boxes = [points.boxes for points in keypoints]
-    seen = shared_tiles(views, [_BOTH], options, boxes=boxes) if any(boxes) else boxes
+    seen = shared_tiles(views, [_BOTH], boxes, search) if any(boxes) else boxes
     first, second = (points.load(some) for points, some in zip(keypoints, seen, strict=True))
     return (first[0], second[0]), (first[1], second[1])
 
 
 def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], options: TieOptions) -> int:
-    """Estimate how many of a few keypoints match, with at most 5 % false ones: a cheap forecast for a pair."""
+    """Return the number of matches, at most 5 % of them false, among a few keypoints: a cheap forecast for a pair."""
     few = (keypoints[0].strongest(AMPLE * MANY), keypoints[1].strongest(AMPLE * MANY))
     if not (len(few[0]) and len(few[1])):
         return 0
-    search = _PairSearch(views, _overlap_keypoints(views, few, options)[0], replace(options, ratio=_LOOSE_RATIO))
+    search = _PairSearch(views, _overlap_keypoints(views, few, options.search)[0], replace(options, ratio=_LOOSE_RATIO))
     coarse = search.offset
     return 0 if coarse is None else len(search.trusted(coarse, _LOOSE_FALSE_SHARE)[0])
 
@@ -235,7 +237,7 @@ def quick_score(views: Ends, keypoints: tuple[KeypointFiles, KeypointFiles], opt
 def first_look(
     views: Sequence[View], keypoints: Sequence[KeypointFiles], pairs: Sequence[Pair], options: TieOptions, work: Work
 ) -> list[tuple[Matches, PairReport]]:
-    """Try each pair's keypoints of a first look once: `ample` says of which pairs that is all that they need."""
+    """Match keypoints of reduced resolution once for each pair: those with `ample` matches need no more."""
     return work.ordered(_attempt, _tasks(views, keypoints, pairs, options), "match")
 
 
@@ -279,7 +281,7 @@ def match_pairs(
 def _match_within(
     several: Sequence[Ends], keypoints: tuple[Keypoints, Keypoints], pair: Pair, options: TieOptions
 ) -> tuple[Matches, PairReport]:
-    """Match two views at some altitudes, and at fewer where that finds few: with less to confuse."""
+    """Match two views within an altitude range, and within narrower ones where that finds few."""
     tried = [match_pair(several[0], keypoints, pair, options)]
     for views in several[1:]:
         if not enough(tried[-1][1]) and views[0].alt_range != several[0][0].alt_range:
@@ -288,7 +290,7 @@ def _match_within(
 
 
 def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], EpipolarSegments]:
-    """Return a function of points that remembers its last value: a matcher asks about the same array again."""
+    """Return the function with a cache of its last value: matchers ask for the same array again."""
     known: list[tuple[Array, EpipolarSegments]] = []
 
     def remembered(xy: Array) -> EpipolarSegments:
@@ -313,9 +315,10 @@ class _PairSearch:
     def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
         self._matcher = matcher_named(options.matcher)(options, keypoints)
-        self.reach = min(reach_of(views[1], options), getattr(self._matcher, "widest", float("inf")))
+        self.reach = min(reach_of(views[1], options.search), getattr(self._matcher, "widest", float("inf")))
         points = keypoints[0].xy
-        self._windows = cache(lambda: shared_tiles(views, [_BOTH], options)[0])
+        boxes = [tiles(view.size, options.tile) for view in views]
+        self._windows = cache(lambda: shared_tiles(views, [_BOTH], boxes, options.search)[0])
         if not self._matcher.detects:
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
@@ -324,7 +327,7 @@ class _PairSearch:
         self._frame = _latest(lambda xy: first if xy is points else epipolar_segments(*views, xy, first.axis))
 
     def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> _PairSearch:
-        """Return the search at looser thresholds, which do not change where it looks."""
+        """Return the search with looser thresholds; its predictions stay the same."""
         other = copy(self)
         if self._matcher.detects:
             other._matcher = matcher_named(options.matcher)(options, keypoints)
@@ -334,11 +337,11 @@ class _PairSearch:
 
     @property
     def patch(self) -> float:
-        """Side of what is compared about a point [px]; 0: it has no extent."""
+        """Side of the template about a point [px]; 0: none."""
         return float(getattr(self._matcher, "patch", 0.0))
 
     def errors(self, found: Matches) -> Array:
-        """Return the distance along and across (M, 2) [px] of matches from where the cameras say."""
+        """Return the distances (M, 2) [px] of matches from the predictions, along and across epipolar lines."""
         return epipolar_segments(*self._views, found.xy[:, 0], self._axis).errors(found.xy[:, 1])
 
     def _predicted(self, where: Callable[[Array], EpipolarSegments], half_width: float) -> Prediction:
@@ -357,7 +360,7 @@ class _PairSearch:
         Bands shifted to either side hold no true match: theirs tell how many false ones come with a score. (The
         "decoys" of peptide identification: Elias and Gygi 2007.)
         """
-        found, aside = self._distinct(prediction), 2.0 * prediction.half_width + 6.0
+        found, aside = self._distinct(prediction), 2.0 * prediction.half_width + INVALID_MARGIN
         decoys = [np.sort(self._distinct(replace(prediction, aside=side * aside)).score) for side in (-1.0, 1.0)]
         few, many = np.sort([np.searchsorted(decoy, found.score, side="right") for decoy in decoys], axis=0)
         # some in one of them are true where an image's rows lie as far off
@@ -369,7 +372,7 @@ class _PairSearch:
 
     @cached_property
     def offset(self) -> Prediction | None:
-        """Where to search, by blind passes of growing width for the cameras' error.
+        """Corrected prediction by blind passes of growing width for the cameras' relative error.
 
         The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
         """
@@ -384,7 +387,7 @@ class _PairSearch:
         return None if best is None else best.prediction
 
     def further(self, tight: Matches) -> Matches:
-        """Return matches and those of other offsets: of points that have none near them, where these show a peak.
+        """Return the matches with those at other offsets: of points without matches near them, where these show a peak.
 
         From some row on, or column, an image may lie elsewhere.
         """
@@ -398,7 +401,7 @@ class _PairSearch:
         return tight
 
     def _beside(self, found: Matches) -> _Peak | None:
-        """Return a blind pass over the points that have none of some matches near them, about the offset of these."""
+        """Return a blind pass over the points without matches near them, about the offset of the matches found."""
         places, offset = found.xy[:, 0], float(np.median(self.errors(found)[:, 1]))
         tree = cKDTree(places)
 
@@ -415,7 +418,7 @@ class _PairSearch:
         )
 
     def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
-        """Return one pass: a peak among the errors across the epipolar lines of some points, if there is one.
+        """Return the peak of the errors across the epipolar lines of some points, if it is significant.
 
         Only of points that are `bare` where that is given.
         """
@@ -463,7 +466,7 @@ class _PairSearch:
             near = tree.query(xy, k=min(FEW, len(tight)))[1]
             along = errors[near, 0]
             middle = np.median(along, axis=1)
-            half = 4.0 + 3.0 * robust_spread(along, middle[:, None])
+            half = 2 * DUPLICATE_DISTANCE + SURELY * robust_spread(along, middle[:, None])
             where = every(xy).moved(xy @ slope + np.median(level[near], axis=1))
             return replace(where, before=middle - half, after=middle + half)
 

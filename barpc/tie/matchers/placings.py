@@ -2,7 +2,7 @@
 
 Keypoints tell without any camera how one picture is turned and scaled against another: each match by its own
 orientation and size, mirrored or not. What most of them say is tried as matching is, its keypoints laid as they would
-be in the right picture: only what lies on common epipolar lines is believed.
+be in the right picture: only matches on common epipolar lines count.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _SAID = "shows the picture {}{}, as keypoints of {} say: give the picture that i
 
 @dataclass(frozen=True)
 class Placing:
-    """How a picture lies: first its rows reversed where it is mirrored, then turned, then scaled, then moved."""
+    """Placing of a picture: its rows are reversed where it is mirrored, then it is turned, scaled and shifted."""
 
     mirrored: bool
     turns: int  # of 90 degrees, columns towards rows
@@ -57,7 +57,7 @@ class Placing:
 
     @property
     def words(self) -> str:
-        """How it lies, as "shows the picture ..."."""
+        """Description that continues "shows the picture ..."."""
         found = [_TURNED[self.mirrored, self.turns]] if self.mirrored or self.turns else []
         if self.size != 1.0:
             found.append(f"at {_SIZES.get(self.size, f'{self.size:.3g} times the size')} that its RPC is for")
@@ -68,11 +68,11 @@ class Placing:
         )
 
     def is_stated(self, reach: float) -> bool:
-        """Return whether it is as the camera says, which may be wrong by so much [px]."""
+        """Return whether the placing is the camera's, which may be wrong by `reach` [px]."""
         return not self.mirrored and not self.turns and self.size == 1.0 and bool(np.hypot(*self.start) <= reach)
 
     def fills(self, view: View) -> bool:
-        """Return whether a view's RPC, at this size, ends where its file does, which that of a whole image does."""
+        """Return whether a view's RPC, at this size, covers its file exactly, as that of a whole image does."""
         if self.size == 1.0 or not isinstance(view.sensor, RPC):
             return False
         ends = view.sensor.image_offset + np.outer([-1.0, 1.0], view.sensor.image_scale) + [[-0.5], [0.5]]
@@ -80,7 +80,7 @@ class Placing:
         return bool(max(np.abs(ends[0]).max(), np.abs(wrong).max() / max(self.size, 1.0)) <= 1.0)
 
     def undone(self, points: Keypoints) -> Keypoints:
-        """Return keypoints of the file as they would be found in the picture that the camera is for."""
+        """Return keypoints of the file transformed into the picture that the camera is for."""
         back = np.linalg.inv(self.linear)
         direction = np.stack([np.cos(points.angle), np.sin(points.angle)], axis=-1) @ back.T
         return replace(
@@ -101,8 +101,9 @@ def _mirrored(descriptors: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def stretched(views: tuple[View, View], first: Array, second: Array) -> bool:
-    """Return whether matches (M, 2), (M, 2) [px] lie as on pictures of another size, or mirrored: across the epipolar
-    lines, where relief has no say, their scale is nearer to half or twice what the cameras say.
+    """Return whether matches (M, 2), (M, 2) [px] have the scale of pictures of another size, or mirrored ones.
+
+    Across the epipolar lines, where relief has no effect, it is nearer to half or twice the cameras'.
     """
     if not len(first):
         return False
@@ -118,7 +119,7 @@ def stretched(views: tuple[View, View], first: Array, second: Array) -> bool:
 
 
 def likeliest_placing(views: tuple[View, View], keypoints: tuple[Keypoints, Keypoints]) -> tuple[Placing, int]:
-    """Return how most keypoints say that the second picture lies if the first does as its camera says, and how many."""
+    """Return the placing of the second picture relative to the first that most keypoints support, and their number."""
     a, b = keypoints
     where = epipolar_segments(*views, a.xy)
     places = where.place(np.zeros(len(a)))
@@ -142,7 +143,7 @@ def likeliest_placing(views: tuple[View, View], keypoints: tuple[Keypoints, Keyp
 
 
 def _mutual_nearest(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int64], ...]:
-    """Return the rows of descriptors that are clearly each other's nearest."""
+    """Return the rows of mutually nearest descriptors by a clear ratio."""
     a, b = (x.astype(np.float32) for x in (first, second))  # whole numbers: their products are exact on any machine
     if min(len(a), len(b)) < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -156,8 +157,9 @@ def _mutual_nearest(first: npt.NDArray[np.uint8], second: npt.NDArray[np.uint8])
 
 
 def misplaced(views: Sequence[View], links: Sequence[Link], placings: Mapping[Link, Placings]) -> dict[str, str]:
-    """Return a sentence on every view, by its name, outside the largest group of those tied by `links`, whose picture
-    lies otherwise than its RPC says, by the `placings` of pairs.
+    """Return sentences, by view name, on pictures with another placing than their RPC's, by the `placings` of pairs.
+
+    Views of the largest group tied by `links` have none.
     """
     groups, said = connected_groups(len(views), links), dict[str, str]()
     right = set(groups[0] if len(groups) > 1 and len(groups[0]) > len(groups[1]) else ())

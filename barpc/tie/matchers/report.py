@@ -1,4 +1,4 @@
-"""Result of matching a pair: whether its matches suffice, which attempt counts, and why a block cannot be tied."""
+"""Result of matching a pair: number of matches, best attempt, and reasons why a block cannot be tied."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from barpc.base.errors import TiePointError
-from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, MANY
 from barpc.scene import View
 from barpc.tie.matchers.features import ample_matches
@@ -17,9 +16,9 @@ from barpc.tie.matchers.placings import Placings, misplaced
 from barpc.tie.pairing.overlaps import Pair, require_connected
 
 STRUCTURE = "structure"
-"""What tries again where another matcher finds few."""
+"""Matcher of pairs for which another one finds few matches."""
 FINE_STRUCTURE = "fine-structure"
-"""And where that finds nothing."""
+"""Matcher of pairs for which structure finds none."""
 SUFFICIENT_SHARE = 0.3
 """A pair of fewer than `MANY` is not tried again where they are this share of the keypoints in its common area, and
 `FEW`: small images have no more to give; nor is a wider pass where this share of the matches stands in the peak."""
@@ -51,7 +50,7 @@ class PairReport:
 
     @property
     def structural(self) -> bool:
-        """Whether structure tells where its matches lie, and not grey values."""
+        """Whether its matches are places of like structure, not of like grey values."""
         return self.matcher in (STRUCTURE, FINE_STRUCTURE)
 
     @property
@@ -60,9 +59,9 @@ class PairReport:
         return self.matcher + ", loosened" * self.loosened + ", by keypoints" * bool(self.unregistered)
 
 
-def ample(report: PairReport, options: TieOptions) -> bool:
-    """Return whether a first look found enough matches to spare a closer one."""
-    return report.status == "ok" and report.verified >= ample_matches(options)
+def ample(report: PairReport, points_per_image: int) -> bool:
+    """Return whether matching at reduced resolution found enough matches."""
+    return report.status == "ok" and report.verified >= ample_matches(points_per_image)
 
 
 def enough(report: PairReport) -> bool:
@@ -71,12 +70,12 @@ def enough(report: PairReport) -> bool:
 
 
 def worth_more(report: PairReport) -> bool:
-    """Return whether another matcher may find what one by keypoints did not."""
+    """Return whether a matcher by structure may find matches where keypoints found few."""
     return not any(report.placings) and "keypoints" not in report.status
 
 
 def _wanted_matches(report: PairReport) -> int:
-    """Return the number of matches that a pair should have: fewer where little is in common."""
+    """Return the number of matches expected of a pair: fewer for a small common area."""
     common = report.overlap * min(report.keypoints)
     return math.ceil(min(MANY, max(FEW, SUFFICIENT_SHARE * common))) if common > 0 else MANY
 

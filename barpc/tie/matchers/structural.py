@@ -1,4 +1,4 @@
-"""Dense matching of structure, where grey values say nothing: another season, sun or sensor.
+"""Dense matching of gradient structure for pairs without like grey values: another season, sun or sensor.
 
 Both images are brought onto the pixels of A, B by the cameras' local derivative, as channels of oriented gradients
 (`barpc.tie.patches.channels`). Templates on a regular grid of A are correlated with all that the band of a prediction
@@ -21,7 +21,8 @@ from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
-from barpc.tie.patches.oriented import HALF, PatchTile, Sampling, found_about, resolution
+from barpc.tie.patches.channels import INVALID_MARGIN
+from barpc.tie.patches.oriented import HALF, MAX_PATCH_SHIFT, PatchTile, Sampling, found_about, resolution
 from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
 
 GRID_POINTS = 200, 500, 1000
@@ -33,7 +34,7 @@ _LONG, _LONGER = 48.0, 130.0  # px of half a band
 
 
 class GradientStructure:
-    """A matcher of gradient structure: the most alike place in each point's band, where no decoy is more alike."""
+    """A matcher of gradient structure: the best correlation in each point's band, if no decoy has a better one."""
 
     detects: ClassVar[bool] = False
     patch: float = 4.0 * HALF
@@ -60,14 +61,14 @@ class GradientStructure:
         if not len(found):
             return NO_MATCHES
         across = prediction.at(found.xy[:, 0]).errors(found.xy[:, 1])[:, 1]
-        return found.select(np.abs(across) <= max(prediction.half_width, 1.5))
+        return found.select(np.abs(across) <= max(prediction.half_width, MAX_PATCH_SHIFT))
 
 
 class FineStructure(GradientStructure):
-    """The same on whole pixels, about cameras that are not far off: lines that coarser pictures have lost.
+    """Structure at full resolution, for cameras with small errors: fine lines are lost in coarser pictures.
 
-    Where half of what is left has grown anew, few places are the best of their bands by themselves: neighbours speak
-    for them, a little to the side of where they would be, and matches count as one that the same neighbours spoke for.
+    Where half of the vegetation has grown anew, few places have the best correlation of their bands by themselves: it
+    is averaged with those of neighbours about the same place, and matches that share neighbours count as one.
     """
 
     widest: ClassVar[float] = 20.0
@@ -75,7 +76,7 @@ class FineStructure(GradientStructure):
 
 
 class _GridSearch:
-    """One look at all points of a grid, at `whole` pixels or in a picture as coarse as the bands are long."""
+    """Search for all points of a grid, at `whole` pixels or in a picture as coarse as the bands are long."""
 
     def __init__(self, a: View, b: View, band: int, prediction: Prediction, whole: bool = False) -> None:
         self._views, self._band, self._prediction, self._whole = (a, b), band, prediction, whole
@@ -111,7 +112,7 @@ class _GridSearch:
         return step, np.concatenate([_grid_points(box, self.pitch) for box in windows])
 
     def matches(self) -> Matches:
-        """Return the best place of every point, on whole bands; found again in finer pictures."""
+        """Return the best place of every point on whole bands, refined in finer pictures."""
         where = self._prediction.where(self._points)
         middle = 0.5 * (where.before + where.after)
         ends = np.stack([where.place(where.before), where.place(where.after)])
@@ -137,11 +138,11 @@ class _GridSearch:
         return Matches.of_places(np.stack([at, xy], axis=1), score)
 
     def _sampling(self, step: int, at: Array) -> Sampling:
-        """Return how both images are seen about some points of A."""
+        """Return the sampling of both images about some points of A."""
         return Sampling(self._files, self._band, step, linear_map(*self._views, at.mean(axis=0)))
 
     def _tile(self, where: EpipolarSegments, rows: IntArray) -> tuple[Array, Array, Array]:
-        """Return the points of A, their best places in B and how unlike these look, of some rows."""
+        """Return the points of A, their best places in B and the dissimilarities, of some rows."""
         at, asked = self._points[rows], self._prediction
         reach_along, slope = 0.5 * (where.after - where.before)[rows], where.slope[rows]
         middle = 0.5 * (where.before + where.after)
@@ -149,7 +150,7 @@ class _GridSearch:
         linear = sampling.linear
         axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
         half = max(asked.half_width, 0.75 * self._step)
-        wide = half if asked.probes else 2.0 * asked.half_width + 6.0 + half
+        wide = half if asked.probes else 2.0 * asked.half_width + INVALID_MARGIN + half
         wide = min(wide, float(np.abs(axes[1]) @ self._files[1][1]))  # B is no wider
         shift, longest = self._part_in_b(where, middle, rows, wide)
         turned = np.abs(np.linalg.inv(self._step * linear) @ axes.T)
@@ -166,7 +167,7 @@ class _GridSearch:
         if self._whole:
             surface = _supported(surface, _adjacency(at, _RING * self.pitch), _SAY)
         elif asked.probes:  # neighbours are moved alike
-            near = _adjacency(at, 1.5 * self.pitch)
+            near = _adjacency(at, self.pitch)
             surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
         off = tile.offsets() @ axes.T  # along, across
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
@@ -180,7 +181,7 @@ class _GridSearch:
         return at[ok], tile.in_b(place)[ok], 1.0 - score[ok]
 
     def _part_in_b(self, where: EpipolarSegments, middle: Array, rows: IntArray, wide: float) -> tuple[float, float]:
-        """Return the middle and half the length [px] of what a tile's segments have in B, from their middles."""
+        """Return the middle and half the length [px] of the parts of a tile's segments inside B, from their middles."""
         start = where.place(middle)[rows]
         step = where.place(middle + 1.0)[rows] - start
         size = np.array(self._files[1][1], dtype=np.float64)
@@ -196,12 +197,12 @@ class _GridSearch:
 
 
 def _adjacency(at: Array, reach: float) -> FloatImage:
-    """1 where points (n, 2) lie within reach [px] of each other along both axes, else 0: (n, n)."""
+    """Return the matrix (n, n) of points (n, 2) within reach [px] of each other along both axes: 1, else 0."""
     return np.asarray(np.abs(at[:, None] - at[None]).max(axis=2) <= reach, np.float32)
 
 
 def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
-    """Correlations (n, y, x) averaged with the best of neighbours' (n, n) about the same place, so much `loud`er."""
+    """Return correlations (n, y, x) averaged with neighbours' (n, n) best about the same place, of weight `loud`."""
     others = near - np.eye(len(near), dtype=np.float32)
     kernel = np.ones((2 * DUPLICATE_DISTANCE + 1,) * 2, np.uint8)
     about = np.stack([cv2.dilate(one, kernel) for one in surface])

@@ -1,1 +1,1 @@
-"""Which views are compared, and where one sees what another shows."""
+"""Pairs of views, their common ground and epipolar geometry."""

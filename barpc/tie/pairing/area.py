@@ -1,4 +1,4 @@
-"""The part of the ground in which tie points are looked for: polygons of a GeoJSON file."""
+"""Area of interest for tie points: polygons of a GeoJSON file."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from barpc.scene import View, connected_groups, connected_labels
 from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import common_range
-from barpc.tie.pixels import Box, tiles
+from barpc.tie.pixels import Box
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ GIVEN_PAIR = "given"
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """What of a block is looked at, and what is known of it beside its cameras.
+    """Restrictions of the search for tie points, and information beside the cameras.
 
     Parameters
     ----------
@@ -114,17 +114,17 @@ class Footprints:
         return np.column_stack([points / self._scale + self._origin, np.full(len(points), self.alt)])
 
 
-def reach_of(view: View, options: TieOptions) -> float:
-    """Return how far a view's camera may be wrong, in any direction [px]."""
-    if options.search is not None:
-        return options.search
+def reach_of(view: View, search: float | None) -> float:
+    """Return the largest error of a view's camera, in any direction [px]: the option `search`, if it is given."""
+    if search is not None:
+        return search
     ground = view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.array(view.altitude))
     pixel = float(ground_sample_distance(view.sensor, ground)[1])
     return float(np.clip(RELATIVE_POINTING_ERROR / pixel, *_SEARCH_LIMITS)) if pixel > 0.0 else _SEARCH_LIMITS[1]
 
 
 def _levels(views: Sequence[View]) -> tuple[float, float, float]:
-    """Return the middle, lowest and highest altitude [m] of what the views' ranges have in common."""
+    """Return the middle, lowest and highest altitude [m] of the common range of the views."""
     low, high = common_range(*views)
     return 0.5 * (low + high), low, high
 
@@ -132,7 +132,7 @@ def _levels(views: Sequence[View]) -> tuple[float, float, float]:
 def overlapping_pairs(
     views: Sequence[View], options: TieOptions, reaches: Sequence[float] = (), area: Area | None = None
 ) -> list[Pair]:
-    """Return all pairs that overlap enough at some altitude, under an angle that is asked for, ascending."""
+    """Return all pairs with enough overlap at some altitude, under an allowed convergence angle, ascending."""
     best: dict[tuple[int, int], Pair] = {}
     for alt in _levels(views):
         for pair in _overlapping_at(Footprints(views, alt, reaches, area), views, options):
@@ -200,7 +200,7 @@ def _candidates(
     lonely |= ~np.isin(np.arange(len(views)), connected_groups(len(views), sorted(known))[0])
     if not (wanted - known if wanted else lonely.any()):
         return pairs
-    grown = overlapping_pairs(views, options, [reach_of(view, options) for view in views], area)
+    grown = overlapping_pairs(views, options, [reach_of(view, options.search) for view in views], area)
     for pair in grown:
         worth = pair.views in wanted if wanted else lonely[list(pair.views)].any()
         if worth and pair.views not in known:
@@ -211,9 +211,7 @@ def _candidates(
 def require_connected(
     views: Sequence[View], links: Sequence[tuple[int, int]], why: str, said: Mapping[str, str] | None = None
 ) -> None:
-    """Raise DisconnectedError unless the links connect all views; `why` says what is missing and what to do, `said` of
-    single views what is wrong with them.
-    """
+    """Raise DisconnectedError unless links connect all views; `why`: reason and remedy, `said`: faults of views."""
     groups = connected_groups(len(views), links)
     if len(groups) < 2:
         return
@@ -225,19 +223,18 @@ def require_connected(
 def shared_tiles(
     views: Sequence[View],
     pairs: Sequence[Pair],
-    options: TieOptions,
+    boxes: Sequence[Sequence[Box]],
+    search: float | None,
     area: Area | None = None,
-    boxes: Sequence[Sequence[Box]] | None = None,
 ) -> list[list[Box]]:
-    """Return the tiles (or `boxes`) of every view that a partner may see in the area, cameras wrong by `reach_of`."""
-    boxes = boxes or [tiles(view.size, options) for view in views]
+    """Return those boxes of every view that a partner may see in the area, with camera errors up to `reach_of`."""
     seen = [np.zeros(len(of_view), dtype=bool) for of_view in boxes]
     partners: list[list[int]] = [[] for _ in views]
     for pair in pairs:
         i, j = pair.views
         partners[i].append(j)
         partners[j].append(i)
-    reaches = [reach_of(view, options) for view in views]
+    reaches = [reach_of(view, search) for view in views]
     for alt in _levels(views):
         prints = Footprints(views, alt, reaches, area)
         for i, of_view in enumerate(boxes):
@@ -282,7 +279,7 @@ def scored_pair(views: Sequence[View], pair: Pair, likeness: int) -> Pair:
 
 
 def _order(pair: Pair) -> tuple[int, int, float, Link]:
-    """Return the order: one date, then by what is in common, then by overlap and angle; last who have nothing."""
+    """Return the sort key: one date, then by likeness, then by overlap and angle; no likeness last."""
     if not isfinite(pair.score):
         return 3, 0, 0.0, pair.views
     if pair.reason == SAME_DATE:

@@ -15,7 +15,7 @@ from barpc.scene import BoolArray
 from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
-"""A part in which an affine frame is farther off the epipolar lines [px] is too large for one."""
+"""A part in which an affine frame misses the epipolar lines by more [px] is too large for one."""
 COLUMNS_PER_PIXEL = 2
 """Columns of the frame a pixel: heights of a Pleiades triplet differ by 0.62 m (NMAD), with one by 0.83 m."""
 WINDOW = 7
@@ -36,7 +36,7 @@ _NOISE_VARIANCE, _SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise 
 
 @dataclass(frozen=True, eq=False)
 class EpipolarFrame:
-    """Affine maps (2, 2, 3) of two images to a frame whose rows are epipolar lines, and what is to be matched there.
+    """Affine maps (2, 2, 3) of two images to a frame whose rows are epipolar lines, and the part to be matched.
 
     `places` (N, 2) [px of the frame]: points about the part; `num`: disparities, from 0 on; `across`: how far rows miss
     the lines at most [px]; `altitude` (4,): of a match, by col, row of the frame, disparity and 1 [m].
@@ -180,7 +180,7 @@ def _back(one: Array, place: Array) -> Array:
 def _resampled(
     path: str, size: tuple[int, int], one: Array, shape: tuple[int, int], band: int
 ) -> tuple[npt.NDArray[np.uint8], BoolArray] | None:
-    """Return an image in the frame, in 8 bits, and where it is known; None where it holds nothing there."""
+    """Return an image in the frame, in 8 bits, and where it is known; None without valid pixels there."""
     corners = _back(one, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * shape)
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, size)
     high = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 3, 0, size)
@@ -204,9 +204,9 @@ def _resampled(
 def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int) -> tuple[FloatImage, BoolArray]:
     """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
     matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
-    there = matcher.compute(left, right).astype(np.float32) / 16.0
+    there = matcher.compute(left, right).astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
-    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / 16.0
+    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
     good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)
@@ -251,6 +251,6 @@ def _refined_disparity(
 
 
 def _warped(values: npt.NDArray[Any], disparity: FloatImage, how: int) -> npt.NDArray[Any]:
-    """Return what the right picture has where the left one's pixels are found."""
+    """Return the right picture resampled at the left one's pixels by their disparities."""
     cols, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in disparity.shape[::-1]))
     return np.asarray(cv2.remap(values, np.asarray(cols - disparity, np.float32), rows, how))

@@ -1,4 +1,4 @@
-"""Templates of one picture's channels found in another's: brought to one resolution and orientation, and correlated.
+"""Correlation of templates between two pictures' channels, brought to one resolution and orientation.
 
 A place counts where its surroundings are a picture, where it is no edge of the search, and where the way back ends
 where it began. Matching by structure, registration by structure and control from a reference all look so.
@@ -40,7 +40,7 @@ def resolution(linear: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Sampling:
-    """How two images are seen on grids of one resolution and orientation."""
+    """Sampling of two images on grids of one resolution and orientation."""
 
     files: ImageFiles
     band: int
@@ -56,7 +56,7 @@ class Sampling:
 
 
 def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> tuple[Array, BoolArray, Array]:
-    """Return the places (n, 2) near those given, whether they stand out and the way back returns; correlations."""
+    """Return the refined places (n, 2), whether they are clear peaks that match back, and correlations."""
     tile = PatchTile.of(sampling, at, xy, np.full(2, _REFINEMENT_RADIUS), half)
     place, ok, score = tile.found()
     return tile.in_b(place), ok & tile.returns(place), score
@@ -186,7 +186,7 @@ class PatchTile:
         return np.asarray(np.concatenate(missed) <= MAX_PATCH_SHIFT)
 
     def shown(self, which: int = 0, place: Array | None = None) -> BoolArray:
-        """Return the places (n, 2) in a picture about which it holds structure: of templates those that do."""
+        """Return the mask of places (n, 2) in a picture with structure about them; of templates by default."""
         at = self.at if place is None else np.rint(place).astype(np.int64)
         known = (np.abs(self.pictures[which]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
         return np.asarray(windows_around(known, at, self.half, self.half).mean(axis=(1, 2, 3)) > MIN_PICTURE_SHARE)

@@ -63,7 +63,7 @@ class PatchRegistration:
 def register_places(
     files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, patch: int
 ) -> PatchRegistration:
-    """Read what is needed of two images, each a path and its size, and register as `register_patches`, tile by tile.
+    """Register patches of two image files, each a path and its size, by `register_patches`, tile by tile.
 
     Where a size is a part of the file's, pixels are means of the file's (`PixelReader`).
     """
@@ -102,7 +102,7 @@ def _window_pixels(reader: PixelReader, size: tuple[int, int], xy: Array, margin
 
 
 def _mosaics(reader: PixelReader, size: tuple[int, int], xy: Array, margin: int) -> ReadWindow:
-    """Return the pixels about every point, side by side in one picture: what lies between points is not worked on."""
+    """Return the pixels about every point, side by side in one picture without those between points."""
     side = 2 * margin + 1
     columns = int(np.ceil(np.sqrt(len(xy))))
     shape = -(-len(xy) // columns) * side, columns * side
@@ -144,7 +144,7 @@ def _by_tile(xy: Array, tile: int) -> list[IntArray]:
 
 
 def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
-    """Return the groups that follow each other as one, as far as they hold so many together."""
+    """Merge consecutive groups while they hold at most `most` rows together."""
     parts: list[list[IntArray]] = []
     for group in groups:
         if not parts or sum(map(len, parts[-1])) + len(group) > most:
@@ -281,7 +281,7 @@ class _Template:
         normal += _SINGLE_PRECISION_EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
         xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
-        noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - 8.0)
+        noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - normal.shape[-1])
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_SINGLE_PRECISION_EPS)
         moved = np.hypot(*(xy - start).T)
         ok = (step <= 10 * settled) & (moved <= oriented.MAX_PATCH_SHIFT) & np.isfinite(sigma)
@@ -351,7 +351,7 @@ def refine(
     of_track = references(tracks, exact, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
-    found = links.register(options, work)
+    found = links.register(options.band, options.tile, work)
     good = links.verified(found, found.ok)
     sigma = links.scaled(found, good)
     return _shared_variance(tracks, of_track, other[good], found.xy[good], sigma[good])
@@ -384,7 +384,7 @@ class _Registrations:
         """Return the indices of the links between the same two views, and of equal values of `more`."""
         return grouped(self.tracks.view[self.reference], self.tracks.view[self.other], *more)
 
-    def register(self, options: TieOptions, work: Work) -> PatchRegistration:
+    def register(self, band: int, tile: int, work: Work) -> PatchRegistration:
         """Register all, tile by tile of the reference view."""
         origin = self.origin
         linear = np.empty((len(self), 2, 2))
@@ -392,14 +392,14 @@ class _Registrations:
             linear[group] = linear_map(*self.of(group), origin[group])
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
-        parts = [part for group in self.groups() for part in _task_parts(origin[group], group, options.tile)]
+        parts = [part for group in self.groups() for part in _task_parts(origin[group], group, tile)]
         tasks = []
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
             ends = sorted(int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other))
-            tasks.append((images, options.band, *places, tuple(ends) in self.structural))
+            tasks.append((images, band, *places, tuple(ends) in self.structural))
         done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
         found = PatchRegistration.none(start)
         for part, one in zip(parts, done, strict=True):
@@ -412,7 +412,7 @@ class _Registrations:
         return where.errors(found.xy[group]), where.after
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
-        """Return the observations that are as certain as others, at one altitude with their track.
+        """Return the mask of observations as certain as their neighbours and at one altitude with their track.
 
         Those off their epipolar line stay: whether the match or the camera is wrong, the adjustment judges, and what it
         holds out is not to agree by selection.
@@ -481,7 +481,7 @@ def _shared_variance(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Arr
 
 
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:
-    """Return the row of the reference observation of every track (P,): the view that is most like the others.
+    """Return the row of the reference observation of every track (P,): that of the view most like the others.
 
     That is where the pairs' spread across the epipolar line [px] is least: it grows with the angle between two views
     and with all else that makes them look different.
