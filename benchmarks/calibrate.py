@@ -24,7 +24,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks
-from barpc.ba.calibration import Calibration, CommonErrors, Learnt, SensorTies, learn
+from barpc.ba.calibration import Learnt, SensorTies, learn
+from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
 from barpc.fit import fit_rpc
 from barpc.scene import Tracks, View

@@ -12,12 +12,12 @@ import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.apart import ForeignCamera, Parts, Solver, find_apart, without_moving
-from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.evidence.scan import neighbours_alike
+from barpc.ba.interior import CommonErrors
 from barpc.ba.judging.following import follow, without_strips
 from barpc.ba.judging.judge import Finding, left_over, standing_out
 from barpc.ba.judging.snooping import image_test
@@ -264,8 +264,7 @@ def _adjustment(
     block, outcome, final = parts.inner, found.outcome, found.final
     covariance = outcome.minimum.covariance(found.problem.free)
     if common is not None:
-        state = final.params, final.points, outcome.weight
-        covariance = replace(covariance, shared=common.by_unknowns(outcome.problem, state, covariance))
+        covariance = replace(covariance, shared=common.respond(outcome.problem, final, outcome.weight, covariance))
     method = covariance.factor.method
     cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
     points, before, after = _points_and_residuals(found, parts)
@@ -369,7 +368,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
-        w[rows] = image_test(covariance, outcome.problem, *at_end, rows)
+        w[rows] = image_test(covariance.of_noise, outcome.problem, *at_end, rows)
     return w
 
 

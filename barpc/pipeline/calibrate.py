@@ -13,7 +13,8 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment
-from barpc.ba.calibration import LINE_SPLINES, Calibration, Learnt, SensorTies, learn, share_shown
+from barpc.ba.calibration import Learnt, SensorTies, learn, share_shown
+from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
 from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
 from barpc.base.errors import InputError, RpcError, listed, plain
@@ -29,6 +30,7 @@ from barpc.rpcio.sources import sensor_of
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
+from barpc.sensor.timing import is_clocked
 
 logger = logging.getLogger(__name__)
 
@@ -277,6 +279,20 @@ def calibrations_of(
 def calibrated(sensors: Sequence[SensorModel], used: Sequence[Calibration | None]) -> list[SensorModel]:
     """Return cameras behind their calibrations, of those that have one."""
     return [s if one is None else Calibrated(s, one.spline) for s, one in zip(sensors, used, strict=True)]
+
+
+def common_errors(run: Run) -> CommonErrors:
+    """Return the errors of interior distortion that the views of a run have in common: by calibration, or unknown.
+
+    Images without a calibration that state no sensor count as of one, as far as they have as many columns.
+    """
+    found = []
+    for view, source in zip(run.views, run.sources, strict=True):
+        used = run.calibrated.get(view.name)
+        if used is None and not is_clocked(view.sensor):
+            used = Calibration.prior(_stated(view, source), view.size[0])
+        found.append(used)
+    return CommonErrors(tuple(found))
 
 
 def _own(view: View, sensor: str, given: Mapping[str, Calibration]) -> Calibration | None:
