@@ -26,9 +26,9 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks
 from barpc.ba.calibration import Learnt, SensorTies, learn
 from barpc.ba.interior import Calibration, CommonErrors
-from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.fit import fit_rpc
-from barpc.scene import Tracks, View
+from barpc.scene import IntArray, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center
 from barpc.simulate import Look, fly
@@ -194,15 +194,38 @@ def with_curve(made: Scene, found: Learnt) -> Adjustment:
     return adjust_tracks(made.views, tracks, common=CommonErrors((used,) * len(made.views)))
 
 
-def bent(made: Scene, found: Adjustment) -> float:
-    """Return how far heights are bent [m], beside what drifts of cameras do: a plane, a twist, bends along the axes."""
-    ground = ground_from_ecef(found.points)
-    known = np.isfinite(ground).all(axis=1)
+def _bends(made: Scene, index: IntArray) -> Array:
+    """Return what takes a plane, a twist and bends along the axes, which cameras' drifts make, off heights (n,)."""
     middle = made.ground.mean(axis=0)
-    east, north = ((made.ground - middle) * metres_per_unit(middle))[known, :2].T / 5e3
-    height = ground[known, 2] - made.ground[known, 2]
+    east, north = ((made.ground - middle) * metres_per_unit(middle))[index, :2].T / 5e3
     rows = np.stack([np.ones_like(east), east, north, east * north, east**2, north**2], axis=1)
-    return float(np.sqrt(np.mean((height - rows @ np.linalg.lstsq(rows, height, rcond=None)[0]) ** 2)))
+    return np.asarray(np.eye(len(rows)) - rows @ np.linalg.pinv(rows))
+
+
+def bent(made: Scene, found: Adjustment) -> float:
+    """Return how far heights are bent [m], the RMS."""
+    height = (ground_from_ecef(found.points) - made.ground)[:, 2]
+    index = np.flatnonzero(np.isfinite(height))
+    return float(np.sqrt(np.mean((_bends(made, index) @ height[index]) ** 2)))
+
+
+def bent_as_said(made: Scene, found: Adjustment) -> tuple[float, float, float]:
+    """Return how far heights are bent [m], the RMS; its standard deviation by the cameras, and with common errors."""
+    ground, inliers = (
+        ground_from_ecef(found.points),
+        np.bincount(made.tracks.point[found.inlier], minlength=len(made.ground)),
+    )
+    index = np.flatnonzero(np.isfinite(ground).all(axis=1) & (inliers >= 2) & ~found.held)[::2]
+    bends, up, covariance = _bends(made, index), enu_basis(ground[index])[:, 2], found.covariance
+    by_unknown = covariance.reduced.carried(
+        np.eye(len(covariance.free)).reshape(len(made.views), -1, len(covariance.free)), index
+    )
+    height = bends @ (ground - made.ground)[index, 2]
+    rows = bends @ np.einsum("ni,nik->nk", up, by_unknown)
+    cameras = np.einsum("nk,kl,nl->n", rows, covariance.of_noise.full, rows).mean()
+    assert covariance.shared is not None
+    shared = ((bends @ np.einsum("ni,nik->nk", up, covariance.shared.of_points(index))) ** 2).sum(axis=1).mean()
+    return float(np.sqrt((height**2).mean())), float(np.sqrt(cameras)), float(np.sqrt(cameras + shared))
 
 
 def pairs(found: Learnt, sensor: Sensor, rng: np.random.Generator, count: int) -> None:

@@ -346,7 +346,7 @@ def _reported_findings(findings: Sequence[Finding], parts: Parts, points: Array)
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
     """Return the tests of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
-    w, gcps = block.in_order(_control_w(found, block, covariance)), len(block.gcps.view)
+    w, gcps = block.in_order(_control_w(found, block, covariance.of_noise)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
         "control": found.tested,
@@ -368,7 +368,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
-        w[rows] = image_test(covariance.of_noise, outcome.problem, *at_end, rows)
+        w[rows] = image_test(covariance, outcome.problem, *at_end, rows)
     return w
 
 
