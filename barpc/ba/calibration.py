@@ -26,7 +26,7 @@ from scipy.sparse.linalg import splu
 from barpc.ba.interior import LINE_SPLINES, STEP_SIGMA, LineCurve
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground_jacobian
-from barpc.base.statistics import BACKFITTING, ROUNDING, STEPS, SURE, robust_spread
+from barpc.base.statistics import BACKFITTING, CRITICAL, ROUNDING, STEPS, SURE, robust_spread
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several
@@ -130,8 +130,9 @@ class _Eliminated:
 
     def product(self, one: sp.csr_array, other: sp.csr_array | None = None) -> sp.csr_array:
         """Return the normal matrix of two sets of unknowns with the points eliminated."""
-        other = one if other is None else other
-        found: sp.csr_array = one.T @ other - (self._points.T @ one).T @ (self._points.T @ other)
+        of_points = self._points.T @ one
+        by_other = of_points if other is None else self._points.T @ other
+        found: sp.csr_array = one.T @ (one if other is None else other) - of_points.T @ by_other
         return found
 
     def gradient(self, one: sp.csr_array) -> Array:
@@ -380,3 +381,8 @@ def share_shown(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
     one = block.told(sp.csr_array(rows))
     information = max(float(one.matrix[0, 0]), ROUNDING)
     return float(-one.gradient[0] / information), float(information**-0.5)
+
+
+def contradicts(shown: float, sigma: float) -> bool:
+    """Return whether tie points that show so much of a curve contradict it."""
+    return shown < 0.5 and 1.0 - shown > CRITICAL * sigma

@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment
-from barpc.ba.calibration import Learnt, SensorTies, learn, share_shown
+from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
 from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
 from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
@@ -22,7 +22,7 @@ from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
 from barpc.base.identity import fingerprint
 from barpc.base.remote import is_url
 from barpc.base.safe_io import CALIBRATION, read_json
-from barpc.base.statistics import CRITICAL, SURE
+from barpc.base.statistics import SURE
 from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
 from barpc.report import Run
 from barpc.report.runfiles import read_summary, read_tables, table_path
@@ -314,7 +314,7 @@ def refuse_strange(run: Run, adjustment: Adjustment) -> None:
     for used, ties in _ties_by_calibration(run, adjustment):
         shown, sigma = share_shown(ties, used.spline)
         logger.info("%s: tie points show %.2f +- %.2f of it", used.path, shown, sigma)
-        if shown < 0.5 and 1.0 - shown > CRITICAL * sigma:
+        if contradicts(shown, sigma):
             raise InputError(
                 f"{used.path}: is not of these images: their tie points show {shown:.2f} +- {sigma:.2f} of its "
                 "distortion (another sensor, or columns in the other order?); leave it out"
