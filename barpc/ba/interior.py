@@ -197,18 +197,18 @@ class CommonErrors:
         structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
         projected = problem.linearise(state.params, state.points)
         whitened = whiten(projected.by_point * weight, reduced.lower[:, structure.point])
-        pull = np.zeros((structure.num_views, q, self.count))
-        common = reduced.common
+        pull, common = np.zeros((structure.num_views, q, self.count)), reduced.common
+        axes = structure.num_points * np.arange(3)
         of_common = np.zeros((0 if common is None else len(common.half), self.count))
         for axis, matrix, by_error in self._displaced(structure.view, problem.xy[0], weight):
-            of_points = _sums(whitened[axis], structure.point, structure.num_points).T @ matrix
+            of_points = _sums(whitened[axis], structure.by_point, np.diff(structure.point_bounds)) @ matrix
             for v, rows in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
-                at = (3 * structure.point[rows, None] + np.arange(3)).ravel()
+                at = (structure.point[rows, None] + axes).ravel()
                 found = matrix[rows].T @ (projected.by_unknown[axis, :, rows] * weight[rows]).T
                 found -= of_points[at].T @ reduced.cross[rows].reshape(-1, q)
                 pull[v] += found.T @ by_error
             if common is not None:
-                at = (3 * common.index[:, None] + np.arange(3)).ravel()
+                at = (common.index[:, None] + axes).ravel()
                 of_common -= common.cross.reshape(len(at), -1).T @ (of_points[at] @ by_error)
         flat = pull.reshape(-1, self.count)
         if common is not None:
@@ -234,10 +234,12 @@ class CommonErrors:
         ecef, xy = structure.of_points(state.points)[:, rows], problem.xy[:, rows]
         projected = problem.cameras.seeing(xy).project(state.params, ecef, bounds, "points")
         whitened = whiten(projected.by_point * weight[rows], reduced.lower[:, point])
+        at = place[point]
+        sums = partial(_sums, order=np.argsort(at, kind="stable"), count=np.bincount(at, minlength=len(index)))
         flat = np.zeros((3 * len(index), self.count))
         for axis, matrix, by_error in self._displaced(structure.view[rows], xy[0], weight[rows]):
-            flat += (_sums(whitened[axis], place[point], len(index)).T @ matrix) @ by_error
-        half = flat.reshape(len(index), 3, -1)
+            flat += (sums(whitened[axis]) @ matrix) @ by_error
+        half = flat.reshape(3, len(index), -1).swapaxes(0, 1)
         if (common := reduced.common) is not None:
             held = place[common.index] >= 0
             half[place[common.index[held]]] -= common.cross[held] @ la.solve_triangular(common.upper, of_common)
@@ -246,9 +248,10 @@ class CommonErrors:
         return np.asarray(with_cameras + own.transpose(1, 0, 2))
 
 
-def _sums(whitened: Array, point: IntArray, count: int) -> sp.csr_array:
-    """Return derivatives (3, K) by points as a sparse matrix (K, 3 `count`)."""
-    place = 3 * point[:, None] + np.arange(3)
-    return sp.csr_array(
-        (whitened.T.ravel(), place.ravel(), 3 * np.arange(len(point) + 1)), shape=(len(point), 3 * count)
-    )
+def _sums(whitened: Array, order: IntArray, count: IntArray) -> sp.csr_array:
+    """Return derivatives (3, K) by points as a sparse matrix (3 P, K), a coordinate after the other.
+
+    `order` (K,) sorts the observations by point, of which each has `count` (P,).
+    """
+    bounds = np.concatenate([[0], np.cumsum(np.tile(count, 3))])
+    return sp.csr_array((whitened[:, order].ravel(), np.tile(order, 3), bounds), shape=(3 * len(count), len(order)))
