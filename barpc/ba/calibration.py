@@ -42,6 +42,7 @@ _BEST_NOISE = 2e-3  # px: no tie points are better, whatever they say of each ot
 # standard deviations up to which tie points count alike: were they weighted by size, what contradicts the curve so far
 # would count less, and a turn would keep a third of its error
 _CUT = 3.0
+_SHOWN = 0.75  # of a curve, by a block of its sensor: halfway from 1 to 0.5, where it harms as much as it helps
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,4 +386,4 @@ def share_shown(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
 
 def contradicts(shown: float, sigma: float) -> bool:
     """Return whether tie points that show so much of a curve contradict it."""
-    return shown < 0.5 and 1.0 - shown > CRITICAL * sigma
+    return shown < _SHOWN and 1.0 - shown > CRITICAL * sigma

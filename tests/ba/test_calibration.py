@@ -13,6 +13,7 @@ from barpc.ba.calibration import (
     Learnt,
     SensorTies,
     _told,
+    contradicts,
     learn,
     share_shown,
 )
@@ -20,7 +21,7 @@ from barpc.ba.interior import Calibration, CommonErrors, LineCurve
 from barpc.base.errors import InputError
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline
 from barpc.simulate import simulate_block
-from benchmarks.calibrate import Scene, Sensor, any_looks, off, scene
+from benchmarks.calibrate import Scene, Sensor, any_looks, off, others, said, scene
 
 SIZE = (6000, 4000)
 
@@ -121,15 +122,30 @@ def test_a_curve_that_changes_is_dated(sensor: Sensor) -> None:
 
 @pytest.mark.slow
 def test_a_block_shows_its_own_curve_whole_and_none_of_another(found: Learnt, sensor: Sensor) -> None:
-    mirrored = Sensor(lambda col: -sensor.curve(SIZE[0] - 1.0 - col), sensor.edges)
     for seed in range(3):
         rng = np.random.default_rng(seed + 50)
         looks = any_looks(3, rng)
         shown, sigma = share_shown(ties(scene(looks, sensor, rng, 700, size=SIZE)), found.spline)
         assert abs(shown - 1.0) < 5.0 * sigma + 0.1
-        shown, sigma = share_shown(ties(scene(looks, mirrored, rng, 700, size=SIZE)), found.spline)
-        assert shown < 0.5
-        assert 1.0 - shown > 4.0 * sigma
+        assert not contradicts(shown, sigma)
+        for name, line in others(sensor, seed, SIZE[0]).items():
+            made = scene(looks, line, np.random.default_rng(seed), 700, size=SIZE)
+            assert contradicts(*share_shown(ties(made), found.spline)), name
+
+
+def test_a_curve_is_contradicted_where_much_of_it_is_surely_missing() -> None:
+    for shown, sigma, wanted in ((0.52, 0.04, True), (-1.0, 0.2, True), (0.7, 0.1, False), (0.9, 0.001, False),
+                                 (1.6, 0.01, False), (0.0, 0.3, False)):  # fmt: skip
+        assert contradicts(shown, sigma) == wanted, (shown, sigma)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", ["polynomials", "waves"])
+def test_what_is_said_of_a_curve_is_right_over_many_sensors(kind: str) -> None:
+    """Neither less nor more than errors are; one line alone may be off by half."""
+    ratio = said(8, kind)
+    assert ratio.max() < 1.25
+    assert ratio.min() > 0.6
 
 
 def test_blocks_of_other_widths_and_too_few_are_refused() -> None:
