@@ -11,28 +11,40 @@ it says of itself over that. bent: RMS of heights of a pair beside a plane, a tw
 
     OMP_NUM_THREADS=1 python benchmarks/calibrate.py                    # 50 scenes
     OMP_NUM_THREADS=1 python benchmarks/calibrate.py --scenes 12 --kind waves --tails
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py --table refusals           # what is refused of 20 sensors
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py --table said               # error over said, RMS of 20 sensors
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py --table sizes --count 1000 # CPU and memory by runs
+    OMP_NUM_THREADS=1 python benchmarks/calibrate.py --table prior              # without a calibration
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
+import sys
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks
-from barpc.ba.calibration import Calibration, CommonErrors, Learnt, SensorTies, learn
-from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
+from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
+from barpc.ba.interior import Calibration, CommonErrors
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.statistics import SURE
 from barpc.fit import fit_rpc
-from barpc.scene import Tracks, View
+from barpc.scene import IntArray, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_center
 from barpc.simulate import Look, fly
 
 SIZE, GSD = (20000, 12000), 0.5
+SMALL = (6000, 4000)
 LINE_RATE = 1e-4
 Curve = Callable[[Array], Array]
 """Columns (n,) -> what a detector line does there (n, 2) [px]."""
@@ -193,15 +205,38 @@ def with_curve(made: Scene, found: Learnt) -> Adjustment:
     return adjust_tracks(made.views, tracks, common=CommonErrors((used,) * len(made.views)))
 
 
-def bent(made: Scene, found: Adjustment) -> float:
-    """Return how far heights are bent [m], beside what drifts of cameras do: a plane, a twist, bends along the axes."""
-    ground = ground_from_ecef(found.points)
-    known = np.isfinite(ground).all(axis=1)
+def _bends(made: Scene, index: IntArray) -> Array:
+    """Return what takes a plane, a twist and bends along the axes, which cameras' drifts make, off heights (n,)."""
     middle = made.ground.mean(axis=0)
-    east, north = ((made.ground - middle) * metres_per_unit(middle))[known, :2].T / 5e3
-    height = ground[known, 2] - made.ground[known, 2]
+    east, north = ((made.ground - middle) * metres_per_unit(middle))[index, :2].T / 5e3
     rows = np.stack([np.ones_like(east), east, north, east * north, east**2, north**2], axis=1)
-    return float(np.sqrt(np.mean((height - rows @ np.linalg.lstsq(rows, height, rcond=None)[0]) ** 2)))
+    return np.asarray(np.eye(len(rows)) - rows @ np.linalg.pinv(rows))
+
+
+def bent(made: Scene, found: Adjustment) -> float:
+    """Return how far heights are bent [m], the RMS."""
+    height = (ground_from_ecef(found.points) - made.ground)[:, 2]
+    index = np.flatnonzero(np.isfinite(height))
+    return float(np.sqrt(np.mean((_bends(made, index) @ height[index]) ** 2)))
+
+
+def bent_as_said(made: Scene, found: Adjustment) -> tuple[float, float, float]:
+    """Return how far heights are bent [m], the RMS; its standard deviation by the cameras, and with common errors."""
+    ground, inliers = (
+        ground_from_ecef(found.points),
+        np.bincount(made.tracks.point[found.inlier], minlength=len(made.ground)),
+    )
+    index = np.flatnonzero(np.isfinite(ground).all(axis=1) & (inliers >= 2) & ~found.held)[::2]
+    bends, up, covariance = _bends(made, index), enu_basis(ground[index])[:, 2], found.covariance
+    by_unknown = covariance.reduced.carried(
+        np.eye(len(covariance.free)).reshape(len(made.views), -1, len(covariance.free)), index
+    )
+    height = bends @ (ground - made.ground)[index, 2]
+    rows = bends @ np.einsum("ni,nik->nk", up, by_unknown)
+    cameras = np.einsum("nk,kl,nl->n", rows, covariance.of_noise.full, rows).mean()
+    assert covariance.shared is not None
+    shared = ((bends @ np.einsum("ni,nik->nk", up, covariance.shared.of_points(index))) ** 2).sum(axis=1).mean()
+    return float(np.sqrt((height**2).mean())), float(np.sqrt(cameras)), float(np.sqrt(cameras + shared))
 
 
 def pairs(found: Learnt, sensor: Sensor, rng: np.random.Generator, count: int) -> None:
@@ -218,6 +253,113 @@ def pairs(found: Learnt, sensor: Sensor, rng: np.random.Generator, count: int) -
                   f"{least:.3f} m", flush=True)  # fmt: skip
 
 
+def said(sensors: int, kind: str, scenes: int = 12) -> Array:
+    """Return the RMS over sensors of errors over what is said (2,): 1 where it is said right, neither more nor less."""
+    ratio = []
+    for seed in range(sensors):
+        rng, sensor = np.random.default_rng(seed), Sensor.made(kind, seed, chips=4, size=SMALL)
+        found = learn([exact(scene(any_looks(3, rng), sensor, rng, 700, size=SMALL)) for _ in range(scenes)])
+        wrong, sigma = off(found, sensor, SMALL[0])
+        ratio.append(wrong / sigma)
+    return np.asarray(np.sqrt(np.mean(np.square(ratio), axis=0)))
+
+
+def exact(made: Scene, name: str = "") -> SensorTies:
+    """Return what a scene tells whose cameras are known but for the detector line."""
+    return SensorTies.of(name, made.views, made.tracks, made.cameras, made.ground)
+
+
+def others(sensor: Sensor, seed: int, width: int) -> dict[str, Sensor]:
+    """Return lines that a calibration of a sensor is not of; binned: of half of its columns, two in one."""
+    curve = sensor.curve
+    return {
+        "another sensor": Sensor.made("polynomials", 1000 + seed, chips=4, size=(width, 0)),
+        "columns mirrored": Sensor(lambda col: np.array([-1.0, 1.0]) * curve(width - 1.0 - col), sensor.edges),
+        "binned by 2": Sensor(lambda col: curve(col / 2.0) * 2.0, 2.0 * sensor.edges),
+        "without distortion": PERFECT,
+    }
+
+
+def shown(made: Scene, found: Learnt) -> tuple[float, float]:
+    """Return the share of a calibration that the tie points of a block adjusted with it show, and its sigma."""
+    adjusted = with_curve(made, found)
+    bases, ground = adjusted.bases, ground_from_ecef(adjusted.points)
+    seen = np.isfinite(ground[made.tracks.point]).all(axis=1)
+    rows = Tracks(*(part[seen] for part in (made.tracks.view, made.tracks.point, made.tracks.xy, made.tracks.sigma)))
+    return share_shown(SensorTies.of("", made.views, rows, bases, ground), found.spline)
+
+
+def refusals(seed: int) -> dict[str, bool]:
+    """Return what was refused of a sensor: by its name what should be, and its own new block, which should not."""
+    rng, sensor = np.random.default_rng(seed), Sensor.made("polynomials", seed, chips=4, size=SMALL)
+    blocks = [exact(scene(any_looks(3, rng), sensor, rng, 500, size=SMALL)) for _ in range(8)]
+    found, out, looks = learn(blocks), dict[str, bool](), any_looks(3, rng)
+    for name, line in {"its own": sensor, **others(sensor, seed, SMALL[0])}.items():
+        made = scene(looks, line, np.random.default_rng(seed), 500, size=SMALL)
+        out[name] = contradicts(*shown(made, found))
+    later = Sensor(lambda col: sensor.curve(col) + 0.2 * np.cos(col[:, None] / 700.0), sensor.edges)
+    more = [exact(scene(any_looks(3, rng), later, rng, 500, size=SMALL)) for _ in range(5)]
+    out["changed, 8 + 5 runs"], out["unchanged"] = learn([*blocks, *more]).change[1] > SURE, found.change[1] > SURE
+    with suppress(InputError):
+        learn(blocks[:2])
+        out["two runs"] = False
+    return {"two runs": True, **out}
+
+
+def size_row(runs: int) -> str:
+    """Return CPU seconds and memory of learning from so many runs: those of 20 scenes, their noise drawn anew."""
+    rng, sensor = np.random.default_rng(1), Sensor.made("polynomials", 1)
+    made = [exact(scene(any_looks(3, rng), sensor, rng)) for _ in range(min(runs, 20))]
+    blocks = []
+    for i in range(runs):
+        one = made[i % len(made)]
+        noise = rng.normal(0, 0.1, one.xy.shape)
+        blocks.append(replace(one, xy=one.xy + noise, residual=one.residual - noise))
+    start, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = learn(blocks)
+    used = time.process_time() - start
+    wrong = np.linalg.norm(off(found, sensor)[0])
+    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return f"{runs} runs: {used:.1f} CPU s, {more:.0f} MB more, to {wrong:.4f} px"
+
+
+def prior_row(name: str, seed: int) -> tuple[float, float, float]:
+    """Return how far heights of a block are bent, and that by what is said without and with the prior (see `main`)."""
+    rng = np.random.default_rng(seed)
+    looks = {"in track": in_track, "crossing": crossing}.get(name, lambda rng: any_looks(3, rng))(rng)
+    line = PERFECT if name == "no distortion" else Sensor.made(list(KINDS)[seed % 2], seed)
+    made = scene(looks, line, rng, 600, noise=0.005, wrong=0.0)
+    prior = Calibration.prior("", SIZE[0])
+    common = CommonErrors((prior,) * len(made.views))
+    bent_by, cameras, both = bent_as_said(made, adjust_tracks(made.views, made.tracks, common=common))
+    return bent_by, bent_by / cameras, bent_by / both
+
+
+def tables(which: str, count: int, kind: str) -> None:
+    """Print a table beside that of the scenes."""
+    if which == "said":
+        print(f"{count} sensors, 12 small scenes each: error over said, RMS {np.round(said(count, kind), 2)}")
+    elif which == "refusals":
+        found = []
+        for seed in range(count):
+            found.append(refusals(seed))
+            print(", ".join(name for name, is_refused in found[-1].items() if is_refused), flush=True)
+        for name in found[0]:
+            print(f"{name}: refused {sum(one[name] for one in found)} of {count}")
+    elif which == "sizes":
+        for runs in (3, 12, 50, 200, 1000):
+            if runs <= count:
+                subprocess.run([sys.executable, __file__, "--table", "size", "--count", str(runs)], check=True)
+    elif which == "size":
+        print(size_row(count), flush=True)
+    else:
+        for name, blocks in {"in track": 6, "crossing": 6, "any": 6, "no distortion": 20}.items():
+            rows = np.array([prior_row(name, seed) for seed in range(min(blocks, count))])
+            square = (rows[:, 1:] ** 2).mean(axis=0)
+            print(f"{name}: heights bent by {np.median(rows[:, 0]):.3f} m, at most {rows[:, 0].max():.3f}; squared "
+                  f"over said {square[0]:.2f} without, {square[1]:.2f} with the prior", flush=True)  # fmt: skip
+
+
 def main() -> None:
     """Print the table."""
     warnings.simplefilter("ignore")
@@ -228,7 +370,12 @@ def main() -> None:
     parser.add_argument("--tails", action="store_true", help="noise with heavy tails")
     parser.add_argument("--pairs", type=int, default=3, help="pairs of either kind to try it on")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--table", choices=["scenes", "said", "refusals", "sizes", "size", "prior"], default="scenes")
+    parser.add_argument("--count", type=int, default=20, help="sensors, blocks or, at most, runs of another table")
     given = parser.parse_args()
+    if given.table != "scenes":
+        tables(given.table, given.count, given.kind)
+        return
     rng, sensor = np.random.default_rng(given.seed), Sensor.made(given.kind, given.seed)
     start, blocks = time.process_time(), []
     for i in range(given.scenes):

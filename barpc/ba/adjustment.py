@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from barpc.ba.altimetry import hold_by_altimetry
-from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.control.snooping import image_test
 from barpc.ba.evidence.scan import neighbours_alike
+from barpc.ba.interior import CommonErrors
 from barpc.ba.resection import resect
 from barpc.ba.result import Adjustment
 from barpc.ba.robust.consensus import two_groups
@@ -183,8 +183,7 @@ def _adjustment(model: Model, found: Solution, options: AdjustOptions, common: C
     block = parts.inner
     covariance = outcome.minimum.covariance(found.problem.free)
     if common is not None:
-        state = final.params, final.points, outcome.weight
-        covariance = replace(covariance, shared=common.by_unknowns(outcome.problem, state, covariance))
+        covariance = replace(covariance, shared=common.respond(outcome.problem, final, outcome.weight, covariance))
     method = covariance.factor.method
     cameras, is_tie = found.problem.cameras, found.problem.structure.point < block.num_tracks
     points, before, after = _points_and_residuals(found, parts)
@@ -266,7 +265,7 @@ def _reported_findings(findings: Sequence[Finding], parts: Parts, points: Array)
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
     """Return the tests of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
-    w, gcps = block.in_order(_control_w(found, block, covariance)), len(block.gcps.view)
+    w, gcps = block.in_order(_control_w(found, block, covariance.of_noise)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
         "control": found.tested,

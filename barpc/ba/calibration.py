@@ -14,28 +14,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import reduce
+from itertools import accumulate
+from operator import add
 
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from barpc.ba.solving.covariance import Covariance
-from barpc.ba.solving.problem import Problem
+from barpc.ba.interior import LINE_SPLINES, STEP_SIGMA, LineCurve
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground_jacobian
-from barpc.base.statistics import BACKFITTING, ROUNDING, SLIGHT, STEPS, SURE, robust_spread
+from barpc.base.statistics import BACKFITTING, CRITICAL, ROUNDING, STEPS, SURE, robust_spread
 from barpc.scene import IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several
-from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bsplines
+from barpc.sensor.image_corrections import ColumnSpline
 
-LINE_SPLINES = 28  # of 25 knots: lenses and focal planes bend over a twentieth of the line, or more slowly
-_COEFFICIENT_SIGMA = (
-    3.0  # px: standard deviation of a coefficient before anything is known, far above any optics that is sold
-)
-_STEP_SIGMA = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
 _ROUGHNESS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: standard deviations of third differences that are compared
 _CANDIDATES = 128  # places of a step that are looked at first; each turn looks at `_FINER` times as many around it
 _FINER = 12
@@ -46,7 +42,7 @@ _BEST_NOISE = 2e-3  # px: no tie points are better, whatever they say of each ot
 # standard deviations up to which tie points count alike: were they weighted by size, what contradicts the curve so far
 # would count less, and a turn would keep a third of its error
 _CUT = 3.0
-CURVE_COLUMNS = 400  # at which a curve is looked at
+_SHOWN = 0.75  # of a curve, by a block of its sensor: halfway from 1 to 0.5, where it harms as much as it helps
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +122,6 @@ class _Eliminated:
         self._solve = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve
         self._half = self.gradient(self._nuisances)
 
-    @property
-    def noise(self) -> float:
-        """Standard deviation of its best tie points [px]."""
-        return float(1.0 / self.weight.max())
-
     def both(self, values: Array, place: IntArray, apart: int, times: int = 1) -> sp.csr_array:
         """Return the derivatives (2 K, 2 `apart` `times`), weighted, of both coordinates by unknowns: of the columns
         values (K, m) at `place`, of the rows `apart` behind.
@@ -140,8 +131,9 @@ class _Eliminated:
 
     def product(self, one: sp.csr_array, other: sp.csr_array | None = None) -> sp.csr_array:
         """Return the normal matrix of two sets of unknowns with the points eliminated."""
-        other = one if other is None else other
-        found: sp.csr_array = one.T @ other - (self._points.T @ one).T @ (self._points.T @ other)
+        of_points = self._points.T @ one
+        by_other = of_points if other is None else self._points.T @ other
+        found: sp.csr_array = one.T @ (one if other is None else other) - of_points.T @ by_other
         return found
 
     def gradient(self, one: sp.csr_array) -> Array:
@@ -185,15 +177,30 @@ class Told:
     cost: float
     freedom: float
 
-    @staticmethod
-    def total(several: Sequence[Told]) -> Told:
-        """Return the sum of several blocks' equations."""
-        parts = zip(*((one.matrix, one.gradient, one.cost, one.freedom) for one in several), strict=True)
-        return Told(*(sum(part) for part in parts))
+    def __add__(self, other: Told) -> Told:
+        return Told(
+            self.matrix + other.matrix,
+            self.gradient + other.gradient,
+            self.cost + other.cost,
+            self.freedom + other.freedom,
+        )
 
     def times(self, factor: float) -> Told:
         """Return the same with another variance of the noise."""
         return replace(self, matrix=self.matrix * factor, gradient=self.gradient * factor, cost=self.cost * factor)
+
+    def without(self, one: Told) -> Told:
+        """Return the sum without one of its blocks."""
+        return self + replace(one.times(-1.0), freedom=-one.freedom)
+
+    def by_steps(self, curve: LineCurve) -> Told:
+        """Return the equations of splines and steps instead of those of splines and detectors."""
+        change = la.block_diag(*2 * [curve.by_detector])
+        return replace(self, matrix=change.T @ self.matrix @ change, gradient=change.T @ self.gradient)
+
+    def part(self, index: IntArray) -> Told:
+        """Return the equations of some of the unknowns, the others 0."""
+        return replace(self, matrix=self.matrix[np.ix_(index, index)], gradient=self.gradient[index])
 
     def solved(self, prior: Array) -> tuple[Array, Array, float]:
         """Return the unknowns (n,), their covariance (n, n), and how probable that makes the data [nats]."""
@@ -207,78 +214,14 @@ class Told:
         return float(-(2.0 * self.gradient + self.matrix @ unknowns) @ unknowns)
 
 
-@dataclass(frozen=True, eq=False)
-class LineCurve:
-    """Layout of a sensor's curve: splines of a coordinate, and steps at columns `edges` (C,), then of the other one."""
-
-    width: int
-    edges: Array
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns of a coordinate."""
-        return LINE_SPLINES + len(self.edges)
-
-    def told(self, block: _Eliminated, col: Array) -> Told:
-        """Return a block's normal equations, of points at columns (K,)."""
-        first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
-        detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
-        place = np.column_stack([first[:, None] + np.arange(4), detector])
-        found = block.told(block.both(np.column_stack([pieces.T, np.ones(len(col))]), place, self.size + 1))
-        # of detectors each, to steps from each edge on
-        steps = np.tri(len(self.edges) + 1, len(self.edges), -1)
-        change = la.block_diag(*2 * [la.block_diag(np.eye(LINE_SPLINES), steps)])
-        return replace(found, matrix=change.T @ found.matrix @ change, gradient=change.T @ found.gradient)
-
-    def along(self, col: Array) -> Array:
-        """Return columns [px] from -1 to 1."""
-        return np.asarray((2.0 * col + 1.0) / self.width - 1.0)
-
-    def basis(self, col: Array) -> Array:
-        """Return the curve (n, size) by one unit of each unknown of a coordinate, at columns (n,)."""
-        steps = (col[:, None] >= self.edges).astype(np.float64)
-        return np.concatenate([bsplines(self.along(col), LINE_SPLINES).T, steps], axis=1)
-
-    def prior(self, bend: float) -> Array:
-        """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
-        rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
-        smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
-        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / _STEP_SIGMA**2)])
-
-    @cached_property
-    def columns(self) -> Array:
-        """Columns at which the curve is looked at (`CURVE_COLUMNS`,), evenly spread."""
-        return (np.arange(CURVE_COLUMNS) + 0.5) * self.width / CURVE_COLUMNS - 0.5
-
-    @cached_property
-    def bent(self) -> Array:
-        """(n, n) Projector of the unknowns off a constant and a slope, both of which splines contain exactly."""
-        lines = np.stack(
-            [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
-        )
-        straight = np.stack([np.ones(CURVE_COLUMNS), self.along(self.columns)], axis=1)
-        one = np.eye(self.size)
-        one[:LINE_SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
-        return np.asarray(la.block_diag(one, one))
-
-    def sizes(self, unknowns: Array) -> Array:
-        """Return the root mean squares (2,) over the columns [px] of a curve (n,), or said by a covariance (n, n)."""
-        basis = self.basis(self.columns)
-        parts = slice(0, self.size), slice(self.size, None)
-        if unknowns.ndim == 1:
-            return np.array([np.sqrt(np.mean((basis @ unknowns[part]) ** 2)) for part in parts])
-        blocks = (unknowns[part, part] for part in parts)
-        return np.sqrt([np.einsum("ni,ij,nj->n", basis, block, basis).mean() for block in blocks])
-
-    def spline(self, unknowns: Array) -> ColumnSpline:
-        """Return the correction with unknowns (n,)."""
-        col, row = unknowns.reshape(2, -1)
-        both = np.stack([col, row], axis=1)
-        return ColumnSpline(self.width, both[:LINE_SPLINES], self.edges, both[LINE_SPLINES:])
+def _told(curve: LineCurve, ties: SensorTies, weight: Array) -> Told:
+    """Return a block's normal equations of splines and detectors, its observations weighted by (K,) [1/px]."""
+    block, (values, place) = _Eliminated(ties, ties.residual, weight), curve.local(ties.xy[:, 0])
+    return block.told(block.both(values, place, curve.size + 1))
 
 
-def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
-    """Return a block linearised at the present curve, its tie points weighted by their residuals."""
+def _weights(ties: SensorTies, curve: ColumnSpline | None) -> Array:
+    """Return the weights (K,) [1/px] of a block's observations by their residuals at the present curve."""
     residual = ties.residual if curve is None else ties.residual + curve.at(ties.xy[:, 0])
     count = np.bincount(ties.point)[ties.point]
     free = (2.0 * count - 3.0) / (2.0 * count)  # of a track's coordinates three go into its point
@@ -289,54 +232,7 @@ def weighted(ties: SensorTies, curve: ColumnSpline | None) -> _Eliminated:
         weight = np.minimum(1.0, _CUT * spread / np.maximum(off, 1e-9)) ** 2
         left = _Eliminated(ties, residual, weight).left()
     noise = np.sqrt((weight**2 * (left**2).sum(axis=1)).sum() / (weight**2 * 2.0 * free).sum())
-    return _Eliminated(ties, ties.residual, weight / max(noise, _BEST_NOISE))
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """The curve of a sensor, its covariance (n, n) [px^2], and the file it came from, with the hash of that."""
-
-    sensor: str
-    spline: ColumnSpline
-    covariance: Array
-    path: str
-    sha256: str
-
-    @cached_property
-    def modes(self) -> tuple[ColumnSpline, ...]:
-        """Independent errors of the curve, each by one standard deviation, the largest first."""
-        size, vectors = la.eigh(self.covariance)
-        kept = np.flatnonzero(size > SLIGHT * size.sum())[::-1]
-        curve = LineCurve(self.spline.width, self.spline.edges)
-        return tuple(curve.spline(vectors[:, i] * np.sqrt(size[i])) for i in kept)
-
-
-@dataclass(frozen=True, eq=False)
-class CommonErrors:
-    """Errors that images of a sensor have in common: those of its calibration."""
-
-    of_view: tuple[Calibration | None, ...]
-
-    def moved(self, view: IntArray, col: Array) -> Array:
-        """Return the displacements (k, K, 2) [px] at columns (K,) by one standard deviation of each error."""
-        found = []
-        for used in {one.sha256: one for one in self.of_view if one is not None}.values():
-            rows = np.array([one is not None and one.sha256 == used.sha256 for one in self.of_view])[view]
-            found += [np.where(rows[:, None], mode.at(col), 0.0) for mode in used.modes]
-        return np.array(found).reshape(-1, len(col), 2)
-
-    def by_unknowns(self, problem: Problem, state: tuple[Array, Array, Array], covariance: Covariance) -> Array:
-        """Return the response of the unknowns (N q, k) to one standard deviation of each error, after an adjustment.
-
-        `state`: unknowns (N, q), points (P, 3) [m] and weights (K,) [1/px].
-        """
-
-        def gradient(xy: Array) -> Array:
-            return replace(problem, xy=xy, _room=[]).reduce(*state).gradient
-
-        start, moved = gradient(problem.xy), self.moved(problem.structure.view, problem.xy[0])
-        pulls = [gradient(problem.xy + one.T) - start for one in moved]
-        return -covariance.solve(np.array(pulls).reshape(-1, len(start)).T)
+    return np.asarray(weight / max(noise, _BEST_NOISE))
 
 
 # --- what many blocks tell --------------------------------------------------------------------------------
@@ -390,18 +286,19 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
     places = np.arange(1, _CANDIDATES) * spacing
     for turn in range(STEPS):
         candidates = LineCurve(int(width), np.unique(np.round(places)) - 0.5)
-        weights = [weighted(block, spline) for block in blocks]
-        total = Told.total([candidates.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)])
+        weights = [_weights(block, spline) for block in blocks]
+        total = reduce(add, (_told(candidates, *one) for one in zip(blocks, weights, strict=True))).by_steps(candidates)
         chosen, bend = _best(total, candidates)
-        curve = LineCurve(int(width), np.sort(candidates.edges[chosen]))
-        told = [curve.told(one, b.xy[:, 0]) for one, b in zip(weights, blocks, strict=True)]
-        spline = curve.spline(Told.total(told).solved(curve.prior(bend))[0])
+        chosen.sort()
+        curve = LineCurve(int(width), candidates.edges[chosen])
+        own = np.r_[:LINE_SPLINES, LINE_SPLINES + np.array(chosen, dtype=np.int64)]
+        spline = curve.spline(total.part(np.r_[own, candidates.size + own]).solved(curve.prior(bend))[0])
         if turn + 1 < STEPS:
             around = np.arange(-1.5 * _FINER, 1.5 * _FINER + 1) * max(spacing / _FINER, 1.0)
             places = (curve.edges[:, None] + 0.5 + around).clip(1.0, width - 1.0).ravel()
             spacing = max(spacing / _FINER, 1.0)
-    noise = float(np.median([one.noise for one in weights]))
-    return _judged(curve, told, curve.prior(bend), noise)
+    told = [_told(curve, *one).by_steps(curve) for one in zip(blocks, weights, strict=True)]
+    return _judged(curve, told, curve.prior(bend), float(np.median([1.0 / one.max() for one in weights])))
 
 
 def _best(total: Told, curve: LineCurve) -> tuple[list[int], float]:
@@ -423,10 +320,10 @@ def _forward(total: Told, curve: LineCurve, bend: float) -> tuple[list[int], flo
     gradient, chosen, pairs = total.gradient[steps] + cross.T @ found, list[int](), np.arange(count)
     while count and len(chosen) < _MOST_STEPS:
         own = np.stack([pairs, pairs + count], axis=1)
-        blocks = matrix[own[:, :, None], own[:, None, :]] + np.eye(2) / _STEP_SIGMA**2
+        blocks = matrix[own[:, :, None], own[:, None, :]] + np.eye(2) / STEP_SIGMA**2
         pull = gradient[own]
         gains = 0.5 * np.einsum("ni,ni->n", pull, np.linalg.solve(blocks, pull[..., None])[..., 0])
-        gains -= 0.5 * np.linalg.slogdet(blocks * _STEP_SIGMA**2)[1] + np.log(count)
+        gains -= 0.5 * np.linalg.slogdet(blocks * STEP_SIGMA**2)[1] + np.log(count)
         best = int(np.argmax(gains))
         if not gains[best] > SURE:
             break
@@ -440,15 +337,15 @@ def _forward(total: Told, curve: LineCurve, bend: float) -> tuple[list[int], flo
 
 def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
     """Return the curve with its tests between blocks."""
-    total = Told.total(told)
+    total = reduce(add, told)
     at, halves = _split(told, prior)
     scatter = _between_blocks(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
     told = [one.times(1.0 / scatter) for one in told]
-    total = Told.total(told)
+    total = reduce(add, told)
     found, covariance, evidence = total.solved(prior)
-    sides = [Told.total(part).solved(prior)[2] for part in (told[:at], told[at:])]
+    sides = [reduce(add, part).solved(prior)[2] for part in (told[:at], told[at:])]
     change = at, sum(sides) - evidence - float(np.log(len(told)))
-    others = [Told.total([*told[:i], *told[i + 1 :]]).solved(prior)[0] for i in range(len(told))]
+    others = [total.without(one).solved(prior)[0] for one in told]
     gain = np.array([one.gain(other) for one, other in zip(told, others, strict=True)])
     freedom = sum(one.freedom for one in told)
     rms = tuple(float(np.sqrt(max(scatter * cost, 0.0) / freedom)) for cost in (total.cost, total.cost - gain.sum()))
@@ -459,8 +356,9 @@ def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) 
 def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]]:
     """Return the split of the blocks by time with the largest evidence, and the curves of both parts."""
     best = (-np.inf, 1, (np.zeros(0), np.zeros(0)))
-    for at in range(1, len(told)):
-        (first, _, one), (second, _, other) = (Told.total(part).solved(prior) for part in (told[:at], told[at:]))
+    total = reduce(add, told)
+    for at, before in enumerate(accumulate(told[:-1], add), 1):
+        (first, _, one), (second, _, other) = (part.solved(prior) for part in (before, total.without(before)))
         best = max(best, (one + other, at, (first, second)), key=lambda row: row[0])
     return best[1:]
 
@@ -478,9 +376,14 @@ def _between_blocks(told: Sequence[Told], curves: Sequence[Array], total: Told, 
 
 def share_shown(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
     """Return how much of a curve the tie points of a block show, 1: all of it, and its standard deviation."""
-    block = weighted(ties, spline)
+    block = _Eliminated(ties, ties.residual, _weights(ties, spline))
     shown = spline.at(ties.xy[:, 0])
     rows = (shown * block.weight[:, None]).reshape(-1, 1)
     one = block.told(sp.csr_array(rows))
     information = max(float(one.matrix[0, 0]), ROUNDING)
     return float(-one.gradient[0] / information), float(information**-0.5)
+
+
+def contradicts(shown: float, sigma: float) -> bool:
+    """Return whether tie points that show so much of a curve contradict it."""
+    return shown < _SHOWN and 1.0 - shown > CRITICAL * sigma

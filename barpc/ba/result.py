@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from barpc.ba.altimetry import AltimetryTest
-from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.gauge import GaugeReport
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.control.snooping import ControlTest
 from barpc.ba.evidence.scan import Interval
+from barpc.ba.interior import CommonErrors
 from barpc.ba.parameters.priors import EarlierScene
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust.consensus import TwoGroups
@@ -279,9 +279,10 @@ def _with_common(
     adjustment: Adjustment, pair: tuple[int, int], points: Array, known: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
     """Return the derivative of heights by unknowns and by errors in common, and the covariance of both together."""
-    common, shared, (by_camera, pull, covariance) = adjustment.common, adjustment.covariance.shared, known
+    common, (by_camera, pull, covariance) = adjustment.common, known
     assert common is not None
-    assert shared is not None
+    assert adjustment.covariance.shared is not None
+    shared = adjustment.covariance.shared.by_unknown
     ground, direct = ground_from_ecef(points), np.zeros((shared.shape[1], len(points)))
     for at, view in enumerate(pair):
         col = adjustment.sensors[view].project(ground)[:, 0]

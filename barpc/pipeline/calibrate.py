@@ -13,7 +13,8 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment
-from barpc.ba.calibration import LINE_SPLINES, Calibration, Learnt, SensorTies, learn, share_shown
+from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
+from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
 from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
 from barpc.base.errors import InputError, RpcError, listed, plain
@@ -21,7 +22,7 @@ from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
 from barpc.base.identity import fingerprint
 from barpc.base.remote import is_url
 from barpc.base.safe_io import CALIBRATION, read_json
-from barpc.base.statistics import CRITICAL, SURE
+from barpc.base.statistics import SURE
 from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
 from barpc.report import Run
 from barpc.report.runfiles import read_summary, read_tables, table_path
@@ -29,6 +30,7 @@ from barpc.rpcio.sources import sensor_of
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
+from barpc.sensor.timing import is_clocked
 
 logger = logging.getLogger(__name__)
 
@@ -279,6 +281,20 @@ def calibrated(sensors: Sequence[SensorModel], used: Sequence[Calibration | None
     return [s if one is None else Calibrated(s, one.spline) for s, one in zip(sensors, used, strict=True)]
 
 
+def common_errors(run: Run) -> CommonErrors:
+    """Return the errors of interior distortion that the views of a run have in common: by calibration, or unknown.
+
+    Images without a calibration that state no sensor count as of one, as far as they have as many columns.
+    """
+    found = []
+    for view, source in zip(run.views, run.sources, strict=True):
+        used = run.calibrated.get(view.name)
+        if used is None and not is_clocked(view.sensor):
+            used = Calibration.prior(_stated(view, source), view.size[0])
+        found.append(used)
+    return CommonErrors(tuple(found))
+
+
 def _own(view: View, sensor: str, given: Mapping[str, Calibration]) -> Calibration | None:
     if not sensor:
         return next(iter(given.values())) if len(given) == 1 else None
@@ -298,7 +314,7 @@ def refuse_strange(run: Run, adjustment: Adjustment) -> None:
     for used, ties in _ties_by_calibration(run, adjustment):
         shown, sigma = share_shown(ties, used.spline)
         logger.info("%s: tie points show %.2f +- %.2f of it", used.path, shown, sigma)
-        if shown < 0.5 and 1.0 - shown > CRITICAL * sigma:
+        if contradicts(shown, sigma):
             raise InputError(
                 f"{used.path}: is not of these images: their tie points show {shown:.2f} +- {sigma:.2f} of its "
                 "distortion (another sensor, or columns in the other order?); leave it out"

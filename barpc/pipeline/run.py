@@ -17,7 +17,6 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
-from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
@@ -27,7 +26,7 @@ from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
-from barpc.pipeline.calibrate import calibrated, calibrations_of, refuse_strange
+from barpc.pipeline.calibrate import calibrated, calibrations_of, common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
@@ -413,7 +412,7 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
         reference=_undistorted_reference(run),
         altimetry=altimetry,
         keep_largest=options.keep_going,
-        common=CommonErrors(tuple(run.calibrated.get(v.name) for v in run.views)) if run.calibrated else None,
+        common=common_errors(run),
     )
     refuse_strange(run, adjustment)
     datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.calibration import Calibration
 from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
+from barpc.ba.interior import Calibration
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
 from barpc.base.statistics import CRITICAL
 from barpc.fit import RpcFit

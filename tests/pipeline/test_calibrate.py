@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,14 +17,16 @@ from click.testing import CliRunner, Result
 
 import barpc
 from barpc.ba.calibration import SensorTies, learn
+from barpc.ba.interior import Calibration
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import _FinishedRun, _refuse_unsure, _row_direction, read_calibration
+from barpc.pipeline.calibrate import _FinishedRun, _refuse_unsure, _row_direction, common_errors, read_calibration
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
+from barpc.report import Run
 from barpc.rpcio.carried import put_tag
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look
@@ -114,6 +118,9 @@ def test_a_run_with_a_calibration_writes_it_and_is_calibrated_again_to_the_same(
     made = scene(any_looks(3, rng), line, rng, 500, size=SIZE)
     paths = files(made, tmp_path / "new")
     plain, with_it = run(paths, "plain"), run(paths, "with", calibration=(str(calibration),))
+    assert {one.sensor for one in plain.adjustment.common.of_view} == {"SIM1_PAN"}  # type: ignore[union-attr]
+    bends = [one.adjustment.gauge.motion_sigma[7:] for one in (plain, with_it)]  # of a prior, and of what is known
+    assert (bends[1] < bends[0]).all()
     after = [np.sqrt((one.adjustment.residuals[one.adjustment.inlier] ** 2).mean()) for one in (plain, with_it)]
     assert after[1] < 0.9 * after[0]
     camera, spline = with_it.run.cameras[0], read_calibration(calibration).spline
@@ -206,11 +213,33 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
     refused("is given twice", archive[0])
     refused("no finished run", tmp_path / "nowhere")
     refused("was changed since", copied("tables/observations.csv", "view,track\n"))
+    table = (archive[2] / "tables/observations.csv").read_text()
+    refused("was changed since", copied("tables/observations.csv", table[: len(table) // 2]))
+    refused("was changed since", copied("tables/residuals.csv", ""))
     refused("missing", copied("tables/images.json", None))
     refused("missing", copied("SHA256SUMS", None))
     refused("schema", copied("summary.json", '{"schema": "barpc-summary-1"}'))
     refused("no summary.json", copied("summary.json", None))
     refused("the images state SIM1_PAN", archive[2], sensor="WV02_P")
+
+
+def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> None:
+    """Images that state none count as of one; a calibration is in place of the prior."""
+    rng = np.random.default_rng(6)
+    made = scene(any_looks(3, rng), Sensor.made("waves", 1, size=SIZE), rng, 30, size=SIZE)
+    names = [files(made, tmp_path / (name or "none"), name) for name in ("SIM1", "SIM2", "")]
+    views = [replace(view, name=f"{i} {view.name}", path=str(path))
+             for i, paths in enumerate(names) for view, path in zip(made.views, paths, strict=True)]  # fmt: skip
+    views[-1] = replace(views[-1], size=(4001, 3000))
+    sources = [open_camera(Path(view.path)) for view in views]
+    own = Calibration.prior("SIM1_PAN", SIZE[0])
+    run = Run("adjust", tuple(views), tuple(sources), made.tracks, calibrated={views[0].name: own})
+    found = common_errors(run).of_view
+    assert found[0] is own
+    keys = [one.sha256 for one in found if one is not None]
+    assert [keys.index(key) for key in keys] == [0, 0, 0, 3, 3, 3, 6, 6, 8]
+    radar = replace(views[1], sensor=SimpleNamespace(timed=None))
+    assert common_errors(replace(run, views=(radar,), sources=tuple(sources[1:2]))).of_view == (None,)
 
 
 @pytest.mark.parametrize(

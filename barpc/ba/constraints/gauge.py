@@ -83,8 +83,14 @@ def gauge_report(
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
-    by_unknown, own = _motion_by_unknowns(covariance, local / radius, enu, use, use.sum() / count)
-    found = _assembled_report(covariance, enu @ shift, by_unknown, own, radius)
+    pick = _motion_of_points(local / radius) @ enu  # (10, n, 3) by ECEF moves
+    by_unknown, own = _motion_by_unknowns(covariance.of_noise, pick, use, use.sum() / count)
+    shared = (
+        None
+        if covariance.shared is None
+        else np.einsum("mni,nik->mk", pick, covariance.shared.of_points(np.flatnonzero(use)))
+    )
+    found = _assembled_report(covariance, enu @ shift, (by_unknown, own, shared), radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
@@ -99,26 +105,29 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
     by_unknown = np.zeros((len(MOTIONS), params.size))
     by_unknown[:, prior.index] = scene.by_unknown
     moved = scene.by_unknown @ (params.ravel()[prior.index] - prior.mean)
-    return _assembled_report(covariance, moved[:3], by_unknown, scene.own, scene.radius)
+    shared = None if covariance.shared is None else by_unknown @ covariance.shared.by_unknown
+    return _assembled_report(covariance, moved[:3], (by_unknown, scene.own, shared), scene.radius)
 
 
 def _assembled_report(
-    covariance: Covariance, shift: Array, by_unknown: Array, own: Array, radius: float
+    covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | None], radius: float
 ) -> GaugeReport:
-    motion_covariance = by_unknown @ covariance.solve(by_unknown.T) + own
+    """`motions`: by unknowns, of their own where these are known, and by errors that images have in common (10, k)."""
+    by_unknown, own, shared = motions
+    motion_covariance = by_unknown @ covariance.of_noise.solve(by_unknown.T) + own
+    motion_covariance += 0.0 if shared is None else shared @ shared.T
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
 
 
-def _motion_by_unknowns(
-    covariance: Covariance, local: Array, enu: Array, use: BoolArray, share: float
-) -> tuple[Array, Array]:
-    """Return the motions by the cameras' unknowns (10, N q), their covariance (10, 10) with cameras known."""
+def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:
+    """Return the motions by the cameras' unknowns (10, N q), their covariance (10, 10) with cameras known; `pick`
+    (10, n, 3) is their derivative by the moves of points.
+    """
     reduced = covariance.reduced
     structure = reduced.structure
     count, q = len(MOTIONS), covariance.num_unknowns
     index = np.flatnonzero(use)
-    pick = _motion_of_points(local) @ enu  # (10, n, 3) by ECEF moves
     lower = reduced.lower[:, index]
     whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
     whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
@@ -182,7 +191,7 @@ def datum_shares(
     problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
     known : (int, int), points from the first on are GCPs, from the second on a reference's
     """
-    moves = covariance.solve(by_unknown.T)
+    moves = covariance.of_noise.solve(by_unknown.T)
     variance = np.einsum("mn,nm->m", by_unknown, moves)
     with np.errstate(divide="ignore", invalid="ignore"):
         unknowns = (moves / np.sqrt(variance)).reshape(problem.structure.num_views, -1, len(variance))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,14 +19,21 @@ _DENSE_UNKNOWNS = 900  # unknowns up to which the whole matrix is kept, and know
 
 
 @dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Response of an adjustment to k errors that images have in common, by one standard deviation of each."""
+
+    by_unknown: Array  # (N q, k) moves of the unknowns
+    of_points: Callable[[IntArray], Array]  # of points (n,) their moves (n, 3, k) [m], ECEF
+
+
+@dataclass(frozen=True, eq=False)
 class Covariance:
     """Posterior covariance of an adjustment; computed when asked, from the factorised normal matrix."""
 
     reduced: Reduced  # the problem linearised at its solution
     factor: Factor  # of the reduced matrix, free unknowns only
     free: BoolArray  # (N q,) unknowns that are not fixed
-    # (N q, k) what unknowns do with errors that images have in common, beside the noise, by their standard deviations
-    shared: Array | None = None
+    shared: SharedErrors | None = None
 
     @property
     def num_unknowns(self) -> int:
@@ -36,7 +44,12 @@ class Covariance:
         """Return S^-1 b for right-hand sides (N q, m); zero for fixed unknowns."""
         out = np.zeros(rows.shape)
         out[self.free] = self.factor.solve(np.ascontiguousarray(rows[self.free]))
-        return out if self.shared is None else out + self.shared @ (self.shared.T @ rows)
+        return out if self.shared is None else out + self.shared.by_unknown @ (self.shared.by_unknown.T @ rows)
+
+    @cached_property
+    def of_noise(self) -> Covariance:
+        """The same without the errors that images have in common."""
+        return self if self.shared is None else replace(self, shared=None)
 
     @property
     def is_large(self) -> bool:
@@ -96,7 +109,7 @@ class Covariance:
     def _of_shared(self, view: int | None = None) -> Array:
         """Return the rows (q, k) of a view in common errors; without a view the covariances (N, q, q) by these."""
         assert self.shared is not None
-        rows = self.shared.reshape(-1, self.num_unknowns, self.shared.shape[1])
+        rows = self.shared.by_unknown.reshape(-1, self.num_unknowns, self.shared.by_unknown.shape[1])
         return np.asarray(rows @ np.swapaxes(rows, 1, 2) if view is None else rows[view])
 
     @cached_property
@@ -123,7 +136,7 @@ class Covariance:
         out = np.zeros((len(self.free), len(self.free)))
         if self.factor.whole_inverse is not None:
             out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
-            return out if self.shared is None else out + self.shared @ self.shared.T
+            return out if self.shared is None else out + self.shared.by_unknown @ self.shared.by_unknown.T
         every = np.arange(len(self.free))
         for part in parts(len(every), max(KEPT // len(every), 1)):
             out[:, part] = self._columns(every[part], False)
@@ -131,6 +144,9 @@ class Covariance:
 
     def points(self, index: IntArray) -> Array:
         """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
+        if self.shared is not None:
+            moves = self.shared.of_points(index)
+            return np.asarray(self.of_noise.points(index) + moves @ np.swapaxes(moves, 1, 2))
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
         lower = self.reduced.lower[:, index]

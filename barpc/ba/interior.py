@@ -1,0 +1,257 @@
+"""Interior distortion of a sensor, the same in all its images: its curve by column, and its part in a covariance.
+
+Where no calibration is given, the distortion has a prior: mean 0, a standard deviation of `_PRIOR_SIGMA` a coordinate,
+and a correlation of exp(-d / `_PRIOR_LENGTH`) between columns d apart, that of steps at random columns. It has no
+constant and no slope, which a camera's correction absorbs.
+
+Every error of a curve displaces the observations of all images of the sensor. The response of an adjustment is one
+Gauss-Newton step with the observations displaced: unknowns move by S^-1 g, points with them and by their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from barpc.ba.solving.covariance import Covariance, SharedErrors
+from barpc.ba.solving.normal import Reduced, solve_transposed, whiten
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
+from barpc.base.geodesy import Array
+from barpc.base.statistics import SLIGHT
+from barpc.scene import BoolArray, IntArray
+from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bsplines
+
+LINE_SPLINES = 28  # of 25 knots: lenses and focal planes bend over a twentieth of the line, or more slowly
+_COEFFICIENT_SIGMA = (
+    3.0  # px: standard deviation of a coefficient before anything is known, far above any optics that is sold
+)
+STEP_SIGMA = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
+CURVE_COLUMNS = 400  # at which a curve is looked at
+# px: interior orientation is calibrated in flight to 0.05-0.1 px RMS (SPOT 5 HRS and HRG, Gachet 2004, Int. Arch.
+# Photogramm. XXXV-B1, whose curves before it reach 0.4 px) or to "better than 0.3 px" (ZY-1 02C, Yang and Wang 2013,
+# J. Remote Sens. 17(5)): the upper one, as the sensor may be any. 0.42 leaves 0.3 of a line of 30,000 columns once a
+# constant and a slope are taken off
+_PRIOR_SIGMA = 0.42
+# px: detectors of focal planes have 1,000 (WorldView) to 6,000 columns (Pleiades); the steps between them make most of
+# a distortion's differences between columns
+_PRIOR_LENGTH = 3000.0
+
+
+@dataclass(frozen=True, eq=False)
+class LineCurve:
+    """Layout of a sensor's curve: splines of a coordinate, and steps at columns `edges` (C,), then of the other one."""
+
+    width: int
+    edges: Array
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns of a coordinate."""
+        return LINE_SPLINES + len(self.edges)
+
+    def local(self, col: Array) -> tuple[Array, IntArray]:
+        """Return what is not 0 of splines and detectors at columns (K,), values (K, 5), and their numbers (K, 5)."""
+        first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
+        detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
+        return np.column_stack([pieces.T, np.ones(len(col))]), np.column_stack(
+            [first[:, None] + np.arange(4), detector]
+        )
+
+    @cached_property
+    def by_detector(self) -> Array:
+        """(size + 1, size) Coefficients of splines and detectors by the unknowns of a coordinate."""
+        return np.asarray(la.block_diag(np.eye(LINE_SPLINES), np.tri(len(self.edges) + 1, len(self.edges), -1)))
+
+    def along(self, col: Array) -> Array:
+        """Return columns [px] from -1 to 1."""
+        return np.asarray((2.0 * col + 1.0) / self.width - 1.0)
+
+    def basis(self, col: Array) -> Array:
+        """Return the curve (n, size) by one unit of each unknown of a coordinate, at columns (n,)."""
+        steps = (col[:, None] >= self.edges).astype(np.float64)
+        return np.concatenate([bsplines(self.along(col), LINE_SPLINES).T, steps], axis=1)
+
+    def prior(self, bend: float) -> Array:
+        """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
+        rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
+        smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
+        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / STEP_SIGMA**2)])
+
+    @cached_property
+    def columns(self) -> Array:
+        """Columns at which the curve is looked at (`CURVE_COLUMNS`,), evenly spread."""
+        return (np.arange(CURVE_COLUMNS) + 0.5) * self.width / CURVE_COLUMNS - 0.5
+
+    @cached_property
+    def bent(self) -> Array:
+        """(n, n) Projector of the unknowns off a constant and a slope, both of which splines contain exactly."""
+        lines = np.stack(
+            [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
+        )
+        straight = np.stack([np.ones(CURVE_COLUMNS), self.along(self.columns)], axis=1)
+        one = np.eye(self.size)
+        one[:LINE_SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
+        return np.asarray(la.block_diag(one, one))
+
+    def sizes(self, unknowns: Array) -> Array:
+        """Return the root mean squares (2,) over the columns [px] of a curve (n,), or said by a covariance (n, n)."""
+        basis = self.basis(self.columns)
+        parts = slice(0, self.size), slice(self.size, None)
+        if unknowns.ndim == 1:
+            return np.array([np.sqrt(np.mean((basis @ unknowns[part]) ** 2)) for part in parts])
+        blocks = (unknowns[part, part] for part in parts)
+        return np.sqrt([np.einsum("ni,ij,nj->n", basis, block, basis).mean() for block in blocks])
+
+    def spline(self, unknowns: Array) -> ColumnSpline:
+        """Return the correction with unknowns (n,)."""
+        col, row = unknowns.reshape(2, -1)
+        both = np.stack([col, row], axis=1)
+        return ColumnSpline(self.width, both[:LINE_SPLINES], self.edges, both[LINE_SPLINES:])
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The curve of a sensor, its covariance (n, n) [px^2], and the file it came from, with the hash of that."""
+
+    sensor: str
+    spline: ColumnSpline
+    covariance: Array
+    path: str
+    sha256: str
+
+    @classmethod
+    def prior(cls, sensor: str, width: int) -> Calibration:
+        """Return what is known of the sensor of images of `width` columns without a calibration: no distortion,
+        give or take that of the field's sensors.
+        """
+        curve = LineCurve(width, np.zeros(0))
+        knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
+        kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)
+        covariance = curve.bent @ la.block_diag(kernel, kernel) @ curve.bent.T
+        return cls(sensor, ColumnSpline(width, np.zeros((LINE_SPLINES, 2))), covariance, "", f"prior {sensor} {width}")
+
+    @property
+    def curve(self) -> LineCurve:
+        """Its layout."""
+        return LineCurve(self.spline.width, self.spline.edges)
+
+    @cached_property
+    def root(self) -> Array:
+        """(n, k) Independent errors of the curve, each by one standard deviation, the largest first."""
+        size, vectors = la.eigh(self.covariance)
+        kept = np.flatnonzero(size > SLIGHT * size.sum())[::-1]
+        return np.asarray(vectors[:, kept] * np.sqrt(size[kept]))
+
+
+@dataclass(frozen=True, eq=False)
+class CommonErrors:
+    """Errors that images of a sensor have in common: those of its calibration, or of what is known without one."""
+
+    of_view: tuple[Calibration | None, ...]
+
+    @cached_property
+    def _groups(self) -> list[tuple[Calibration, BoolArray]]:
+        """Calibrations, each with its views (N,)."""
+        used = {one.sha256: one for one in self.of_view if one is not None}
+        found = np.array([None if one is None else one.sha256 for one in self.of_view])
+        return [(one, found == key) for key, one in used.items()]
+
+    @property
+    def count(self) -> int:
+        """Number k of independent errors."""
+        return sum(one.root.shape[1] for one, _ in self._groups)
+
+    def moved(self, view: IntArray, col: Array) -> Array:
+        """Return the displacements (k, K, 2) [px] at columns (K,) by one standard deviation of each error."""
+        found = [np.zeros((0, len(col), 2))]
+        for one, of in self._groups:
+            basis = one.curve.basis(col) * of[view][:, None]
+            found.append(np.stack([basis @ part for part in np.split(one.root, 2)]).transpose(2, 1, 0))
+        return np.concatenate(found)
+
+    def _displaced(self, view: IntArray, col: Array, weight: Array) -> Iterator[tuple[int, sp.csr_array, Array]]:
+        """Yield displacements, weighted, of a coordinate: its number, (K, m) by coefficients, and these by all errors
+        (m, k).
+        """
+        first = 0
+        for one, of in self._groups:
+            curve, last = one.curve, first + one.root.shape[1]
+            values, place = curve.local(col)
+            rows = np.arange(0, values.size + 1, values.shape[1])
+            weighted = (values * (weight * of[view])[:, None]).ravel()
+            matrix = sp.csr_array((weighted, place.ravel(), rows), shape=(len(col), curve.size + 1))
+            for axis, part in enumerate(np.split(one.root, 2)):
+                by_error = np.zeros((curve.size + 1, self.count))
+                by_error[:, first:last] = curve.by_detector @ part
+                yield axis, matrix, by_error
+            first = last
+
+    def respond(self, problem: Problem, state: State, weight: Array, covariance: Covariance) -> SharedErrors:
+        """Return the response of an adjustment, of weights (K,) [1/px], to one standard deviation of each error."""
+        structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
+        projected = problem.linearise(state.params, state.points)
+        whitened = whiten(projected.by_point * weight, reduced.lower[:, structure.point])
+        pull, common = np.zeros((structure.num_views, q, self.count)), reduced.common
+        axes = structure.num_points * np.arange(3)
+        of_common = np.zeros((0 if common is None else len(common.half), self.count))
+        for axis, matrix, by_error in self._displaced(structure.view, problem.xy[0], weight):
+            of_points = _sums(whitened[axis], structure.by_point, np.diff(structure.point_bounds)) @ matrix
+            for v, rows in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
+                at = (structure.point[rows, None] + axes).ravel()
+                found = matrix[rows].T @ (projected.by_unknown[axis, :, rows] * weight[rows]).T
+                found -= of_points[at].T @ reduced.cross[rows].reshape(-1, q)
+                pull[v] += found.T @ by_error
+            if common is not None:
+                at = (common.index[:, None] + axes).ravel()
+                of_common -= common.cross.reshape(len(at), -1).T @ (of_points[at] @ by_error)
+        flat = pull.reshape(-1, self.count)
+        if common is not None:
+            of_common = la.solve_triangular(common.upper, of_common, trans="T")
+            flat = flat - common.by_camera.T @ of_common
+        by_unknown = covariance.solve(flat)
+        known = problem, state, weight, reduced
+        return SharedErrors(by_unknown, partial(self._point_moves, known, (by_unknown, of_common)))
+
+    def _point_moves(
+        self,
+        known: tuple[Problem, State, Array, Reduced],
+        moved: tuple[Array, Array],
+        index: IntArray,
+    ) -> Array:
+        """Return the moves (n, 3, k) [m] of points, of unknowns (N q, k) and what errors of heights have in common."""
+        (problem, state, weight, reduced), (by_unknown, of_common) = known, moved
+        structure = problem.structure
+        place = np.full(structure.num_points, -1)
+        place[index] = np.arange(len(index))
+        rows = np.flatnonzero(place[structure.point] >= 0)
+        point, bounds = structure.point[rows], np.searchsorted(rows, structure.bounds)
+        ecef, xy = structure.of_points(state.points)[:, rows], problem.xy[:, rows]
+        projected = problem.cameras.seeing(xy).project(state.params, ecef, bounds, "points")
+        whitened = whiten(projected.by_point * weight[rows], reduced.lower[:, point])
+        at = place[point]
+        sums = partial(_sums, order=np.argsort(at, kind="stable"), count=np.bincount(at, minlength=len(index)))
+        flat = np.zeros((3 * len(index), self.count))
+        for axis, matrix, by_error in self._displaced(structure.view[rows], xy[0], weight[rows]):
+            flat += (sums(whitened[axis]) @ matrix) @ by_error
+        half = flat.reshape(3, len(index), -1).swapaxes(0, 1)
+        if (common := reduced.common) is not None:
+            held = place[common.index] >= 0
+            half[place[common.index[held]]] -= common.cross[held] @ la.solve_triangular(common.upper, of_common)
+        own = solve_transposed(reduced.lower[:, index, None], half.transpose(1, 0, 2))
+        with_cameras = reduced.carried(by_unknown.reshape(structure.num_views, -1, self.count), index)
+        return np.asarray(with_cameras + own.transpose(1, 0, 2))
+
+
+def _sums(whitened: Array, order: IntArray, count: IntArray) -> sp.csr_array:
+    """Return derivatives (3, K) by points as a sparse matrix (3 P, K), a coordinate after the other.
+
+    `order` (K,) sorts the observations by point, of which each has `count` (P,).
+    """
+    bounds = np.concatenate([[0], np.cumsum(np.tile(count, 3))])
+    return sp.csr_array((whitened[:, order].ravel(), np.tile(order, 3), bounds), shape=(3 * len(count), len(order)))
