@@ -174,7 +174,7 @@ def offsets(check: Path, cameras: dict[str, Path], points: dict[tuple[str, str],
         if not (cameras.get(a, Path()).is_file() and cameras.get(b, Path()).is_file()):
             return "a camera is missing"
         run = subprocess.run(
-            [sys.executable, check.__file__ or "", cameras[a], cameras[b], ties],
+            [sys.executable, str(check), cameras[a], cameras[b], ties],
             capture_output=True,
             text=True,
             check=False,

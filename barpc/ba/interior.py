@@ -56,7 +56,7 @@ class LineCurve:
         return LINE_SPLINES + len(self.edges)
 
     def local(self, col: Array) -> tuple[Array, IntArray]:
-        """Return what is not 0 of splines and detectors at columns (K,), values (K, 5), and their numbers (K, 5)."""
+        """Return the splines and detectors that are not 0 at columns (K,): values (K, 5), and their numbers (K, 5)."""
         first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
         detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
         return np.column_stack([pieces.T, np.ones(len(col))]), np.column_stack(
@@ -127,9 +127,7 @@ class Calibration:
 
     @classmethod
     def prior(cls, sensor: str, width: int) -> Calibration:
-        """Return what is known of the sensor of images of `width` columns without a calibration: no distortion,
-        give or take that of the field's sensors.
-        """
+        """Return the prior of a sensor of images of `width` columns: no distortion, within that of the field's sensors."""
         curve = LineCurve(width, np.zeros(0))
         knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
         kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)
@@ -151,7 +149,7 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class CommonErrors:
-    """Errors that images of a sensor have in common: those of its calibration, or of what is known without one."""
+    """Errors that images of a sensor have in common: those of its calibration, or of the prior without one."""
 
     of_view: tuple[Calibration | None, ...]
 
@@ -224,7 +222,7 @@ class CommonErrors:
         moved: tuple[Array, Array],
         index: IntArray,
     ) -> Array:
-        """Return the moves (n, 3, k) [m] of points, of unknowns (N q, k) and what errors of heights have in common."""
+        """Return the motions (n, 3, k) [m] of points, by unknowns (N q, k) and common errors of heights."""
         (problem, state, weight, reduced), (by_unknown, of_common) = known, moved
         structure = problem.structure
         place = np.full(structure.num_points, -1)
