@@ -127,7 +127,7 @@ class Calibration:
 
     @classmethod
     def prior(cls, sensor: str, width: int) -> Calibration:
-        """Return the prior of a sensor of images of `width` columns: no distortion, within that of the field's sensors."""
+        """Return the prior of a sensor of images of `width` columns: no distortion, of a usual size."""
         curve = LineCurve(width, np.zeros(0))
         knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
         kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)
