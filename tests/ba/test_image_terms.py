@@ -165,6 +165,44 @@ def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() 
     assert found.outcome.inlier.mean() > 0.99
 
 
+@dataclass
+class Ended:
+    """A solution by its name, and how well check tracks are met."""
+
+    name: str
+    after: int
+    findings: tuple[Any, ...] = ()
+    outcome: Any = None
+    asked: tuple[str, ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("kinds", "whole", "axis", "kept"),
+    [
+        ({0: "step", 1: "step"}, 1, 1, "tried"),  # one image stands still: it is seen against that
+        ({0: "step", 1: "step"}, 1, 0, "found"),  # of columns: detectors may be of all
+        ({0: "step", 1: "step"}, 3, 0, "tried"),
+        ({0: "step", 1: "step", 2: "decay"}, 1, 1, "found"),  # of all images: what is of images as a whole competes
+        ({0: "step", 1: "step", 2: "decay"}, 3, 1, "tried"),
+        ({0: "sinusoid", 1: "sinusoid"}, 1, 1, "found"),
+        ({0: "sinusoid"}, 1, 1, "tried"),
+    ],
+)
+def test_terms_of_all_images_compete_with_splines_and_detectors(monkeypatch, kinds, whole, axis, kept) -> None:
+    """Of three images; the less, the better are check tracks met: 9 without terms, 2 with them, `whole` by splines."""
+    terms: Any = [SimpleNamespace(kind=kind, view=v, where=(axis,), moved=None, gain=9.0) for v, kind in kinds.items()]
+    for name, value in (
+        ("_layout_of", None), ("_at_selection", Ended("found", 9)), ("_solve_with", Ended("tried", 2)),
+        ("with_splines", Ended("whole", whole)), ("standing_out", []),
+    ):  # fmt: skip
+        monkeypatch.setattr(image_terms, name, lambda *_, value=value: value)
+    monkeypatch.setattr(image_terms, "is_better", lambda one, other, outer: one < other)
+    monkeypatch.setattr(image_terms, "is_admitted", lambda one, other, outer, gain: not other < one)
+    parts: Any = SimpleNamespace(inner=views_of(300, 300, 300), outer=None)
+    found: Any = with_terms(Ended("found", 9), Selection(tuple(terms)), parts, AdjustOptions())
+    assert found.name == kept
+
+
 def shaken(px: float, waves: float) -> Displacement:
     """All images, each with a phase of its own."""
     return lambda of, at: (

@@ -300,6 +300,9 @@ def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_
     assert not other.adds_to(best, [(placed("decay", 1), base, 40.0)])
     behind = combined(("step", 2, 50.0), ("decay", 0, 30.0))
     assert not behind.adds_to(best, [(placed("decay"), base, 30.0)])  # what went before is another
+    assert behind.adds_to(combined(("step", 2, 50.0), ("sinusoid", 1, 60.0)), [(placed("decay"), base, 30.0)])
+    for rival, gap in ((0.5, 19.5), (-3.0, 20.0)):  # over nothing, where the runner-up is worse
+        assert combined().added([(placed("step"), base, 20.0), (placed("decay", 1), base, rival)]).taken[0].gap == gap
 
 
 # --- of a block that was solved ---------------------------------------------------------------------------------------
