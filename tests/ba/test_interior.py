@@ -10,6 +10,8 @@ import pytest
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, pair_heights
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.report.summary.views import _shared_errors, moved_in_space
+from barpc.sensor.corrected import Corrected
 from barpc.sensor.image_corrections import ColumnSpline
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.calibrate import PERFECT, Scene, Sensor, bent_as_said, crossing, in_track, scene
@@ -51,15 +53,27 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     assert shared is not None
     index = np.flatnonzero(np.isfinite(plain.points).all(axis=1))
     moves, moved = shared.of_points(index), common.moved(block.tracks.view, block.tracks.xy[:, 0])
+    middle = block.truth.ground.mean(axis=0)
+    known = _shared_errors(found, 0, middle)
+    assert known is not None
+    sensor, seen = plain.bases[0], np.zeros((2, 0))
+    assert isinstance(sensor, Corrected)
     assert moves.shape[2] == len(moved) == common.count == 4
     assert not moved[:, block.tracks.view == 2].any()
     for k in range(4):
         ends = []
         for sign in (1, -1):
             tracks = replace(block.tracks, xy=block.tracks.xy + sign * moved[k])
-            ends.append(adjust_tracks(block.views, tracks, options, **given).points[index])
-        wanted = (ends[0] - ends[1]) / 2
+            ends.append(adjust_tracks(block.views, tracks, options, **given))
+        wanted = (ends[0].points - ends[1].points)[index] / 2
         np.testing.assert_allclose(moves[..., k], wanted, atol=0.02 * np.abs(wanted).max())
+        change = (ends[0].sensors[0].project(middle) - ends[1].sensors[0].project(middle)) / 2
+        seen = np.column_stack([seen, change - known[1][:, k]])
+    # what cameras follow of a displacement is not off in the image
+    model = "rotation+translation"
+    before = moved_in_space(sensor, plain.covariance.view(0), model, middle)[1]
+    after = moved_in_space(sensor, found.covariance.view(0), model, middle, None, known)[1]
+    np.testing.assert_allclose(after**2, before**2 + (seen**2).sum(axis=1), rtol=0.03)
     some = index[::7]
     more = found.covariance.points(some) - plain.covariance.points(some)
     np.testing.assert_allclose(more, moves[::7] @ np.swapaxes(moves[::7], 1, 2), atol=1e-9)

@@ -40,13 +40,19 @@ class EllipseEntry(Record):
 
 
 def moved_in_space(
-    model: Corrected, covariance: Array, unknowns: str, ground: Array, seen: tuple[Array, ...] | None = None
+    model: Corrected,
+    covariance: Array,
+    unknowns: str,
+    ground: Array,
+    seen: tuple[Array, ...] | None = None,
+    shared: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array, EllipseEntry]:
     """Return the shift (2,) [px] by P_BA of a ground point near the image centre, its sigma (2,), and its ellipse.
 
     `covariance` (q, q) is of rotation (metres: angle x distance), translation [m], then any drift, which is zero in the
     middle row; `unknowns`: "rotation", "translation" or "rotation+translation"; `ground` (3,): lon, lat [deg], alt [m].
-    `seen`, if known: the result of `project_ecef`, and its projection by the delivered camera.
+    `seen`, if known: the result of `project_ecef`, and its projection by the delivered camera. `shared`: what k errors
+    that images have in common do with the unknowns (q, k), which `covariance` has, and displace in the image (2, k).
     """
     ecef = ecef_from_ground(ground)
     image, by_point, by_rotation, by_translation, before = seen or (
@@ -56,7 +62,7 @@ def moved_in_space(
     distance = np.linalg.norm(ecef - model.correction.center)
     parts = {"rotation": by_rotation / distance, "translation": by_translation}
     jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
-    return _ground_accuracy(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T)
+    return _ground_accuracy(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T, shared)
 
 
 def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
@@ -69,11 +75,14 @@ def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Arr
 
 
 def _ground_accuracy(
-    moved: Array, jacobian: Array, covariance: Array, by_level: Array
+    moved: Array, jacobian: Array, covariance: Array, by_level: Array, shared: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array, EllipseEntry]:
     """`jacobian` (2, q): [px] by the first unknowns; `by_level` (2, 2): [px/m] by east and north, at one altitude."""
     q = jacobian.shape[1]
     variance = jacobian @ covariance[:q, :q] @ jacobian.T
+    if shared is not None:  # the camera follows displacements of the image: what is left of them counts
+        response = jacobian @ shared[0][:q]
+        variance += (left := response - shared[1]) @ left.T - response @ response.T
     seen = np.linalg.inv(by_level)
     values, axes = np.linalg.eigh(seen @ variance @ seen.T)
     minor, major = np.sqrt(np.maximum(values, 0.0)).tolist()
@@ -432,7 +441,8 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
         known: dict[str, Any] = {"range_m": offset[0], "azimuth_ms": offset[1], "timing_slopes": slopes}
         known["timing_sigma"] = (np.array(sigma[:2]) / [1.0, sensor.sensor.speed / 1e3]).tolist()
     elif isinstance(sensor, Corrected):
-        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle, seen)
+        shared = None if strange else _shared_errors(adjustment, i, middle)
+        moved, uncertain, place = moved_in_space(sensor, covariance, model, middle, seen, shared)
         known = {
             "rotation_urad": (sensor.correction.rotation * 1e6).tolist(),
             "angle_urad": float(np.linalg.norm(sensor.correction.rotation)) * 1e6,
@@ -449,6 +459,15 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
     return CorrectionEntry(
         *common, moved.tolist(), **{"center_sigma_px": None, **known, **_image_correction_entry(spline)}
     )
+
+
+def _shared_errors(adjustment: Adjustment, i: int, ground: Array) -> tuple[Array, Array] | None:
+    """Return what common errors do with a view's unknowns (q, k), and with where it sees a point (2, k) [px]."""
+    if adjustment.common is None or adjustment.covariance.shared is None:
+        return None
+    by_unknown = adjustment.covariance.shared.by_unknown.reshape(len(adjustment.names), adjustment.params.shape[1], -1)
+    col = adjustment.sensors[i].project(ground[None])[:, 0]
+    return by_unknown[i], adjustment.common.moved(np.array([i]), col)[:, 0].T
 
 
 def _image_correction_entry(spline: RowSpline | None) -> dict[str, Any]:
