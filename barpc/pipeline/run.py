@@ -416,7 +416,10 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
         common=CommonErrors(tuple(run.calibrated.get(v.name) for v in run.views)) if run.calibrated else None,
     )
     refuse_strange(run, adjustment)
-    datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]
+    ground = [ground_from_ecef(adjustment.points)]  # none without tie points
+    control = None if run.reference is None else run.reference.control
+    ground += [one.lonlatalt for one in (gcps, None if control is None else control.points) if one is not None]
+    datums = [] if dem is None else [*dem.datums(np.concatenate(ground))]
     datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
 

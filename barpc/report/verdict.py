@@ -107,7 +107,14 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if len(run.tracks):
         yield from (*_of_cameras(found), *_of_places(run, found, views), *_of_solution(run, found))
     yield from dem_reasons(found)
-    yield from datum_reasons(run.datums, found)
+    yield from datum_reasons(run.datums, found, _common_lean(views))
+
+
+def _common_lean(views: Sequence[ViewEntry]) -> float:
+    """Return the tangent of the incidence that the lines of sight of all views have in common; 0: none."""
+    known = [view for view in views if None not in (view.incidence_deg, view.azimuth_deg)]
+    angles = np.radians([(view.incidence_deg, view.azimuth_deg) for view in known]).reshape(-1, 2)
+    return float(np.abs(np.sum(np.tan(angles[:, 0]) * np.exp(1j * angles[:, 1])))) / max(len(known), 1)
 
 
 def _of_cameras(found: Adjustment) -> Iterator[str]:
