@@ -28,7 +28,7 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: f
     """Yield heights that seem to have another vertical datum than assumed, and those whose datum stays unknown.
 
     The likelihoods of both are compared, as `SURE` asks. An unknown datum is reported where the file does not state it,
-    and the other would shift the scene by more than the standard deviation of its height, or sideways by more than
+    and the other would shift the scene by more than the standard deviation of its height, or horizontally by more than
     that of its position: lines of sight that have a slope `lean` in common meet points at wrong heights beside them.
     """
     for one in datums:
@@ -54,7 +54,7 @@ def _shifts(one: HeightDatum, adjustment: Adjustment, share: float, lean: float)
     sigma, fixed = adjustment.gauge.sigma, adjustment.datum.get(_SIDE_SHARES.get(one.source, ""))
     up, aside = abs(one.otherwise) * np.array([share, 0.0 if fixed is None else lean * fixed[:_UP].mean()])
     words = [f"{metres(up)} too {'low' if one.otherwise > 0 else 'high'}"] * bool(up > sigma[_UP])
-    return " and ".join(words + [f"up to {metres(aside)} off sideways"] * bool(aside > np.hypot(*sigma[:_UP])))
+    return " and ".join(words + [f"up to {metres(aside)} off horizontally"] * bool(aside > np.hypot(*sigma[:_UP])))
 
 
 def _contradicted(one: HeightDatum, offset: float) -> str:

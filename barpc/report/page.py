@@ -18,6 +18,7 @@ from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
+from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.ranking import (
     MIN_PAIR_MATCHES,
@@ -41,6 +42,7 @@ from barpc.scene import connected_groups
 
 REPORT_FILE = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
+MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
 REPORT_STAGE = "report"  # the stage that makes the page
 
 
@@ -165,7 +167,13 @@ def _images_section(files: RunFiles) -> Section:
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    return _section("images", {"views": views, "adjusted": adjusted}, tables=[shown])
+    return _section("images", {"views": views, "adjusted": adjusted}, tables=[shown], **_panels(image_panels(files)))
+
+
+def _panels(panels: Pictures) -> dict[str, Any]:
+    """Return small maps as parts of a section: those beyond `TABLE_ROWS_SHOWN` open on demand."""
+    shown, more = panels[:TABLE_ROWS_SHOWN], panels[TABLE_ROWS_SHOWN:]
+    return {"panels": shown, "folds": [(f"{len(more)} more images", more)] if more else []}
 
 
 def _map_section(files: RunFiles) -> Section:
@@ -179,23 +187,26 @@ def _map_section(files: RunFiles) -> Section:
     )
     if num > MAX_SHOWN:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
-    facts = {"groups": len(connected_groups(num, links)), "lonely": lonely, "by_length": summary.tracks.by_length}
-    return _section("map", facts, charts=[(ground_map(files), caption)] if any(files.outlines) else [])
+    lengths = {length: count for length, count in summary.tracks.by_length.items() if count}
+    facts = {"groups": len(connected_groups(num, links)), "lonely": lonely, "by_length": lengths}
+    charts = [(ground_map(files), caption)] if any(files.outlines) else []
+    if len(lengths) > MAX_LENGTHS_SAID:
+        charts.append((length_bars(lengths), "Tie points by the number of images that see them."))
+    return _section("map", facts | {"said": len(lengths) <= MAX_LENGTHS_SAID}, charts=charts)
 
 
 def _randomness_section(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
-    views, adjusted, folds = files.summary.views, files.summary.adjusted, []
+    views, adjusted = files.summary.views, files.summary.adjusted
     first = [files.number[view.name] for view in flagged(views)]
     panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before", first)
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
-    if len(panels) > TABLE_ROWS_SHOWN:
-        folds.append((f"{len(panels) - TABLE_ROWS_SHOWN} more images", panels[TABLE_ROWS_SHOWN:]))
+    parts = _panels(panels)
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
-        folds.append((f"Before the adjustment. {lengths}", before))
-    return _section("random", {"marked": marked, "key": key}, panels=panels[:TABLE_ROWS_SHOWN], folds=folds)
+        parts["folds"].append((f"Before the adjustment. {lengths}", before))
+    return _section("random", {"marked": marked, "key": key}, **parts)
 
 
 def _surface_section(files: RunFiles) -> Section | None:
@@ -226,7 +237,7 @@ def _pairs_section(files: RunFiles) -> Section | None:
     }
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
-    return _section("pairs", facts, tables=[replace(shown, marks=marks)])
+    return _section("pairs", facts, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
 
 
 def _corrections_section(files: RunFiles) -> Section | None:
@@ -256,7 +267,7 @@ def _decisions_section(files: RunFiles) -> Section | None:
         tables += _tables_of("explained", scene.explanations) + _tables_of("left", scene.left)
         tables += _tables_of("worse", scene.held_out_places or ())
     tables += _tables_of("again", [pair for pair in summary.pairs if pair.beaten])
-    return _section("decisions", {}, points=points, tables=tables)
+    return _section("decisions", {}, points=points, charts=profile_charts(files), tables=tables)
 
 
 def decisions(summary: Summary) -> list[str]:

@@ -112,9 +112,11 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 def _common_lean(views: Sequence[ViewEntry]) -> float:
     """Return the tangent of the incidence that the lines of sight of all views have in common; 0: none."""
-    known = [view for view in views if None not in (view.incidence_deg, view.azimuth_deg)]
-    angles = np.radians([(view.incidence_deg, view.azimuth_deg) for view in known]).reshape(-1, 2)
-    return float(np.abs(np.sum(np.tan(angles[:, 0]) * np.exp(1j * angles[:, 1])))) / max(len(known), 1)
+    angles = np.array([(view.incidence_deg, view.azimuth_deg) for view in views], dtype=np.float64)
+    incidence, azimuth = np.radians(angles.reshape(-1, 2)).T
+    leans = np.tan(incidence) * np.exp(1j * azimuth)
+    known = np.isfinite(leans)
+    return float(np.abs(leans[known].sum())) / max(int(known.sum()), 1)
 
 
 def _of_cameras(found: Adjustment) -> Iterator[str]:

@@ -124,7 +124,7 @@ def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_
     found = [*datum_reasons([HeightDatum(source, "them", GEOID, DEFAULT)], one, lean)]
     assert len(found) == bool(aside)
     if aside:
-        assert f"the scene is up to {aside} m off sideways, and neither" in found[0]
+        assert f"the scene is up to {aside} m off horizontally, and neither" in found[0]
         assert found[0].endswith("--geoid none, or --geoid egm96." if source == "heights" else "--heights egm96.")
 
 

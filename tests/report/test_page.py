@@ -113,7 +113,7 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 
 
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(maps, "_MAX_MAP_IMAGES", 4)
+    monkeypatch.setattr(maps, "MAX_PICTURES", 4)
     monkeypatch.setattr(page, "MAX_SHOWN", 5)
     html = page.report_html(block_run.record, block_run.folder)
     assert "Of 9 images 4 are shown: those with the largest systematic part." in html
