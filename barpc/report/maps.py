@@ -24,7 +24,7 @@ from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, known, metres
+from barpc.report.summary.words import counted, figure, known, metres
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
@@ -51,7 +51,7 @@ def template(name: str) -> Any:
         optimized=False,  # it is used once
     )
     environment.filters |= {"n": coordinate, "tally": tally}
-    environment.filters |= {one.__name__: one for one in (counted, known, listed, metres)}
+    environment.filters |= {one.__name__: one for one in (counted, figure, known, listed, metres)}
     return environment.get_template(name)
 
 

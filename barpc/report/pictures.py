@@ -1,4 +1,4 @@
-"""Pictures of the images with what lies on them, residuals along rows, tiles of a pair, counts as columns."""
+"""Pictures of the images and their flagged parts, residuals along rows, tiles of a pair, histograms."""
 
 from __future__ import annotations
 
