@@ -143,9 +143,10 @@ def _along_lines(
     line = taken(here, alt + _HEIGHT_STEP) - middle
     line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-9)
     foot = middle + line * ((there - middle) * line).sum(axis=1, keepdims=True)
-    along = np.linalg.solve(linear, line[..., None])[..., 0]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    along *= np.where(along[:, :1] < 0, -1.0, 1.0)  # columns to the right
+    # by the adjugate: a matrix without an inverse, as of cameras without a parallax, gives a tile that shows nothing
+    along = np.einsum("nij,nj->ni", linear[:, ::-1, ::-1].swapaxes(1, 2) * [[1.0, -1.0], [-1.0, 1.0]], line)
+    with np.errstate(invalid="ignore"):
+        along *= np.where(along[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(along, axis=1, keepdims=True)  # to the right
     across = np.column_stack([-along[:, 1], along[:, 0]])
     side = half * (2.0 * ticks(_TILE) / (_TILE - 1) - 1.0)
     grid = np.stack(np.meshgrid(side, side), axis=-1)

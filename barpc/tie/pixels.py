@@ -298,9 +298,10 @@ def thumbnail(path: str | os.PathLike[str], size: tuple[int, int], side: int, ba
     """
     with open_raster(path) as dataset:
         read = _RasterBand.of(dataset, path, band)
-        zoom = max(1, max(dataset.width, dataset.height) // (2 * side))
+        ends = dataset.width, dataset.height
+        zoom = max(1, min(max(ends) // (2 * side), *ends))
         level = zoom if getattr(dataset, "driver", None) else 1  # a mosaic has no levels
-        width, height = (n // zoom * zoom for n in (dataset.width, dataset.height))
+        width, height = (n // zoom * zoom for n in ends)
         step, parts = zoom * max(1, SPAN // zoom), []
         for top in range(0, height, step):
             both = read.read((0, top, width, min(step, height - top)), level)

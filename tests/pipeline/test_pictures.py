@@ -101,6 +101,25 @@ def test_rows_of_tiles_are_epipolar_lines_and_what_the_cameras_miss_is_across_th
         assert moved == pytest.approx(4.0 * axis, abs=0.02)
 
 
+def test_cameras_without_a_parallax_and_unknown_heights_end_no_run(ramp):
+    view = simulate_block(2, 40, seed=3).views[0]
+    here = np.array([[300.0, 400.0], [500.0, 600.0]])
+    first, second = pictures._along_lines([view.sensor, view.sensor], (here, here), np.array([100.0, np.nan]), 20.0)
+    assert np.isnan(first[1]).all()
+    assert np.isnan(second[1]).all()
+    shown = replace(view, path=str(ramp), size=(1300, 900))
+    assert not pictures._tile(shown, 1, first[1]).any()
+    assert pictures._tile(shown, 1, second[0]).shape == (120, 120)
+
+
+@pytest.mark.parametrize("size", [(20, 30_000), (30_000, 3), (1, 1), (2, 1)])
+def test_an_image_of_few_columns_or_rows_has_a_thumbnail_or_none(tmp_path, size):
+    pixels = (np.arange(size[0] * size[1]) % 251).reshape(size[1], size[0]).astype(np.uint8)
+    grey = thumbnail(write(tmp_path / "thin.tif", pixels, nodata=255), size, 480)
+    assert grey is None or (max(grey.shape) <= 480 and min(grey.shape) >= 1)
+    assert (grey is None) <= (max(size) < 3)
+
+
 def test_a_run_keeps_small_pictures_of_what_it_saw_and_they_are_no_results(adjusted):
     result, out = adjusted
     found = json.loads((out / "tables/pictures.json").read_text())
