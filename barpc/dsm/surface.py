@@ -5,7 +5,6 @@ And the picture that convinces: the same window of the ground by the cameras as 
 
 from __future__ import annotations
 
-import base64
 import json
 import logging
 import shutil
@@ -49,6 +48,7 @@ from barpc.dsm.stereo import (
 )
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
+from barpc.pipeline.pictures import encoded
 from barpc.rasters.raster import BLOCK_SIZE, hashed, open_raster
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key
@@ -57,7 +57,7 @@ from barpc.scene import View
 from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
 from barpc.tie.pairing.overlaps import Footprints
-from barpc.tie.pixels import jpeg, read_pixels, sample_stretch
+from barpc.tie.pixels import read_pixels, sample_stretch
 from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
 
@@ -341,9 +341,9 @@ def show_in_report(
         for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
             middle = float(np.nanmedian(nmad)) if np.isfinite(nmad).any() else None
             row = {"cameras": cameras, "share": float(np.isfinite(height).mean()), "nmad_m": middle}
-            shown.append(row | _encoded_picture(shaded(height, tile.step)))
+            shown.append(row | encoded(shaded(height, tile.step)))
         seen = (block.views[i] for i in pairs[0])
-        shown += [{"image": view.name, **_encoded_picture(draped(view, tile, after[0], band))} for view in seen]
+        shown += [{"image": view.name, **encoded(draped(view, tile, after[0], band))} for view in seen]
         text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{FOLDER}/{SURFACE}"
         with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
@@ -358,10 +358,6 @@ def _delivered(view: View, source: Any) -> View:
     if source is None:
         raise BarpcError(f"{view.name}: no file holds its delivered camera")
     return replace(view, sensor=open_camera(view.path, camera=source.path).model)
-
-
-def _encoded_picture(grey: npt.NDArray[np.uint8]) -> dict[str, object]:
-    return {"size": [grey.shape[1], grey.shape[0]], "picture": base64.b64encode(jpeg(grey)).decode()}
 
 
 def draped(view: View, tile: Tile, height: F32, band: int) -> npt.NDArray[np.uint8]:

@@ -30,7 +30,7 @@ from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
 from barpc.report.page import REPORT_FILE, REPORT_STAGE, can_render, report_html
 from barpc.report.records import json_form
-from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
+from barpc.report.runfiles import FOLDER, PICTURES, TABLES, gcps_geojson, read_summary
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, format_for, hidden_by, sidecars, write_camera
@@ -119,7 +119,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST, SUMS]
+    names = [*(f"{FOLDER}/{name}" for name in (*TABLES, PICTURES)), LAST, SUMS]
     names += [REPORT_FILE] * can_render() + [GCP_FILE] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -162,8 +162,9 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
     with workspace.stage(REPORT_STAGE):
         if can_render():
             workspace.write_text(REPORT_FILE, report_html(summary, workspace.folder))
-    # the report may be made again by another release: it is no result
-    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name != REPORT_FILE)
+    # the report may be made again by another release, and pictures are to look at: neither is a result
+    shown = REPORT_FILE, f"{FOLDER}/{PICTURES}"
+    results = sorted((name, sha) for name, sha in workspace.outputs.items() if name not in shown)
     summary = replace(summary, outputs=tuple(OutputEntry(name, sha) for name, sha in results))
     texts = ",\n".join(f"{json.dumps(key)}: {_json(value)}" for key, value in json_form(summary).items())
     workspace.write_text(LAST, f"{{\n{texts}\n}}\n")

@@ -46,6 +46,7 @@ from barpc.pipeline.inputs import (
 )
 from barpc.pipeline.loading import Image, image_path, load_views
 from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.pictures import write_pictures
 from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
@@ -192,10 +193,12 @@ def _summed_up(
     progress = work.progress
     if run.adjustment is not None:
         run = _with_block(run, images, inputs, workspace, work)
-    run = _portable_run(run, workspace.folder)
+    opened, run = run, _portable_run(run, workspace.folder)
     with _stage_progress(workspace, "summary", progress):
         entries = _entries(inputs.values(), workspace.folder)
         summary = replace(summarize(run), inputs=entries, out_dir=None, stages=None)
+    with _stage_progress(workspace, "pictures", progress):
+        write_pictures(workspace, opened, summary, work)
     _report_progress(progress, REPORT_STAGE, 0)
     summary = write_tables(workspace, run, summary)
     _report_progress(progress, REPORT_STAGE, 1)
@@ -415,7 +418,10 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
         common=common_errors(run),
     )
     refuse_strange(run, adjustment)
-    datums = [] if dem is None else [*dem.datums(ground_from_ecef(adjustment.points))]
+    ground = [ground_from_ecef(adjustment.points)]  # none without tie points
+    control = None if run.reference is None else run.reference.control
+    ground += [one.lonlatalt for one in (gcps, None if control is None else control.points) if one is not None]
+    datums = [] if dem is None else [*dem.datums(np.concatenate(ground))]
     datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
 

@@ -14,17 +14,22 @@ from barpc.report.summary.words import metres
 
 _HEIGHT_SHARES = {"gcps": ("gcps",), "heights": ("heights", "reference"), "altimetry": ("altimetry",)}
 """Source of heights -> the shares of the scene's height that depend on it."""
-_UP = 2  # place of the scene's height among its motions
+_SIDE_SHARES = {"gcps": "gcps", "heights": "reference"}
+"""Source of heights -> the share of the scene's position of the points in images that have these heights."""
+_FLAGS = ("--heights ellipsoidal", "--heights egm96"), ("--geoid none", "--geoid egm96")
+"""Flags for ellipsoidal heights and for those above sea level: of points, of a DEM."""
+_UP = 2  # place of the scene's height among its motions, after east and north
 
 Evidence = list[tuple[float, float]]
 """Offsets of heights above others, and their standard deviations [m]."""
 
 
-def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment) -> Iterator[str]:
+def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: float) -> Iterator[str]:
     """Yield heights that seem to have another vertical datum than assumed, and those whose datum stays unknown.
 
     The likelihoods of both are compared, as `SURE` asks. An unknown datum is reported where the file does not state it,
-    and the other would shift the scene by more than the standard deviation of its height.
+    and the other would shift the scene by more than the standard deviation of its height, or horizontally by more than
+    that of its position: lines of sight that have a slope `lean` in common meet points at wrong heights beside them.
     """
     for one in datums:
         share = sum(np.nan_to_num(adjustment.datum[name][_UP]) for name in _HEIGHT_SHARES[one.source])
@@ -35,26 +40,30 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment) -> Iter
         if other <= fits < taken and taken - other > 2.0 * SURE:
             yield _contradicted(one, offset[np.argmin(sigma)])
         elif one.provenance == DEFAULT and not (taken <= fits and other - taken > 2.0 * SURE):
-            moves = abs(one.otherwise) * share
-            if moves > adjustment.gauge.sigma[_UP]:
+            ellipsoidal, geoid = _FLAGS[one.source == "heights"]
+            if shifts := _shifts(one, adjustment, share, lean):
                 yield (
                     f"The vertical datum of the heights of {one.name} is not stated. They were taken as ellipsoidal; "
-                    f"if they are above sea level, the scene is {metres(moves)} too "
-                    f"{'low' if one.otherwise > 0 else 'high'}, and neither the cameras nor other heights show it. "
-                    "Give --heights ellipsoidal, or --heights egm96."
+                    f"if they are above sea level, the scene is {shifts}, and neither the cameras nor other heights "
+                    f"show it. Give {ellipsoidal}, or {geoid}."
                 )
+
+
+def _shifts(one: HeightDatum, adjustment: Adjustment, share: float, lean: float) -> str:
+    """Return the shifts of the scene by the other datum that exceed their standard deviations, in words."""
+    sigma, fixed = adjustment.gauge.sigma, adjustment.datum.get(_SIDE_SHARES.get(one.source, ""))
+    up, aside = abs(one.otherwise) * np.array([share, 0.0 if fixed is None else lean * fixed[:_UP].mean()])
+    words = [f"{metres(up)} too {'low' if one.otherwise > 0 else 'high'}"] * bool(up > sigma[_UP])
+    return " and ".join(words + [f"up to {metres(aside)} off horizontally"] * bool(aside > np.hypot(*sigma[:_UP])))
 
 
 def _contradicted(one: HeightDatum, offset: float) -> str:
     geoid = f"{metres(abs(one.otherwise))} {'above' if (one.otherwise > 0) != one.converted else 'below'}"
-    seems = (
-        ("be above sea level", "--heights egm96") if not one.converted else ("be ellipsoidal", "--heights ellipsoidal")
-    )
-    flag = seems[1] if one.source != "heights" else "--geoid egm96" if not one.converted else "--geoid none"
+    seems, flag = ("ellipsoidal" if one.converted else "above sea level"), _FLAGS[one.source == "heights"]
     return (
         f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} the ground by the "
         f"delivered cameras, or by other heights, and the geoid lies {geoid} the ellipsoid here: they seem to "
-        f"{seems[0]}. Give {flag}, or the opposite to confirm the present datum."
+        f"be {seems}. Give {flag[not one.converted]}, or the opposite to confirm the present datum."
     )
 
 

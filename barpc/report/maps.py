@@ -20,21 +20,20 @@ from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.ranking import TABLE_ROWS_SHOWN, flagged, worst_first
 from barpc.report.records import MAX_SHOWN
-from barpc.report.runfiles import ObservationTable, RunFiles
+from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, known, metres
+from barpc.report.summary.words import counted, figure, known, metres
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
 _MAP_MARGIN = 34.0
-_MAX_MAP_IMAGES = 60  # images on the page: those with the largest systematic part
 _VECTORS = 6000
-_PANEL = 180.0
+_PANEL = 300.0  # units from left to right: those of a page that shows them side by side on a desk
 _MAX_LABEL_LENGTH = 16  # characters of a name on the map
 _LABEL_HEIGHT = 14.0  # units of a line of names
-_ARROW_LENGTH = 12.0  # units of a long residual
+_ARROW_LENGTH = 20.0  # units of a long residual
 
 
 @cache
@@ -52,7 +51,7 @@ def template(name: str) -> Any:
         optimized=False,  # it is used once
     )
     environment.filters |= {"n": coordinate, "tally": tally}
-    environment.filters |= {one.__name__: one for one in (counted, known, listed, metres)}
+    environment.filters |= {one.__name__: one for one in (counted, figure, known, listed, metres)}
     return environment.get_template(name)
 
 
@@ -185,7 +184,7 @@ def _map_labels(
             view.name if len(view.name) <= _MAX_LABEL_LENGTH else f"…{view.name[1 - _MAX_LABEL_LENGTH :]}"
         )  # its end tells of a series
         name += f" + {alike}" * bool(alike)
-        (x, y), half = place.tolist(), 3.6 * len(name)
+        (x, y), half = place.tolist(), 4.1 * len(name)  # units of a bold character: 8.2, of digits
         x = min(max(x, half), WIDTH - half)
         if _is_free(x, y, half, taken):
             rows = (y, y + 1.1 * _LABEL_HEIGHT, y - 1.1 * _LABEL_HEIGHT)
@@ -277,7 +276,7 @@ def residual_panels(
     use = observations.used & np.isfinite(residuals).all(axis=1)
     norm = np.hypot(*residuals[use].T)
     longest = (float(np.quantile(norm, 0.95)) if len(norm) else 0.0) or 1.0
-    most = min(_VECTORS // min(max(len(views), 20), _MAX_MAP_IMAGES), 300)
+    most = min(_VECTORS // min(max(len(views), 20), MAX_PICTURES), 300)
     order = np.flatnonzero(use)
     order = order[np.argsort(observations.view[order], kind="stable")]
     rows_of = np.split(order, np.searchsorted(observations.view[order], np.arange(1, len(views))))
@@ -290,16 +289,25 @@ def residual_panels(
     rest = [k for k in range(len(views)) if k not in first]
     if len(views) > TABLE_ROWS_SHOWN:
         rest.sort(key=lambda k: -shares[k])
-    for k in [*first, *rest][:_MAX_MAP_IMAGES]:
+    for k in [*first, *rest][:MAX_PICTURES]:
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    shown = float(f"{longest:.2g}")  # two digits, and no power of ten for residuals of hundreds of pixels
-    key = f"Scale bar: {shown:g} px of a single residual; bold arrows are drawn at twice that scale."
+    key = f"Scale bar: {_px(longest)} of a single residual; bold arrows are drawn at twice that scale."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
         key += "those that need review, then " * bool(first) + "those with the largest systematic part."
     return charts, shares, key
+
+
+def _px(length: float) -> str:
+    return f"{float(f'{length:.2g}'):g} px"  # two digits, and no power of ten for residuals of hundreds of pixels
+
+
+def panel_box(view: ViewEntry) -> Array:
+    """Return width and height (2,) of the panel of an image."""
+    width, height = view.size
+    return np.array([_PANEL, _PANEL * min(max(height / width, 0.4), 2.5)])
 
 
 def _panel_note(cells: Cells) -> str:
@@ -308,8 +316,7 @@ def _panel_note(cells: Cells) -> str:
 
 def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, longest: float) -> str:
     """Draw the map of an image, with the residuals that are drawn (m, 4): col, row, dcol, drow [px]."""
-    width, height = view.size
-    box = np.array([_PANEL, _PANEL * min(max(height / width, 0.4), 2.5)])
+    box = panel_box(view)
     side, start = box / COVERAGE_CELLS, (drawn[:, :2] + 0.5) * (box / view.size)
     heat = [
         (j * side[0], i * side[1], *side, 0.06 + 0.5 * min(float(rms) / (2 * longest), 1.0))
@@ -330,6 +337,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         shafts=np.hstack([start, start + drawn[:, 2:] * (_ARROW_LENGTH / longest)]).tolist(),
         arrows=arrows,
         bar=_ARROW_LENGTH,
+        length=_px(longest),
         described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}{'; shaded: few tie points' * len(gaps)}.",
     )
     return text
@@ -338,7 +346,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
 def _arrow(middle: Array, vector: Array) -> tuple[list[Array], list[Array]]:
     """Return shaft and barbs of an arrow centred on a cell, not longer than reaches its neighbours' middles."""
     length = float(np.hypot(*vector))
-    vector, length = vector * min(1.0, 24.0 / max(length, 1e-9)), min(length, 24.0)
+    vector, length = vector * min(1.0, 2 * _ARROW_LENGTH / max(length, 1e-9)), min(length, 2 * _ARROW_LENGTH)
     tip, tail = middle + vector / 2, middle - vector / 2
     along = vector / max(length, 1e-9) * min(5.0, length / 2)
     across = np.array([-along[1], along[0]]) * 0.6

@@ -97,7 +97,7 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         return
     now = np.sqrt(np.diag(covariance))[_POSITION]
     options, found, words = summary.options or {}, list[ExpectedEntry](), list[str]()
-    if not (options.get("dem") or options.get("reference")):
+    if not (summary.reference and summary.reference.used) and not (scene.dem and scene.dem.num_held):
         then = _sigma_with(covariance, *_dem_observations(options))
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))

@@ -1,6 +1,13 @@
 "use strict";
 const unfold = sections => { for (const section of sections) for (const e of section.querySelectorAll(":scope > .whole")) e.open = true; };
 const asked = () => unfold([...document.querySelectorAll("section")].filter(section => "#" + section.id === location.hash));
+const all = document.querySelector(".all");
+all.hidden = !document.querySelector("main details");
+all.onclick = () => {
+  const open = all.textContent === "open all";
+  for (const e of document.querySelectorAll("main details")) e.open = open;
+  all.textContent = open ? "close all" : "open all";
+};
 addEventListener("hashchange", asked); addEventListener("beforeprint", () => unfold(document.querySelectorAll("section"))); asked();
 // The page is whole without this: tables that sort and filter, one selection in map, tables and panels, and residual
 // maps in large.

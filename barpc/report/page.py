@@ -18,6 +18,7 @@ from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
 from barpc.report.maps import ground_map, residual_panels, template
+from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.ranking import (
     MIN_PAIR_MATCHES,
@@ -31,7 +32,7 @@ from barpc.report.ranking import (
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
-from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
+from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry, SceneEntry
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
@@ -41,6 +42,8 @@ from barpc.scene import connected_groups
 
 REPORT_FILE = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
+_POSITION = "east", "north", "up"  # motions of the scene as a whole
+MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
 REPORT_STAGE = "report"  # the stage that makes the page
 
 
@@ -165,7 +168,22 @@ def _images_section(files: RunFiles) -> Section:
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    return _section("images", {"views": views, "adjusted": adjusted}, tables=[shown])
+    return _section(
+        "images",
+        {"views": views, "agree": adjusted and _num_in_use(files)},
+        tables=[shown],
+        **_panels(image_panels(files)),
+    )
+
+
+def _num_in_use(files: RunFiles) -> int:
+    return sum(view.num_observations for view in files.summary.views)
+
+
+def _panels(panels: Pictures) -> dict[str, Any]:
+    """Return small maps as parts of a section: those beyond `TABLE_ROWS_SHOWN` open on demand."""
+    shown, more = panels[:TABLE_ROWS_SHOWN], panels[TABLE_ROWS_SHOWN:]
+    return {"panels": shown, "folds": [(f"{len(more)} more images", more)] if more else []}
 
 
 def _map_section(files: RunFiles) -> Section:
@@ -180,23 +198,31 @@ def _map_section(files: RunFiles) -> Section:
     caption += "; shaded: rows or columns with few tie points." if any(view.gap for view in summary.views) else "."
     if num > MAX_SHOWN:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
-    facts = {"groups": len(connected_groups(num, links)), "lonely": lonely, "by_length": summary.tracks.by_length}
-    return _section("map", facts, charts=[(ground_map(files), caption)] if any(files.outlines) else [])
+    lengths = {length: count for length, count in summary.tracks.by_length.items() if count}
+    facts = {
+        "num": sum(lengths.values()),
+        "groups": len(connected_groups(num, links)),
+        "lonely": lonely,
+        "by_length": lengths,
+    }
+    charts = [(ground_map(files), caption)] if any(files.outlines) else []
+    if len(lengths) > MAX_LENGTHS_SAID:
+        charts.append((length_bars(lengths), "Tie points by the number of images that see them."))
+    return _section("map", facts | {"said": len(lengths) <= MAX_LENGTHS_SAID}, charts=charts)
 
 
 def _randomness_section(files: RunFiles) -> Section | None:
     if not len(files.observations.view):
         return None
-    views, adjusted, folds = files.summary.views, files.summary.adjusted, []
+    views, adjusted = files.summary.views, files.summary.adjusted
     first = [files.number[view.name] for view in flagged(views)]
     panels, shares, key = residual_panels(views, files.observations, "after" if adjusted else "before", first)
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
-    if len(panels) > TABLE_ROWS_SHOWN:
-        folds.append((f"{len(panels) - TABLE_ROWS_SHOWN} more images", panels[TABLE_ROWS_SHOWN:]))
+    parts = _panels(panels)
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
-        folds.append((f"Before the adjustment. {lengths}", before))
-    return _section("random", {"marked": marked, "key": key}, panels=panels[:TABLE_ROWS_SHOWN], folds=folds)
+        parts["folds"].append((f"Before the adjustment. {lengths}", before))
+    return _section("random", {"marked": marked, "key": key}, **parts)
 
 
 def _surface_section(files: RunFiles) -> Section | None:
@@ -222,12 +248,17 @@ def _pairs_section(files: RunFiles) -> Section | None:
     sure = sure_pairs(files.summary.views, pairs)
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
     facts = {
-        **{"worst": worst, "offset": offset_of(worst), "wanted": GOOD_RMSE, "enough": MIN_PAIR_MATCHES},
+        **{
+            "worst": worst,
+            "offset": offset_of(worst) if any(worst.offset_rms) else None,
+            "wanted": GOOD_RMSE,
+            "enough": MIN_PAIR_MATCHES,
+        },
         "best": min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None),
     }
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
-    return _section("pairs", facts, tables=[replace(shown, marks=marks)])
+    return _section("pairs", facts, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
 
 
 def _corrections_section(files: RunFiles) -> Section | None:
@@ -245,7 +276,14 @@ def _corrections_section(files: RunFiles) -> Section | None:
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
     scene = files.summary.scene
     moved = float(np.linalg.norm(np.array(scene.shift_enu_m, float))) if scene is not None else 0.0
-    return _section("moves", {"most": max(moves), "moved": moved, "held": files.summary.gcps}, tables=tables)
+    by_cameras = scene is not None and (not scene.datum or _least_share(scene, "cameras") > 0.5)
+    return _section("moves", {"most": max(moves), "moved": moved, "by_cameras": by_cameras}, tables=tables)
+
+
+def _least_share(scene: SceneEntry, *sources: str) -> float:
+    """Return the share of sources in the position of the scene, east, north or up, where it is least."""
+    parts = [one for one in scene.datum if one.part in _POSITION]
+    return min((sum(getattr(one, source) or 0.0 for source in sources) for one in parts), default=0.0)
 
 
 def _decisions_section(files: RunFiles) -> Section | None:
@@ -257,7 +295,7 @@ def _decisions_section(files: RunFiles) -> Section | None:
         tables += _tables_of("explained", scene.explanations) + _tables_of("left", scene.left)
         tables += _tables_of("worse", scene.held_out_places or ())
     tables += _tables_of("again", [pair for pair in summary.pairs if pair.beaten])
-    return _section("decisions", {}, points=points, tables=tables)
+    return _section("decisions", {}, points=points, charts=profile_charts(files), tables=tables)
 
 
 def decisions(summary: Summary) -> list[str]:
@@ -269,17 +307,23 @@ def decisions(summary: Summary) -> list[str]:
 
 
 def _gauge_section(files: RunFiles) -> Section | None:
-    scene, reference, gcps = files.summary.scene, files.summary.reference, files.summary.gcps
+    scene, reference, gcps, views = (
+        files.summary.scene,
+        files.summary.reference,
+        files.summary.gcps,
+        files.summary.views,
+    )
     if scene is None:
         return None
     points = [f"{mode.words[0].upper()}{mode.words[1:]}." for mode in scene.weakest_modes[:NAMED] if mode.sigma_m]
     columns = DatumEntry.columns(scene.datum)
     tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
     tables += _tables_of("gcps", gcps)
-    tables += _tables_of("control", [view for view in files.summary.views if view.control_w is not None])
+    tables += _tables_of("control", [view for view in views if view.control_w is not None])
     tables += _tables_of("reference", () if reference is None else reference.views)
-    held = bool(gcps or (reference and reference.used))
-    return _section("gauge", {"scene": scene, "held": held}, points=points, tables=tables)
+    held = _least_share(scene, "gcps", "reference") > 0.5
+    facts = {"scene": scene, "held": held, "num": _num_in_use(files)}
+    return _section("gauge", facts, points=points, tables=tables)
 
 
 def _check_points_section(files: RunFiles) -> Section | None:

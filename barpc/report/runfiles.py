@@ -191,6 +191,9 @@ TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
 SURFACE = "surface.json"
 """Two reliefs and two images on the surface for the report, of a run of which one was made, and which run (`run_key`).
 """
+PICTURES = "pictures.json"
+"""Thumbnails of images, and a strip of the worst pair: to look at, no result."""
+MAX_PICTURES = 60  # images of which the page shows a picture, and the residuals
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -225,13 +228,21 @@ class ReliefWindow(Record):
 
 
 class Draped(Record):
-    """An image on the surface, in the window of the reliefs."""
+    """A picture of an image: small, or on the surface in the window of the reliefs."""
 
     MORE: ClassVar = Any
 
     image: str = column("Its name")
     size: tuple[Side, Side] = column("Width and height of the picture", "px")
     picture: str = column("The image, a JPEG in base64", pattern=_BASE64)
+
+
+class PairStrip(Draped):
+    """Tiles of a pair along its epipolar lines, a row of them an image and kind of cameras."""
+
+    rows: tuple[str, ...] = column("What each row shows", minItems=1, maxItems=3)
+    tiles: Side = column("Tiles of a row")
+    half_px: float = column("From the middle of a tile to its edge, in the first image", "px")
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,6 +260,8 @@ class RunFiles:
     outlines: Sequence[Sequence[Array]]
     reliefs: Sequence[ReliefWindow] = ()
     draped: Sequence[Draped] = ()
+    thumbnails: Sequence[Draped] = ()
+    strips: Sequence[PairStrip] = ()
 
     @property
     def number(self) -> dict[str, int]:
@@ -314,7 +327,9 @@ def read_tables(summary: Summary, folder: Path) -> RunFiles:
     made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
     of_run = partial(_parse_surface, run=run_key(summary))
     shown = _parsed(surface, read_text(surface, SUMMARY), of_run) if made else ((), ())
-    return RunFiles(summary, observations, points, tracks, outlines, *shown)
+    pictures = table_path(folder, PICTURES)  # none of runs before release 0.4
+    small = _parsed(pictures, read_text(pictures, SUMMARY), _parse_pictures) if os.path.lexists(pictures) else ((), ())
+    return RunFiles(summary, observations, points, tracks, outlines, *shown, *small)
 
 
 def run_key(summary: Summary) -> str:
@@ -336,6 +351,16 @@ def _parse_surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple
     if [one.cameras for one in reliefs] != ["delivered", "corrected"] or len(draped) not in (0, 2):
         raise ValueError("reliefs that are not one before and one after, images that are not two")
     return reliefs, draped
+
+
+def _parse_pictures(text: str) -> tuple[tuple[Draped, ...], tuple[PairStrip, ...]]:
+    import fastjsonschema
+
+    found = parse_json(text)
+    kinds: dict[str, type[Record]] = {"images": Draped, "pairs": PairStrip}
+    lists = {key: {"type": "array", "items": kind.json_schema()} for key, kind in kinds.items()}
+    fastjsonschema.validate({"type": "object", "properties": lists, "required": list(lists)}, found)
+    return tuple(map(Draped.read, found["images"])), tuple(map(PairStrip.read, found["pairs"]))
 
 
 def _parse_table(path: Path, parse: Any) -> Any:

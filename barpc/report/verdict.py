@@ -114,7 +114,16 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             *_of_solution(run, found),
         )
     yield from dem_reasons(found)
-    yield from datum_reasons(run.datums, found)
+    yield from datum_reasons(run.datums, found, _common_lean(views))
+
+
+def _common_lean(views: Sequence[ViewEntry]) -> float:
+    """Return the tangent of the incidence that the lines of sight of all views have in common; 0: none."""
+    angles = np.array([(view.incidence_deg, view.azimuth_deg) for view in views], dtype=np.float64)
+    incidence, azimuth = np.radians(angles.reshape(-1, 2)).T
+    leans = np.tan(incidence) * np.exp(1j * azimuth)
+    known = np.isfinite(leans)
+    return float(np.abs(leans[known].sum())) / max(int(known.sum()), 1)
 
 
 def _of_cameras(found: Adjustment) -> Iterator[str]:
@@ -315,7 +324,7 @@ def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Ite
     known = f"the scene's position is uncertain by {lengths(found.gauge.sigma)} (east, north, up; 1 sigma)"
     if run.gcps is not None:
         yield from held_lines(found.control, run.gcps, views, known)
-    elif _holds(found) or (run.reference is not None and run.reference.control is not None):
+    elif _holds(found) or (run.reference and run.reference.control) or run.known or found.options.fixed:
         yield f"{known[0].upper()}{known[1:]}."
     elif (terrain := found.terrain) is not None and terrain.shows and terrain.held:
         yield f"With the DEM, {known}."
@@ -339,12 +348,14 @@ def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
     return f"Residuals of {points} (RMS): {np.hypot(*image):.2f} px in the images{on_ground}."
 
 
-def _checked_lines(_: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
+def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     rmse = median([view.rmse_before for view in views])
     if np.isfinite(rmse):
         yield f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px with the cameras as given."
-    else:
+    elif len(run.tracks):
         yield "No residual could be computed: no camera projects tie points of another image."
+    else:
+        yield "There are no tie points: nothing shows whether the cameras agree."
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:

@@ -290,9 +290,38 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
     return small, known
 
 
-def jpeg(pixels: ByteImage) -> bytes:
-    """Encode grey values (H, W) as a JPEG file."""
-    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 70])[1])
+def thumbnail(path: str | os.PathLike[str], size: tuple[int, int], side: int, band: int = 1) -> ByteImage | None:
+    """Return an 8-bit picture of a whole raster of `size` (width, height), at most `side` px a side.
+
+    None where nothing varies; invalid pixels are black. Two pixels a side are read for one, from overviews where the
+    file has them: a picture to look at, at a fraction of the cost of all pixels.
+    """
+    with open_raster(path) as dataset:
+        read = _RasterBand.of(dataset, path, band)
+        ends = dataset.width, dataset.height
+        zoom = max(1, min(max(ends) // (2 * side), *ends))
+        level = zoom if getattr(dataset, "driver", None) else 1  # a mosaic has no levels
+        width, height = (n // zoom * zoom for n in ends)
+        step, parts = zoom * max(1, SPAN // zoom), []
+        for top in range(0, height, step):
+            both = read.read((0, top, width, min(step, height - top)), level)
+            parts.append([one[:: zoom // level, :: zoom // level] for one in both])
+    pixels, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
+    stretch = Stretch.of(pixels[valid])
+    if stretch is None:
+        return None
+    shape = [max(1, round(n * min(1.0, side / max(size)))) for n in size]
+    picture = np.where(valid, stretch.apply(pixels, valid), np.uint8(0))
+    return np.asarray(cv2.resize(picture, shape, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def jpeg(pixels: ByteImage, most: float = np.inf) -> bytes:
+    """Encode grey values (H, W) as a JPEG file, of at most so many bytes: at a lower quality, then smaller."""
+    for quality in (70, 50, 30):
+        found = bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+        if len(found) <= most or min(pixels.shape) < 2:
+            return found
+    return jpeg(np.asarray(cv2.resize(pixels, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA), np.uint8), most)
 
 
 def grow(box: Box, margin: int, size: tuple[int, int]) -> Box:

@@ -282,7 +282,8 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
     }
     prior, common = (
         f"tables/{PRIOR_FILE}",
-        [*(f"tables/{name}" for name in TABLES), "summary.json", "SHA256SUMS"] + ["report.html"] * can_render(),
+        [*(f"tables/{name}" for name in (*TABLES, "pictures.json")), "summary.json", "SHA256SUMS"]
+        + ["report.html"] * can_render(),
     )
     pairs, known = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"], "tables/images.json"
     assert sorted(names["matching"]) == sorted([*common, "matches.csv", "matches.npz", *pairs])

@@ -13,6 +13,8 @@ from barpc.ba.constraints.gauge import SOURCES
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.base.geodesy import DEFAULT, INFERRED, STATED, HeightDatum
 from barpc.report.datum import datum_reasons
+from barpc.report.verdict import _common_lean
+from tests.report.made import a_view
 
 GEOID = 48.0
 
@@ -28,7 +30,7 @@ def block(up: float = 0.0, cameras: float = 10.0, known: float = 0.5, source: st
 
 
 def told(adjustment: Any, provenance: str = DEFAULT, otherwise: float = GEOID, **fields: Any) -> list[str]:
-    return [*datum_reasons([HeightDatum("gcps", "6 GCPs", otherwise, provenance, **fields)], adjustment)]
+    return [*datum_reasons([HeightDatum("gcps", "6 GCPs", otherwise, provenance, **fields)], adjustment, 0.0)]
 
 
 @pytest.mark.parametrize("provenance", [DEFAULT, INFERRED, STATED])
@@ -93,15 +95,43 @@ def test_control_that_was_refused_is_held_against_the_others():
 def test_a_dem_is_held_against_the_tie_points_without_what_it_may_be_wrong_by():
     terrain = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 20.0), delivered=(47.0, 0.0, 0.0), beyond=(47 / 22.4, 0, 0))
     one = HeightDatum("heights", "the DEM d.tif", GEOID, DEFAULT)
-    (why,) = datum_reasons([one], block(source="heights", terrain=terrain))
+    (why,) = datum_reasons([one], block(source="heights", terrain=terrain), 0.0)
     assert "The heights of the DEM d.tif lie 47.0 m below" in why
     assert "Give --geoid egm96" in why
-    (why,) = datum_reasons([replace(one, converted=True, otherwise=48.0)], block(source="heights", terrain=terrain))
+    (why,) = datum_reasons(
+        [replace(one, converted=True, otherwise=48.0)], block(source="heights", terrain=terrain), 0.0
+    )
     assert "Give --geoid none" in why
     for off in (1.0, -8.0):
         right = replace(terrain, delivered=(off, 0.0, 0.0), beyond=(abs(off) / 22.4, 0, 0))
-        assert [*datum_reasons([one], block(source="heights", terrain=right))] == []
+        assert [*datum_reasons([one], block(source="heights", terrain=right), 0.0)] == []
     unknown = block(source="heights", terrain=replace(terrain, beyond=(np.nan,) * 3))
-    (why,) = datum_reasons([one], unknown)
+    (why,) = datum_reasons([one], unknown, 0.0)
     assert why.startswith("The vertical datum of the heights of the DEM d.tif is not stated.")
-    assert [*datum_reasons([one], block(source="reference", terrain=None))] == [why]  # which stands on it
+    assert [*datum_reasons([one], block(source="reference", terrain=None), 0.0)] == [why]  # which stands on it
+
+
+@pytest.mark.parametrize(
+    ("lean", "share", "aside"), [(0.27, 1.0, "13.0"), (0.27, 0.5, "6.5"), (0.05, 1.0, ""), (0.0, 1, "")]
+)
+@pytest.mark.parametrize("source", ["gcps", "heights"])
+def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_its_own(source, lean, share, aside):
+    """One image on points of a wrong height: known to 60 m in height and to 4 m sideways, 48 m times lean is more."""
+    one = block(known=60.0, source=source)
+    one.gauge.sigma[:2], points = np.sqrt(8.0), {"gcps": "gcps", "heights": "reference"}[source]
+    one.datum[points] = np.where(np.arange(10) == 2, np.nan_to_num(one.datum[points][2]), share)
+    one.gauge.delivered_sigma[2] = 500.0
+    found = [*datum_reasons([HeightDatum(source, "them", GEOID, DEFAULT)], one, lean)]
+    assert len(found) == bool(aside)
+    if aside:
+        assert f"the scene is up to {aside} m off horizontally, and neither" in found[0]
+        assert found[0].endswith("--geoid none, or --geoid egm96." if source == "heights" else "--heights egm96.")
+
+
+@pytest.mark.parametrize(
+    ("angles", "lean"),
+    [([(30, 0)], 0.577), ([(30, 0), (30, 180)], 0.0), ([(30, 359), (30, 1)], 0.577), ([(None, 1)], 0)],
+)
+def test_the_common_lean_of_lines_of_sight_cancels_from_opposite_sides(angles, lean):
+    views = [a_view(incidence_deg=incidence, azimuth_deg=azimuth) for incidence, azimuth in angles]
+    assert _common_lean(views) == pytest.approx(lean, abs=1e-3)

@@ -99,6 +99,27 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert "F test asked" not in text
 
 
+def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed(record):
+    plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
+    assert "no higher degree was needed" in plain
+    assert "explains all residuals" in plain
+    assert "fit equally well" in plain
+    text = said(with_views(record, *[{"systematic_p": 0.3}] * 8, {"systematic_p": 9e-69}), held_out_places=())
+    assert "no higher degree was needed" not in text
+    last = record.views[8].name
+    assert f"no higher degree removes the systematic residuals of {last} (F test: p below 1e-4)" in text
+    for cause in ("systematic", "held_out", "wrong_matches", "left"):
+        text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
+        assert "explains all residuals" not in text
+        assert "No extra model that was tested explains the inconsistent residuals." in text
+        assert "fit equally well" not in text
+    assert "explains all residuals" in said(with_views(record, {"cause": "odd", "advice": "look"}), held_out_places=())
+    untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
+    assert "fit equally well" not in untested
+    nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
+    assert "explains" not in nothing
+
+
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
     assert (

@@ -228,11 +228,11 @@ def test_where_tie_points_move_is_outlined_and_says_so():
 def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_ends():
     places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
     drawn = drawn_names(places)
-    assert drawn.texts("name") == [("view_0137", 32.4, 104.0, "middle"), ("B", 416.4, 54.0, "middle")]
+    assert drawn.texts("name") == [("view_0137", 36.9, 104.0, "middle"), ("B", 415.9, 54.0, "middle")]
     assert len(maps._map_labels(places, [(30.0, 90.0, 20.0)])) == 1
     (long,) = drawn_names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))]).texts("name")
     assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
-    for dx, dy, shown in ((7.3, 0.0, 2), (7.1, 0.0, 1), (0.0, 14.1, 2), (0.0, 13.9, 1)):
+    for dx, dy, shown in ((8.3, 0.0, 2), (8.1, 0.0, 1), (0.0, 14.1, 2), (0.0, 13.9, 1)):
         assert (
             len(
                 maps._map_labels(
@@ -347,39 +347,42 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     assert shares == [1.0, 0.0]
     assert [caption for _, caption in charts_of] == ["A: 100 % systematic", "B: 0 % systematic"]
     first, second = (Drawing(svg) for svg, _ in charts_of)
-    assert first.box == (180, 90)
-    assert first.rects("empty") == [(0, 0, 180, 90)]
+    assert first.box == (300, 150)
+    assert first.rects("empty") == [(0, 0, 300, 150)]
     (heat,) = first.rects("heat")
-    assert heat == (0, 11.25, 22.5, 11.25)
+    assert heat == (0, 18.75, 37.5, 18.75)
     opacity = 0.06 + 0.5 * min(math.hypot(0.3, 0.02) / (2 * longest), 1.0)
     assert float(first.all("rect", "heat")[0].get("fill-opacity")) == pytest.approx(opacity, abs=0.006)
     vectors = first.all("path", "vector")[0].get("d")
     x, y, u, v = map(float, re.match(r"M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)", vectors).groups())
-    assert (x, y) == pytest.approx((60.5 / 5, 60.5 / 5), abs=0.051)
-    assert (u - x, v - y) == pytest.approx((0.3 * 12 / longest, 0.02 * 12 / longest), abs=0.11)
+    assert (x, y) == pytest.approx((60.5 / 3, 60.5 / 3), abs=0.051)
+    assert (u - x, v - y) == pytest.approx((0.3 * 20 / longest, 0.02 * 20 / longest), abs=0.11)
     assert vectors.count("M") == 40
-    assert first.rects("scalebar") == [(4, 83, 12, 3)]  # as long as a line of `longest`
+    assert first.rects("scalebar") == [(4, 143, 20, 3)]  # as long as a line of `longest`
+    assert first.texts("name") == [(f"{longest:.2g} px", 29, 147, "")]
     shaft, barbs = first.points("mean")
-    length = 0.3 * 24 / longest
+    length = 0.3 * 40 / longest
     assert np.array(shaft) == pytest.approx(
-        np.array([(11.25 - length / 2, 16.875), (11.25 + length / 2, 16.875)]), abs=0.006
+        np.array([(18.75 - length / 2, 28.125), (18.75 + length / 2, 28.125)]), abs=0.006
     )
-    assert barbs[1] == pytest.approx((11.25 + length / 2, 16.88), abs=0.006)
+    assert barbs[1] == pytest.approx((18.75 + length / 2, 28.12), abs=0.006)
     assert first.described == "40 residuals are drawn; 100 % systematic."
     assert first.root.get("data-v") == "0"
     assert first.root[0].text == "Residuals over A"
-    assert second.rects("heat") == [(157.5, 78.75, 22.5, 11.25)]
+    assert second.rects("heat") == [(262.5, 131.25, 37.5, 18.75)]
     assert float(second.all("rect", "heat")[0].get("fill-opacity")) == pytest.approx(
         0.06 + 0.5 * 0.6 / (2 * longest), abs=0.006
     )
     assert not second.all("path", "mean")
 
 
-@pytest.mark.parametrize(("size", "tall"), [((100, 100), 180), ((1000, 100), 72), ((100, 1000), 450), ((400, 200), 90)])
+@pytest.mark.parametrize(
+    ("size", "tall"), [((100, 100), 300), ((1000, 100), 120), ((100, 1000), 750), ((400, 200), 150)]
+)
 def test_a_panel_has_the_shape_of_its_image_within_reason(size, tall):
     charts_of, _, _ = panels([], [a_view(size=size)])
     drawn = Drawing(charts_of[0][0])
-    assert drawn.box == (180, tall)
+    assert drawn.box == (300, tall)
     assert charts_of[0][1] == "A: no tie points"
     assert drawn.all("path", "vector")[0].get("d") == "M0 0"
 
@@ -391,9 +394,9 @@ def test_a_very_large_error_is_no_darker_than_dark_and_its_arrow_no_longer_than_
     opacities = [float(e.get("fill-opacity")) for e in drawn.all("rect", "heat")]
     assert opacities == [0.31, 0.56]
     small, _head, large, barbs = drawn.points("mean")
-    assert math.dist(*large) == pytest.approx(24.0, abs=0.02)
-    assert np.subtract(large[1], large[0]) == pytest.approx((14.4, 19.2), abs=0.02)
-    assert math.dist(*small) == pytest.approx(24.0, abs=0.02)
+    assert math.dist(*large) == pytest.approx(40.0, abs=0.02)
+    assert np.subtract(large[1], large[0]) == pytest.approx((24.0, 32.0), abs=0.02)
+    assert math.dist(*small) == pytest.approx(40.0, abs=0.02)
     tip, along = np.array(large[1]), np.array([3.0, 4.0])
     across = np.array([-4.0, 3.0]) * 0.6
     assert np.array(barbs) == pytest.approx(np.array([tip - along + across, tip, tip - along - across]), abs=0.011)

@@ -17,7 +17,8 @@ from barpc.base.errors import BarpcError, InputError
 from barpc.cli import cli
 from barpc.pipeline import outputs
 from barpc.report import Run, maps, page, summarize
-from barpc.report.runfiles import TABLES, ObservationTable, RunFiles
+from barpc.report.ranking import worst_first
+from barpc.report.runfiles import MAX_PICTURES, TABLES, Draped, ObservationTable, RunFiles
 from barpc.report.summary.words import metres
 from barpc.scene import Tracks
 from tests.lanes import rest_slow
@@ -113,7 +114,7 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
 
 
 def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(maps, "_MAX_MAP_IMAGES", 4)
+    monkeypatch.setattr(maps, "MAX_PICTURES", 4)
     monkeypatch.setattr(page, "MAX_SHOWN", 5)
     html = page.report_html(block_run.record, block_run.folder)
     assert "Of 9 images 4 are shown: those with the largest systematic part." in html
@@ -154,7 +155,9 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
         *(np.concatenate([column] * copies) for column in columns),
     )
     told = replace(summary, views=tuple(views), pairs=tuple(pairs), verdict=tuple(lines))
-    return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines)
+    every = worst_first(told.views)[:MAX_PICTURES]  # as large as a run writes them
+    small = [Draped(view.name, (480, 480), "A" * (4 * 25_000 // 3 // 4 * 4)) for view in every]
+    return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines, thumbnails=small)
 
 
 @pytest.mark.slow
@@ -164,7 +167,8 @@ def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_ru
     monkeypatch.setattr(page, "read_tables", lambda *_: files)
     html = page.report_html(files.summary, "")
     views = len(files.summary.views)
-    assert 1e6 < len(html.encode()) < 3e6
+    assert 3e6 < len(html.encode()) < 6e6
+    assert html.count("data:image/jpeg") == 60
     assert (f"And {views - 400} more; all are in summary.json." in html) == (num == 1000)
     assert html.count('class="outline doubtful"') == (views if num == 300 else views // 3)
     assert ("At most 400 of 1008 footprints are drawn" in html) == (num == 1000)

@@ -185,8 +185,11 @@ def test_corrections_are_told_by_the_farthest_move():
     assert [cell.key for cell in section.tables[0].rows[0]][1:3] == [3.0, -4.0]
     assert texts(section.tables[1])[1] == ["B", "3.00", "1.00", "45", "5.00", "-"]
     assert not section.charts
-    held = asked("corrections", views, scene=a_scene(shift_enu_m=(9.0, 0.0, 0.0)), gcps=(a_gcp("P", 0.0, 0.0),))
-    assert "no tie point can tell" not in held.answer
+    gcps = (a_gcp("P", 0.0, 0.0),)
+    for cameras, told in ((0.9, True), (0.1, False)):  # whether control is given or not: what counts is used
+        datum = (DatumEntry("up", 2.0, cameras, 0.0, 0.0, 1.0 - cameras, 0.0, None),)
+        moved = asked("corrections", views, scene=a_scene(shift_enu_m=(9.0, 0.0, 0.0), datum=datum), gcps=gcps)
+        assert ("which tie points cannot determine" in moved.answer) == told
     assert [table.key for table in asked("corrections", views[:1]).tables] == ["corrections"]
     assert asked("corrections", [views[0], a_view("B")]) is None
     clocks = asked("corrections", [a_view("A", correction=a_correction(range_m=1.0, azimuth_ms=0.5))])
@@ -231,10 +234,17 @@ def test_what_the_images_cannot_tell_is_said_of_the_weakest():
 @pytest.mark.parametrize(("used", "helped"), [(True, True), (False, False)])
 def test_a_reference_that_is_used_helps_as_control_does(used, helped):
     row = ReferenceViewEntry("A", 9.0, (1.0, -2.0), 50, 30, 20, 0.5)
-    section = asked("gauge", scene=a_scene(), reference=ReferenceEntry(used, 0.5, 1.0, 20, (row,)))
+    shares = [DatumEntry(part, 2.0, 1.0 - used, 0.0, 0.0, 0.0, 0.0, float(used)) for part in ("east", "north", "up")]
+    scene = a_scene(datum=tuple(shares))
+    section = asked("gauge", scene=scene, reference=ReferenceEntry(used, 0.5, 1.0, 20, (row,)))
     assert ("--gcp" not in section.answer) == helped
     assert texts(section.tables[-1]) == [["A", "9.0", "+1.00", "-2.00", "50", "30", "20", "0.50"]]
-    assert "--gcp" not in asked("gauge", scene=a_scene(), gcps=(a_gcp("P", 0.0, 0.0),)).answer
+    given = asked("gauge", scene=scene, gcps=(a_gcp("P", 0.0, 0.0),)).answer  # that are given may not be used
+    assert ("--gcp" not in given) == helped
+    by_gcps = tuple(replace(one, cameras=0.2, gcps=0.8, reference=0.0) for one in shares)
+    assert "--gcp" not in asked("gauge", scene=a_scene(datum=by_gcps)).answer
+    weak = replace(shares[2], cameras=0.9, gcps=0.1, reference=0.0)
+    assert "--gcp" in asked("gauge", scene=a_scene(datum=(*by_gcps[:2], weak))).answer
 
 
 def test_what_holds_the_scene_and_the_control_in_each_image_are_tables():

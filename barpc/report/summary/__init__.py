@@ -125,7 +125,9 @@ class Summary(Record):
     control_test: ControlTestEntry | None = column("Test of the residuals of control", default=None)
     reference: ReferenceEntry | None = column("A reference orthoimage, where one was given", default=None)
     inputs: tuple[InputEntry, ...] | None = column("Every input file, for `barpc verify`", default=None)
-    outputs: tuple[OutputEntry, ...] | None = column("Every output file but this and the report", default=None)
+    outputs: tuple[OutputEntry, ...] | None = column(
+        "Every output file but this, the report and its pictures", default=None
+    )
     out_dir: str | None = column("Folder of the results; not in the file", default=None)
     stages: tuple[StageEntry, ...] | None = column("Stages of the run; not in the file", default=None)
 

@@ -60,6 +60,17 @@ def known(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
+def figure(value: float) -> str:
+    """Return a number with one decimal, or with one digit where it would read 0.0.
+
+    Examples
+    --------
+    >>> figure(12.34), figure(0.0234), figure(0)
+    ('12.3', '0.02', '0')
+    """
+    return f"{value:.1f}" if abs(value) >= 0.05 else f"{value:.1g}"
+
+
 def metres(value: float) -> str:
     """Return a length with a unit that keeps it readable.
 

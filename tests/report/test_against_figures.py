@@ -1,0 +1,568 @@
+"""Every sentence of a report against the figures beside it, over runs of all kinds.
+
+A sentence without a row of `SENTENCES` fails: whoever adds one says what it must agree with.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from html import unescape
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jinja2")
+
+from barpc.base.errors import listed
+from barpc.report import Run, Summary
+from barpc.report.page import SECTIONS
+from barpc.report.quality_checks import enu
+from barpc.report.runfiles import ObservationTable, RunFiles
+from barpc.report.summary.block import DatumEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import metres
+from barpc.report.verdict import summarize
+from tests.lanes import rest_slow
+from tests.report.worlds import WORLDS
+
+NUM = r"([-+\d.e]+)"
+LENGTH = r"([-+\d.]+ (?:m|cm|mm))"
+SENTENCES: dict[str, Callable[..., None]] = {}
+SMOOTH, SURE_P = 0.06, 1e-4
+
+
+def says(pattern: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register what a sentence must agree with: called with the summary and the groups of the pattern."""
+
+    def register(check: Callable[..., None]) -> Callable[..., None]:
+        SENTENCES[pattern] = check
+        return check
+
+    return register
+
+
+def near(text: str, value: float | None) -> None:
+    """A number as written is the figure, to its digits."""
+    digits = len(text.partition("e")[0].partition(".")[2])
+    assert value is not None
+    assert float(text) == pytest.approx(value, abs=0.51 * 10.0**-digits, rel=0.06 if "e" in text else 1e-9)
+
+
+def median(values) -> float:
+    return float(np.median([value for value in values if value is not None]))
+
+
+def share(summary: Summary, *sources: str, parts: tuple[str, ...] = ("east", "north", "up")) -> list[float]:
+    rows = [one for one in summary.scene.datum if one.part in parts]
+    return [sum(getattr(one, source) or 0.0 for source in sources) for one in rows]
+
+
+def used_gcps(s: Summary) -> int:
+    return sum(gcp.used and gcp.status not in ("not seen", "rejected", "undecided") for gcp in s.gcps)
+
+
+OTHERS = [name for name in DatumEntry.__dataclass_fields__ if name not in ("part", "sigma_m", "cameras", "heights")]
+
+
+@says(rf"Tie points of (\d+) images? agree to {NUM} px(?: \(before: {NUM} px\))?\.")
+def _(s, num, after, before):
+    assert int(num) == sum(view.num_observations > 0 for view in s.views)
+    near(after, median(view.rmse_after for view in s.views))
+    assert before is None or near(before, median(view.rmse_before for view in s.views)) is None
+
+
+@says(rf"Tie points of (\d+) images? agree to {NUM} px with the cameras as given\.")
+def _(s, num, now):
+    assert int(num) == len(s.views)
+    near(now, median(view.rmse_before for view in s.views))
+
+
+@says(r"There are no tie points: control alone constrains the cameras\.")
+def _(s):
+    assert s.tracks.num_observations == 0
+    assert used_gcps(s)
+
+
+@says(r"There are no tie points: nothing shows whether the cameras agree\.")
+def _(s):
+    assert s.tracks.num_observations == 0
+    assert all(view.rmse_before is None for view in s.views)
+
+
+@says(r"(\d+) tie points? of (\d+) images?, (\d+) observations?\.")
+@says(r"(\d+) images?, (\d+) tie points?, (\d+) observations?\.")
+def _(s, *counts):
+    assert sorted(map(int, counts)) == sorted((s.tracks.num_tracks, len(s.views), s.tracks.num_observations))
+
+
+@says(r"The scene as a whole moved by ([-+].* up)\.")
+def _(s, shift):
+    assert shift == enu(s.scene.shift_enu_m)
+
+
+@says(
+    r"(With \d+ GCPs?|With the DEM|Without(?: consistent)? ground control|The scene's position)(?:, the scene's "
+    r"position)? is uncertain by (.*) \(east, north, up; 1 sigma\)\."
+)
+def _(s, start, sigma):
+    assert sigma == ", ".join(map(metres, s.scene.sigma_enu_m))
+    if start.startswith("Without"):
+        assert max(share(s, *OTHERS)) < 0.05
+        assert not (s.scene.dem and s.scene.dem.num_held)
+        assert ("consistent" in start) == bool(s.gcps)
+    elif "GCP" in start:
+        assert int(start.split()[1]) == used_gcps(s) > 0
+        assert max(share(s, "gcps")) > 0.0
+    elif "DEM" in start:
+        assert s.scene.dem.num_held > 0
+        assert share(s, "heights", parts=("up",))[0] > 0.05
+    else:
+        assert max(share(s, *OTHERS)) > 0.05
+
+
+@says(r"Nothing checks (it|them): an error in a GCP would not show\.")
+def _(s, what):
+    assert {gcp.status for gcp in s.gcps} <= {"used", "not seen"}
+    assert (what == "it") == (used_gcps(s) == 1)
+    assert all((gcp.redundancy or 0.0) < 0.5 for gcp in s.gcps)
+
+
+@says(r"Only (\S+) shows GCPs: .*")
+def _(s, image):
+    assert {name for gcp in s.gcps for name in gcp.images} == {image}
+
+
+@says(r"(\d+) GCPs? rejected, as the others contradict (it|them): [^:]*: (.*)\.")
+def _(s, num, them, names):
+    gone = [gcp for gcp in s.gcps if gcp.status == "rejected"]
+    assert int(num) == len(gone)
+    assert (them == "it") == (len(gone) == 1)
+    for gcp in gone:
+        assert f"{gcp.name} ({enu(gcp.residual_enu_m)}, w = {gcp.w:.1f})" in names
+    assert used_gcps(s) > len(gone)
+
+
+@says(r"GCPs contradict each other, and no subset outweighs the others: (.*) against (.*?)(?: \(.*\))?\. None .*")
+@says(r"With the GCPs the images would agree less with each other: ()()the RMS .*")
+def _(s, one, other):
+    assert used_gcps(s) == 0
+    for name in filter(None, f"{one}, {other}".split(", ")):
+        assert name.strip() in {gcp.name for gcp in s.gcps if gcp.status == "undecided"}
+
+
+@says(rf"The vertical datum of the heights of .* is not stated\. .* the scene is {LENGTH} too (low|high).*")
+def _(s, far, side):
+    assert float(far.split()[0]) > s.scene.sigma_enu_m[2]
+    assert side == "low"
+
+
+@says(
+    r"DEM heights constrain (\d+) of (\d+) tie points?(: the DEM has no height .*|\. "
+    rf"Assumed error: {LENGTH} per point.*)"
+)
+def _(s, held, num, rest, sigma):
+    dem = s.scene.dem
+    assert (int(held), int(num)) == (dem.num_held, dem.num_tracks)
+    assert ("no height" in rest) == (dem.num_held == 0)
+    assert sigma is None or sigma == metres(dem.sigma_m)
+
+
+@says(rf"The DEM covers (\d+) % of the tie points(?:; they lie {NUM} m above it \(median; NMAD {NUM} m\))?\.")
+def _(s, percent, offset, spread):
+    dem = s.scene.dem
+    near(percent, 100.0 * dem.num_known / dem.num_tracks)
+    assert (offset is None) == (dem.num_known == 0)
+    if offset:
+        near(offset, dem.offset_m)
+        near(spread, dem.spread_m)
+
+
+@says(rf"The DEM does not show the terrain of the tie points: its relief is {NUM} times theirs\. .* It was not used\.")
+def _(s, relief):
+    assert float(relief) == pytest.approx(s.scene.dem.relief, rel=0.06)
+    assert max(share(s, "heights")) < 0.05
+
+
+@says(r"Reference: (\d+) of (\d+) points? matched .* in (\d+) images?.*")
+def _(s, points, tried, images):
+    seen = [view for view in s.reference.views if view.offset_en_m]
+    assert s.reference.used
+    assert int(images) == len(seen)
+    assert (int(points), int(tried)) == (sum(v.num_points for v in seen), sum(v.num_tried for v in seen))
+
+
+@says(r"The reference does not show .*It was not used\.")
+def _(s):
+    assert not s.reference.used
+
+
+@says(
+    rf"(\d+) of (\d+) altimetry heights agree with the surface of the tie points to {LENGTH} \({LENGTH} "
+    r"expected\); (.*)\."
+)
+def _(s, agree, near_, spread, expected, motion):
+    one = s.scene.altimetry
+    assert (int(agree), int(near_)) == (one.num_agreeing, one.num_near)
+    assert (spread, expected) == (metres(one.spread_m), metres(one.expected_m))
+    assert motion == f"they shifted it by {enu(one.motion_enu_m)}"
+    assert share(s, "altimetry", parts=("up",))[0] > 0.5
+
+
+@says(r"The altimetry was not used: (.*) \((\d+) of (\d+) .* of (\d+) given\)\.")
+def _(s, why, agree, near_, given):
+    one = s.scene.altimetry
+    assert (why, int(agree), int(near_), int(given)) == (one.why_not, one.num_agreeing, one.num_near, one.num_given)
+    assert max(share(s, "altimetry")) < 0.05
+
+
+@says(rf"More than {NUM} % of the tie points of (.*) were rejected, with neighbouring errors in random directions, .*")
+def _(s, percent, names):
+    for name in names.split(", "):
+        (view,) = [view for view in s.views if view.name == name]
+        assert 100 * view.lost > float(percent)
+
+
+@says(r"(\d+) images? added to the (\d+) images? of (.*); (\d+) of these have new tie points\.")
+def _(s, new, old, *_rest):
+    assert int(new) + int(old) == len(s.views)
+
+
+@says(rf"Their cameras stay valid: the largest change, of (\S+), is {NUM} px \(limit: {NUM} px\)\.")
+def _(s, name, far, floor):
+    assert float(far) <= float(floor)
+
+
+@says(rf"Residuals of (\d+) check points? \(RMS\): {NUM} px in the images, (.*) on the ground \(east, north, up\)\.")
+def _(s, num, pixels, ground):
+    assert int(num) == len(s.check_points)
+    miss = np.array([point.residual_enu_m for point in s.check_points])
+    assert ground == ", ".join(map(metres, np.sqrt((miss**2).mean(axis=0))))
+    seen = np.array([one for point in s.check_points for one in point.seen])
+    near(pixels, np.sqrt((seen**2).sum(axis=1).mean()))
+
+
+@says(r"(\S+) was left out: .*")
+def _(s, path):
+    assert path in {file.path for file in s.left_out}
+
+
+@says(r"p7 is outside of all images\.")
+def _(s):
+    assert s.status != "good"
+
+
+# --- an image ---------------------------------------------------------------------------------------------
+
+
+def figures(view: ViewEntry, text: str) -> None:
+    """Figures of an image's sentence against its cells."""
+    for pattern, value in (
+        (rf"only {NUM} tie points", view.num_observations),
+        (rf"only {NUM} GCPs?", view.num_gcps),
+        (rf"{NUM} % of its tie points were rejected", 100 * view.lost),
+        (rf"check tie points have residuals of {NUM} px", view.held_out_px),
+        (rf"misses it by {NUM} px", view.fit and float(np.hypot(*view.fit.rmse_px))),
+        (rf"RMS; {NUM} px at most", view.fit and max(view.fit.max_px)),
+        (rf"its RPC is {NUM} times less", view.prior_scale),
+        (r"tie points have residuals of (\d[\d.]*) px: adjust", view.rmse_before),
+        (rf"tie points keep residuals of {NUM} px", view.rmse_after),
+    ):
+        if found := re.search(pattern, text):
+            near(found[1], value)
+    assert not re.search(r"more than 0 %", text)
+    assert ("no tie points" not in text) or view.num_observations == 0
+
+
+# --- next steps -------------------------------------------------------------------------------------------
+
+
+@says(
+    r"(After review, hand over|Hand over) (.*?)(?: and (\d+) more)?"
+    r"(?:; best pair for heights: (\S+) - (\S+), (.*) per pixel .*)?\."
+)
+def _(s, start, names, more, a, b, per_pixel):
+    assert (start == "Hand over") == s.passed
+    good = {name for view in s.views if not view.advice for name in view.outputs}
+    assert {*names.split(", ")} <= good
+    assert len(names.split(", ")) + int(more or 0) == len(good)
+    pairs = {(pair.a, pair.b): pair for pair in s.pairs}
+    assert a is None or per_pixel == metres(pairs[a, b].height_m_per_px)
+    assert a is None or not any(view.advice for view in s.views if view.name in (a, b))
+
+
+@says(r"The scene's position is uncertain by (.*?) \(east, north, up; 1 sigma\); (.*)\.")
+def _(s, sigma, gains):
+    assert sigma == ", ".join(map(metres, s.scene.sigma_enu_m))
+    (step,) = [step for step in s.next if step.expected]
+    assert gains.count("with ") == len(step.expected)
+    for one in step.expected:
+        better = [a / b for a, b in zip(s.scene.sigma_enu_m, one.sigma_enu_m, strict=True) if b is not None]
+        assert max(better) > 1.5
+    assert ("with a DEM" in gains) <= (s.scene.dem is None or s.scene.dem.num_held == 0)
+
+
+@says(r"Look at (.*?)(?: and \d+ more)? \((.*?)\).*\.")
+def _(s, names, _label):
+    assert {*names.split(", ")} <= {view.name for view in s.views if view.advice}
+
+
+@says(
+    r"(Review: |Check the files that were left out: |The cameras disagree: adjust them|Adjust the cameras with these).*"
+)
+def _(s, start):
+    assert not start.startswith("Review") or s.reasons
+    assert not start.startswith("Check") or s.left_out
+    assert not start.startswith("The cameras disagree") or min(view.rmse_before for view in s.views) > 0.5
+    assert not start.startswith("Adjust") or s.tracks.num_tracks
+
+
+# --- decisions --------------------------------------------------------------------------------------------
+
+
+@says(r"Tie points were given: nothing was matched\.")
+def _(s):
+    assert not any(pair.tied_by for pair in s.pairs)
+    assert s.pairs
+
+
+@says(r"Each camera is corrected by (.*)\.")
+def _(s, model):
+    assert model == s.scene.model
+
+
+@says(r"The standard camera model explains all residuals; no extra model was needed\.")
+def _(s):
+    assert not s.scene.explanations
+    assert not s.scene.left
+    assert any(view.num_observations for view in s.views)
+    for view in s.views:
+        assert (view.systematic_px or 0.0) <= SMOOTH or (view.systematic_p or 1.0) > SURE_P
+        assert (view.rmse_after or 0.0) < 0.5
+        assert (view.held_out_px or 0.0) < 1.0
+
+
+@says(r"No extra model that was tested explains the inconsistent residuals\.")
+def _(s):
+    assert s.scene.left or s.scene.held_out_places or any(view.cause for view in s.views)
+
+
+@says(r"The degree of the rotation drift, (\d+), was set by an option\.")
+def _(s, degree):
+    assert int(degree) == s.scene.drift_degree == s.options["adjust"]["drift"]
+
+
+@says(r"The rotation drifts along the rows as a polynomial of degree (\d+)(.*)\.")
+def _(s, degree, rest):
+    assert int(degree) == s.scene.drift_degree
+    assert s.options["adjust"]["drift"] is None
+    low = [view.name for view in s.views if (view.systematic_p if view.systematic_p is not None else 1.0) < SURE_P]
+    assert ("no higher degree was needed" in rest) <= (not low)
+    assert ("as in the earlier run" in rest) == (None in s.scene.drift_sigma_m)
+    if found := re.search(r"first and last row: (.*?)\)", rest):
+        assert found[1] == ", ".join(map(metres, s.scene.drift_sigma_m))
+
+
+@says(rf"The squares of the corrections are {NUM} times .* stated accuracies: (.*)\.")
+def _(s, ratio, rest):
+    assert float(ratio) == pytest.approx(s.scene.prior_ratio, rel=0.06)
+    wide = [view for view in s.views if (view.prior_scale or 1.0) > 1.005]
+    assert ("no prior was widened" in rest) == (not wide)
+    if found := re.search(rf"priors of (\d+) images? were widened, at most {NUM} times \((\S+)\)", rest):
+        assert int(found[1]) == len(wide)
+        near(found[2], max(view.prior_scale for view in wide))
+
+
+@says(rf"(\d+) of (\d+) observations of tie points \({NUM} %\) were rejected as outliers, the most in (\S+): {NUM} %\.")
+def _(s, cut, num, percent, name, most):
+    gone = sum(view.num_rejected for view in s.views)
+    assert (int(cut), int(num)) == (gone, gone + sum(view.num_observations for view in s.views))
+    assert float(percent) == pytest.approx(100 * gone / int(num), abs=0.051)
+    assert float(percent) > 0 < float(most)
+    assert max(s.views, key=lambda view: view.lost).lost == next(view.lost for view in s.views if view.name == name)
+
+
+@says(r"No observation of a tie point was rejected\.")
+def _(s):
+    assert sum(view.num_rejected for view in s.views) == 0 < sum(view.num_observations for view in s.views)
+
+
+@says(r"(\d+) more were held out as independent checks\.")
+def _(s, num):
+    assert int(num) == s.scene.num_held_out
+
+
+@says(r"Independent check tie points fit equally well in all rows, columns and cells of every image\.")
+def _(s):
+    assert s.scene.held_out_places == ()
+    errors = [view.held_out_px for view in s.views if view.num_observations]
+    assert None not in errors
+    assert max(errors) < 5.0 * max(median(view.rmse_after for view in s.views), 0.05)
+
+
+@says(r"(\d+) of (\d+) visible GCPs constrain the block\.")
+def _(s, num, seen):
+    assert int(num) == used_gcps(s)
+    assert int(seen) == sum(bool(gcp.images) for gcp in s.gcps)
+
+
+@says(
+    rf"(\d+) of (\d+) residuals? of control points in the images exceed {NUM} times .* deviation; {NUM} are "
+    rf"expected by chance \(the largest: w = {NUM}, (\S+) in (\S+)\)\."
+)
+def _(s, beyond, num, critical, expected, w, point, image):
+    test = s.control_test
+    assert (int(beyond), int(num), point, image) == (test.num_beyond, test.num, test.point, test.image)
+    near(w, test.largest_w)
+    assert (test.largest_w > float(critical)) == (test.num_beyond > 0)
+    assert float(expected) == pytest.approx(test.expected, rel=0.5)
+
+
+# --- answers of sections ----------------------------------------------------------------------------------
+
+
+@says(r"(\d+) of (\d+) images? passed\.( Residuals measure .*)?")
+def _(s, good, num, agreement):
+    assert (int(good), int(num)) == (sum(not view.advice for view in s.views), len(s.views))
+    assert not agreement or s.tracks.num_observations
+
+
+@says(r"There are no tie points in use\.(?: Tied .*)?")
+def _(s):
+    assert not any(s.tracks.by_length.values())
+
+
+@says(
+    r"Tie points connect (all images|the images in (\d+) separate groups)\.(?: Tied to one .*?\.)?"
+    r"((?: \d+.* in \d+.*)?)"
+)
+def _(s, how, groups, lengths):
+    assert s.pairs
+    linked = {pair.a for pair in s.pairs} | {pair.b for pair in s.pairs}
+    assert (how == "all images") <= ({view.name for view in s.views} == linked)
+    for count, length in re.findall(r"(\d+)(?: tie points?)? in (\d+)", lengths):
+        assert s.tracks.by_length[length] == int(count)
+
+
+@says(r"(Mostly|Not in [^:]*): in .*")
+def _(s, start):
+    assert start
+
+
+@says(
+    rf"(?:No epipolar offset is known: .*|The epipolar offset, .* is {NUM} px \(RMS\) in the worst pair "
+    r"\((\S+) - (\S+)\);.*)"
+    rf" (?:The best pair for heights is (\S+) - (\S+): .* angle is {NUM} degrees, .* is (.*) of height|No pair .*)\."
+)
+def _(s, offset, a, b, best_a, best_b, angle, height):
+    pairs = {(pair.a, pair.b): pair for pair in s.pairs}
+    if offset:
+        ends = [pair.epipolar_after if s.kind == "adjust" else pair.epipolar_before for pair in s.pairs]
+        near(offset, max(end.rms for end in ends if end))
+    if best_a:
+        near(angle, pairs[best_a, best_b].convergence_deg)
+        assert height == metres(pairs[best_a, best_b].height_m_per_px)
+        assert not any(view.advice for view in s.views if view.name in (best_a, best_b))
+
+
+@says(
+    rf"Up to {NUM} px at the centre of an image\.(?: Part of that is common to all images: the scene as a whole moved "
+    rf"by {LENGTH}, which tie points cannot determine\.)?"
+)
+def _(s, most, scene):
+    near(most, max(np.hypot(*view.correction.center_shift_px) for view in s.views))
+    assert scene is None or scene == metres(np.linalg.norm(s.scene.shift_enu_m))
+    assert scene is None or max(share(s, *OTHERS, "heights")) < 0.5
+
+
+@says(r"(Tie points fix .* Earth\. )?Uncertainty that remains \(1 sigma\), the weakest mode first\.(.*)")
+def _(s, ties, rest):
+    assert bool(ties) == any(view.num_observations for view in s.views)
+    sigmas = [mode.sigma_m for mode in s.scene.weakest_modes if mode.sigma_m is not None]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert ("--gcp" in rest) == (min(share(s, "gcps", "reference")) <= 0.5)
+
+
+@says(r"(?:[A-Z].* may (?:lie|be).*|Heights may be .*)\.")
+def _(s):
+    pass  # of the modes, whose figures are their own field: `summary.block.ModeEntry.words`
+
+
+@says(r"The figures behind the decisions of this run; choices by options are marked\.")
+def _(s):
+    pass
+
+
+@says(r"(\d+) check points? that the adjustment did not use; .*")
+def _(s, num):
+    assert int(num) == len(s.check_points)
+
+
+@says(rf"(?:Not known for every image|Errors of at most {NUM} px, .*)\. Give other tools .*")
+def _(s, worst):
+    errors = [max(view.fit.max_px) for view in s.views if view.fit]
+    assert worst is None or float(worst) == pytest.approx(max(errors), rel=0.06)
+
+
+# --- the runs ---------------------------------------------------------------------------------------------
+
+
+def files_of(run: Run, summary: Summary) -> RunFiles:
+    """A run's tables without a folder."""
+    tracks, before = run.tracks, run.ties_before.residuals
+    after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals
+    seen = ObservationTable(tracks.view, tracks.point, tracks.xy, before, after, run.keep)
+    return RunFiles(summary, seen, np.zeros((0, 4)), np.zeros(0, int), [()] * len(run.views))
+
+
+@cache
+def made(kind: str) -> tuple[Summary, list[str]]:
+    """The summary of a run, and every sentence of its page but those of images."""
+    run = WORLDS[kind]()
+    summary = summarize(run)
+    found = [section for make in SECTIONS if (section := make(files_of(run, summary))) is not None]
+    page = [text for section in found for text in (section.answer, *section.points)]
+    steps = [step.text for step in summary.next]
+    return summary, [unescape(str(text)) for text in (*summary.verdict, *steps, *page)]
+
+
+KINDS = [pytest.param(kind, marks=pytest.mark.filterwarnings("ignore")) for kind in WORLDS]
+
+
+@pytest.mark.parametrize("kind", rest_slow(KINDS, 8))
+def test_no_sentence_is_against_its_figure(kind):
+    summary, sentences = made(kind)
+    of_images = {view.reservation: view for view in summary.views if view.advice}
+    told = {
+        f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in (summary.scene.explanations if summary.scene else ())
+    }
+    assert set(of_images) <= set(summary.verdict)
+    for sentence in sentences:
+        if sentence in of_images:
+            figures(of_images[sentence], sentence)
+        elif sentence not in told:
+            rows = [
+                (check, found) for pattern, check in SENTENCES.items() if (found := re.fullmatch(pattern, sentence))
+            ]
+            assert rows, f"no row of SENTENCES: {sentence}"
+            for check, found in rows[:1]:
+                check(summary, *found.groups())
+
+
+@pytest.mark.parametrize("kind", rest_slow(KINDS, 8))
+def test_what_is_flagged_comes_first_and_the_headline_counts_it(kind):
+    summary, _ = made(kind)
+    bad = [view.name for view in summary.views if view.status == "failed"]
+    look = [view.name for view in summary.views if view.advice and view.status != "failed"]
+    counts = [int(num) for num in re.findall(r"(\d+) images? needs? review", summary.headline)]
+    assert counts == [len(look)] * bool(look)
+    gone = [int(num) for num in re.findall(r"(\d+) images? (?:is|are) not", summary.headline)]
+    assert gone == [len(bad) + len(summary.left_out)] * bool(bad or summary.left_out)
+    assert summary.passed == (summary.status == "good") == (not summary.reasons)
+    assert summary.reasons == summary.verdict[len(summary.verdict) - len(summary.reasons) :]
+
+
+def test_there_are_thirty_kinds_and_listed_names_end_as_the_patterns_read_them():
+    assert len(WORLDS) >= 30
+    assert listed([f"v{k}" for k in range(7)], 5).endswith("v4 and 2 more")
