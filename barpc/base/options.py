@@ -55,6 +55,7 @@ class Rule:
     below: float | None = None  # not reached
     rows: str = ""  # the table whose keys are the values allowed, as module and name
     hook: bool = False  # or `module:name`, of a user's own
+    removed: Mapping[str, str] = field(default_factory=dict)  # value of earlier releases -> what it was, what to use
     cli_only: bool = False  # given on the command line or in Python: no options file may set it
 
     def holds(self, number: float) -> bool:
@@ -170,7 +171,8 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
         found = value
     elif choices := rule.choices(kind):
         if type(value) not in (str, int) or value not in choices:
-            raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}")
+            why = rule.removed.get(str(value))
+            raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}" + (f"; removed: {why}" if why else ""))
         found = value
     else:
         found = _as_type(kind, rule, value)
@@ -376,12 +378,15 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
-    method: Literal["auto", "ridge", "gauss-newton", "minimax", "lcurve-joint", "vendor-denominators"] = option(
+    method: Literal["auto", "ridge", "gauss-newton", "lcurve-joint"] = option(
         "auto",
         """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and
-        row (78 unknowns). `gauss-newton`: the least squares of the error
-        itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
-        only. `auto`: `ridge`, and another one where the certificate says that it is better.""",
+        row (78 unknowns). `gauss-newton`: the least squares of the error itself, for models without noise. `auto`:
+        `ridge`, and `gauss-newton` where the certificate says that it is better.""",
+        removed={
+            "minimax": "it minimised the largest error, `gauss-newton` minimises the RMSE",
+            "vendor-denominators": "it kept the denominators of the RPC under a model, `auto` fits them",
+        },
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4

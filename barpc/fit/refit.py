@@ -15,7 +15,7 @@ from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.axes import wrong_axes, wrong_axes_of_grid
 from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
-from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
+from barpc.fit.methods import FitSolution, solve, solve_problem
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
     Errors,
@@ -71,21 +71,22 @@ def fit_rpc(
     -----
     BarpcWarning : part of the image has no ground point
     """
-    options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
+    options, alt_range = options or FitOptions(), widened(alt_range)
     sample = _check_sample(model, size, alt_range)
     screened(sample.ground, sample.points[:, :2])
     contradiction = sample.contradiction()
-    axes = "" if vendor is not None else wrong_axes(model, size, alt_range)  # an RPC's lines of sight are cubics' own
+    # the lines of sight of an RPC are cubics' own
+    axes = "" if isinstance(innermost(model), RPC) else wrong_axes(model, size, alt_range)
     given, seen = partial(_points_for_method, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
-        solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method, vendor=vendor)
+        solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         errors = sample.errors(solution.rpc)
         return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
-        fit = _best_method(attempt, options, vendor, False, exact=True)
+        fit = _best_method(attempt, options, False, exact=True)
         if isinstance(model, Splined | Calibrated):
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
@@ -99,12 +100,10 @@ def fit_rpc(
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
-def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
-    """Return the RPC of a sensor model by one method, without a certificate: the caller measures its misfit."""
-    options, alt_range = FitOptions(), widened(alt_range)
-    return solve(
-        *_points_for_method(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)
-    ).rpc
+def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> RPC:
+    """Return the RPC of a sensor model by ``ridge``, without a certificate: the caller measures its misfit."""
+    options = FitOptions()
+    return solve(*_points_for_method(model, size, widened(alt_range), options, "ridge"), options, "ridge").rpc
 
 
 def _check_sample(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
@@ -134,7 +133,7 @@ def _points_for_method(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, method: str
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
-    if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
+    if method == "gauss-newton":  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _SCATTERED_CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
@@ -154,7 +153,6 @@ def fit_rpc_points(
     sigma: npt.ArrayLike | None = None,
     check: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
     size: tuple[int, int] | None = None,
-    vendor: RPC | None = None,
     options: FitOptions | None = None,
     strict: bool = True,
 ) -> RpcFit:
@@ -168,7 +166,6 @@ def fit_rpc_points(
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
     size : (width, height), optional, image whose coverage is stated [px]; else the points' own extent
-    vendor : RPC, optional, whose denominators may be kept
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
     strict : bool, as for `fit_rpc`
@@ -188,7 +185,7 @@ def fit_rpc_points(
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
+        solution = solve(cnp, cnp_image, options, method, weight=weight)
         errors = Errors()
         if held_out is not None:
             errors.add(solution.rpc.project(held_out[0]) - held_out[1])
@@ -196,10 +193,10 @@ def fit_rpc_points(
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         fit = _certified(solution, errors, errors.largest, loop, size)
-        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None and vendor is None else fit.rpc
+        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None else fit.rpc
         return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
 
-    fit = _best_method(attempt, options, vendor, strict, exact=False)
+    fit = _best_method(attempt, options, strict, exact=False)
     seen = partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
 
@@ -235,11 +232,6 @@ def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Arra
         message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
         warnings.warn(message, BarpcWarning, stacklevel=3)
     return ground, image
-
-
-def underlying_rpc(model: object) -> RPC | None:
-    """Return the RPC under a model: the model itself, or the one inside its corrections."""
-    return inner if isinstance(inner := innermost(model), RPC) else None
 
 
 def innermost(model: object) -> object:
@@ -298,9 +290,7 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
     return fit
 
 
-def _best_method(
-    attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
-) -> RpcFit:
+def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: bool, exact: bool) -> RpcFit:
     """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
@@ -310,8 +300,6 @@ def _best_method(
     fits = [attempt("ridge")]
     if exact and not float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR:
         fits.append(attempt("gauss-newton"))
-    if vendor is not None and all(fit.verdict(options.tolerance) for fit in fits):
-        fits.append(attempt("vendor-denominators"))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))

@@ -273,6 +273,13 @@ def test_records_print_what_differs_from_the_defaults() -> None:
             {"fit": {"space": "images"}},
             r"here \[fit\]: space 'images' is not one of image, ground",
         ),
+        (
+            {"fit": {"method": "minimax"}},
+            r"here \[fit\]: method 'minimax' is not one of auto, [^;]*; removed: it minimised the largest error, "
+            r"`gauss-newton` minimises",
+        ),
+        ({"fit": {"method": "vendor-denominators"}}, "removed: it kept the denominators of .*, `auto` fits them$"),
+        ({"fit": {"method": "minimal"}}, r"'minimal' is not one of auto, ridge, gauss-newton, lcurve-joint$"),
         ({"adjust": {"loss": "tukey"}}, r"here \[adjust\]: loss 'tukey' is not one of .*linear"),
         ({"rpc_formats": ["txt", "doc"]}, r"rpc_formats .*'doc' is not one of txt, "),
         ({"adjust": {"dem_sigma": -1}}, r"here \[adjust\]: dem_sigma must be a number above 0"),
