@@ -199,8 +199,16 @@ def normalization(ground: Array, image: Array, options: FitOptions) -> Normaliza
     offset = tidy(0.5 * (low + high))
     scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
-    found = Normalization(offset, scale, middle, half)
-    return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
+    if options.precision is None:
+        return Normalization(offset, scale, middle, half)
+    limits = PRECISIONS[options.precision]
+    if limits.significant:  # from 1 on a coefficient has a decimal less: half of 1e-6 of 20,000 px is 0.01 px
+        # the largest are those of degree one, above 1 where the box of the ground is wider than the image under it;
+        # curvature (cubic terms of 0.03 turn a slope by 3 / 5 of it) and denominators move them by some per cent
+        rows = np.column_stack([np.ones(len(ground)), (ground - offset) / scale])
+        slopes = np.abs(np.linalg.lstsq(rows, (image - middle) / half)[0]).max(axis=0)
+        half = half * np.maximum(1.05 * slopes, 1.0)
+    return limits.normalization(Normalization(offset, scale, middle, half))
 
 
 def solve(

@@ -273,10 +273,11 @@ class Precision(NamedTuple):
 
     normalization: Callable[[Normalization], Normalization]
     coeffs: Callable[[Array], Array]
+    significant: bool  # a coefficient's digits count from its first one, not from the point
 
 
 PRECISIONS: dict[str, Precision] = {
-    "nitf": Precision(_nitf_normalization, _nitf_coeffs),
-    "rpcm": Precision(_rpcm_normalization, lambda coeffs: np.round(coeffs, 12)),
+    "nitf": Precision(_nitf_normalization, _nitf_coeffs, significant=True),
+    "rpcm": Precision(_rpcm_normalization, lambda coeffs: np.round(coeffs, 12), significant=False),
 }
 """Format -> its digits: the RPC00B record of NITF, and text files with twelve decimals as rpcm writes them."""

@@ -184,6 +184,16 @@ def test_offsets_and_scales_are_the_middle_and_the_half_of_the_points() -> None:
     assert nitf.image_offset.tolist() == [20.0, 20.0]
 
 
+def test_coefficients_of_significant_digits_stay_below_one_where_the_box_is_wider_than_the_image() -> None:
+    """A square image turned by 22.5 degrees: its slope over its box is cos^2 + cos sin = 1.207."""
+    corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1], [0, 0]]) * 20_000.0
+    cos, sin = np.cos(np.pi / 8), np.sin(np.pi / 8)
+    ground = np.column_stack([corners @ [[cos, -sin], [sin, cos]] * 1e-5, [0.0, 0, 0, 0, 500]]) + [5.0, 43.0, 0.0]
+    for precision, least, most in (("nitf", 20_000 * 1.2071, 20_000 * 1.2071 * 1.08), ("rpcm", 20_000, 20_000)):
+        scale = normalization(ground, corners, FitOptions(precision=precision)).image_scale
+        assert least <= scale.min() <= scale.max() <= most, precision
+
+
 def test_what_rpcm_prints_has_twelve_decimals() -> None:
     held = PRECISIONS["rpcm"]
     assert held.coeffs(np.array([1.23456789012345, 4e-13, 6e-13])).tolist() == [1.234567890123, 0.0, 1e-12]
