@@ -64,10 +64,10 @@ class ModeEntry(Record):
     motion_m: tuple[Number, ...] = column(
         "All motions for an error of this one by sigma_m: east, north, up, tilts, turn, scale, twist, bending",
         "m",
-        minItems=7,
-        maxItems=len(MOTIONS),
+        min_length=7,
+        max_length=len(MOTIONS),
     )
-    words: str = column("Its sentence", minLength=1)
+    words: str = column("Its sentence", min_length=1)
 
 
 class DatumEntry(Record):
@@ -135,7 +135,7 @@ class ExplanationEntry(Record):
     PAGE: ClassVar = "sentence gain gap runner_up"
 
     name: str = column("Its kind", enum=[*_EXPLANATION_SENTENCES, FOREIGN_CAMERA])
-    sentence: str = column("The same as a sentence", head="explanation of residuals", minLength=1)
+    sentence: str = column("The same as a sentence", head="explanation of residuals", min_length=1)
     image: str | None = column("View; null where it concerns several")
     gain: float = column("Logarithm of its evidence over that of the model without it", "nats", "gain", ".0f")
     gap: float = column("The same over the runner-up", "nats", "over the next", ".0f")
@@ -176,7 +176,7 @@ class HeldOutEntry(Record):
     PAGE: ClassVar = "sentence count chance"
 
     image: str = column("View")
-    sentence: str = column("The same as a sentence", head="larger residuals of check tie points", minLength=1)
+    sentence: str = column("The same as a sentence", head="larger residuals of check tie points", min_length=1)
     columns: tuple[float, float] | None = column("From, to; null for all", "px")
     rows: tuple[float, float] | None = column("From, to; null for all", "px")
     count: Count = column("Observations tested there", head="tested")
@@ -187,8 +187,6 @@ class HeldOutEntry(Record):
 
 class SceneEntry(Record):
     """The block."""
-
-    MORE: ClassVar = Any  # of earlier releases
 
     shift_enu_m: Vector = column("Mean shift of the tie points, east, north, up", "m")
     sigma_enu_m: Vector = column("Posterior standard deviation of the scene's position", "m")
