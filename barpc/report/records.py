@@ -74,7 +74,7 @@ class Record:
 
     @classmethod
     def read(cls, found: Any) -> Self:
-        """Return the record of a parsed file; keys that it does not know are passed over. ValueError where it is damaged."""
+        """Return the record of a parsed file; keys it does not know are passed over. ValueError where it is damaged."""
         try:
             return msgspec.convert(found, cls)
         except (msgspec.ValidationError, OverflowError) as error:
