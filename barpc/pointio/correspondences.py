@@ -28,12 +28,11 @@ from barpc.pointio.columns import (
     numbers_of,
     vertical_of_column,
 )
-from barpc.pointio.gcp_formats import read_geojson, read_tags
-from barpc.pointio.gcp_table import GcpTable
+from barpc.pointio.gcp_formats import GcpTable, read_geojson, read_tags
 from barpc.pointio.tables import read_table
-from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
+from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.raster import driver_of, open_raster
-from barpc.rasters.vertical import ELLIPSOID, Vertical
+from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of
 from barpc.scene import Altimetry
 
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground

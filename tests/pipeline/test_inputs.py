@@ -14,7 +14,7 @@ from barpc.base.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 
 from .known import errors_at_check_points
 
