@@ -21,8 +21,19 @@ from barpc.base.errors import BarpcError, InputError, listed, plain
 from barpc.base.geodesy import INFERRED, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
-from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA, Names, degrees, guessed, number_of, numbers_of
-from barpc.pointio.tables import Texts, lacking, read_columns, row_of
+from barpc.pointio.tables import (
+    GROUND_SIGMA,
+    IMAGE_SIGMA,
+    Names,
+    Texts,
+    degrees,
+    guessed,
+    lacking,
+    number_of,
+    numbers_of,
+    read_columns,
+    row_of,
+)
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 

@@ -19,10 +19,9 @@ import numpy as np
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
 from barpc.base.safe_io import TABLE, read_head
-from barpc.pointio.columns import TURNS
 from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, GcpTable, open_gcps
 from barpc.pointio.names import ViewNames
-from barpc.pointio.tables import Texts, distinct, index_texts
+from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
 from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of, vertical_of
 from barpc.scene import GroundPoints, IntArray
