@@ -27,7 +27,6 @@ def column(
     *,
     adjusted: bool = False,
     default: Any = MISSING,
-    enum: Sequence[str | None] = (),
     **limits: Any,
 ) -> Any:
     """Return a field of a record with its declaration.
@@ -43,14 +42,14 @@ def column(
     adjusted : bool
         Whether only an adjustment has it: other runs leave its column out.
     default, **limits
-        None for an optional value; those of `msgspec.Meta`: ge, le, min_length, max_length, pattern.
-    enum
-        The texts that it may be.
+        None for an optional value; `enum`, the texts that it may be, and those of `msgspec.Meta`: ge, le, min_length,
+        max_length, pattern.
     """
     end = f" [{unit}]" if unit else ""
     heads = f"{head}{end}" if isinstance(head, str) else tuple(f"{words}{end}" for words in head)
+    enum = limits.pop("enum", None)
     meta = msgspec.Meta(description=f"{text}{end}.", **limits)
-    of_file = {"kind": Literal[*enum] if enum else None, "meta": meta}
+    of_file = {"kind": enum and Literal[*enum], "meta": meta}
     return field(default=default, metadata={**of_file, "column": (heads, form, adjusted)})
 
 
