@@ -49,7 +49,8 @@ def column(
     heads = f"{head}{end}" if isinstance(head, str) else tuple(f"{words}{end}" for words in head)
     enum = limits.pop("enum", None)
     meta = msgspec.Meta(description=f"{text}{end}.", **limits)
-    of_file = {"kind": enum and Literal[*enum], "meta": meta}
+    texts: Any = enum and Literal[*enum]
+    of_file = {"kind": texts | None if enum and default is None else texts, "meta": meta}
     return field(default=default, metadata={**of_file, "column": (heads, form, adjusted)})
 
 

@@ -89,7 +89,7 @@ def test_what_a_file_may_hold_is_what_is_declared():
     for wrong in (
         {"num": 3}, {"num": "3", "part": None}, {"num": True, "part": None}, {"num": 3.5, "part": None}, [], None,
         {"num": 3, "part": {"size": 1.5, "both": [1.0]}}, {"num": 3, "part": {"size": "x"}},
-        {"num": 3, "part": None, "more": [1]}, {"num": 3, "part": {"size": 10**400}},
+        {"num": 3, "part": None, "more": [1]},
         {"num": 3, "part": None, "kind": "c"}, {"num": 3, "part": None, "share": 1.5},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"^[A-Z]"):

@@ -60,7 +60,7 @@ class ModeEntry(Record):
     """A motion of the scene that the images determine poorly."""
 
     sigma_m: Number = column("Posterior standard deviation", "m")
-    meaning: str = column("The motion", enum=list(MODES))
+    meaning: str = column("The motion", enum=MODES)
     motion_m: tuple[Number, ...] = column(
         "All motions for an error of this one by sigma_m: east, north, up, tilts, turn, scale, twist, bending",
         "m",
@@ -73,7 +73,7 @@ class ModeEntry(Record):
 class DatumEntry(Record):
     """Sources of a motion of the scene, as shares of its information. Tie points have none."""
 
-    part: str = column("Motion of the scene", head="motion", enum=list(MODES))
+    part: str = column("Motion of the scene", head="motion", enum=MODES)
     sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "sigma", ".2f")
     cameras: Number = column("Accuracies of the cameras as delivered", head="cameras", form=".0%")
     earlier_run: Number = column("The earlier run", head="earlier run", form=".0%")
@@ -140,7 +140,7 @@ class ExplanationEntry(Record):
     gain: float = column("Logarithm of its evidence over that of the model without it", "nats", "gain", ".0f")
     gap: float = column("The same over the runner-up", "nats", "over the next", ".0f")
     runner_up: str | None = column("Kind of the runner-up; null for none", head="next", default=None)
-    axis: str | None = column("Rows or columns", default=None, enum=[*AXES, None])
+    axis: str | None = column("Rows or columns", default=None, enum=AXES)
     first: Number = column("Its first row or column", "px", default=None)
     last: Number = column("Its last row or column", "px", default=None)
     size_px: Number = column("RMS displacement; of a sinusoid its amplitude", "px", default=None)
@@ -160,7 +160,7 @@ class LeftEntry(Record):
     PAGE: ClassVar = "image axis first last rejected off_px rejected_median_px gain"
 
     image: str = column("View", head="image")
-    axis: str = column("Rows or columns", head="axis", enum=list(AXES))
+    axis: str = column("Rows or columns", head="axis", enum=AXES)
     first: float = column("The first", "px", "first", ".0f")
     last: float = column("The last", "px", "last", ".0f")
     rejected: float = column("Share of their tie points that were rejected", head="rejected", form=".0%")

@@ -274,7 +274,7 @@ class ViewEntry(Record):
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
-    cause: str | None = column("Name of the reservation; null without one", default=None, enum=[*CAUSES, None])
+    cause: str | None = column("Name of the reservation; null without one", default=None, enum=CAUSES)
     num_moving: Count = column("Observations of tie points that move together, which were excluded", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
