@@ -35,7 +35,7 @@ from scipy.interpolate import RectBivariateSpline
 from barpc.base.geodesy import metres_per_unit
 from barpc.pointio.matches import read_matches, write_matches
 from barpc.rpcio import read_rpc
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate

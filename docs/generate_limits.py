@@ -18,7 +18,7 @@ from barpc.base.remote import REQUEST_BYTES, hosts
 from barpc.pointio import names, third_party_matches
 from barpc.rasters import dem, raster
 from barpc.report import runfiles
-from barpc.rpcio import carried
+from barpc.rpcio import images
 from barpc.sensor import document as metadata
 from barpc.sensor import sicd
 from barpc.tie.pairing import area
@@ -84,9 +84,9 @@ def rows() -> list[tuple[str, str]]:
         (safe_io.NAMES.words, f"{size(safe_io.NAMES.most)}, {many(safe_io._MAX_NAME_LENGTH)} characters a line"),
         ("a VRT", size(safe_io.MB)),
         ("a raster read as a DEM or geoid", f"{many(dem._MAX_CELLS)} cells"),
-        ("RPC tags of a TIFF", f"{many(carried._MAX_ENTRIES)} entries, {size(carried.SCANNED)} of values"),
-        ("an RPC in a NITF", f"the first {size(carried.SCANNED)}"),
-        ("a file of acquisition metadata", f"the first {size(carried.SCANNED)}"),
+        ("RPC tags of a TIFF", f"{many(images._MAX_ENTRIES)} entries, {size(images.SCANNED)} of values"),
+        ("an RPC in a NITF", f"the first {size(images.SCANNED)}"),
+        ("a file of acquisition metadata", f"the first {size(images.SCANNED)}"),
         ("a run's state", f"{size(safe_io.MAX_XML)}; larger ones count as missing"),
         (
             "a file of a web server or store",

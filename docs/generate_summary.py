@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from barpc.report.records import Record
 from barpc.report.summary import Summary
@@ -25,8 +26,8 @@ type: a number or null; `*` behind a name: it may be missing. Records have headi
 relative to the run folder. The same as a [JSON schema](summary.schema.json).
 """
 
-WORDS = {"string": "text", "boolean": "true/false", "object": "record", "array": "list"}
-"""Types of JSON in the words of the page, where it has shorter ones."""
+WORDS = {str: "text", bool: "true/false", int: "integer", float: "number", Mapping: "record"}
+"""Types of Python in the words of the page."""
 
 
 def parts_of(record: type[Record], name: str = "") -> Iterator[tuple[str, type[Record]]]:
@@ -41,15 +42,16 @@ def parts_of(record: type[Record], name: str = "") -> Iterator[tuple[str, type[R
                 yield from parts_of(kind, f"{name}.{field.name}{many}".lstrip("."))
 
 
-def in_words(part: Mapping[str, Any]) -> str:
-    """Return a type in as few characters as tell it."""
-    if "enum" in part:
-        return "/".join(f"`{value}`" for value in part["enum"] if value is not None)
-    kinds = part["type"] if isinstance(part["type"], list) else [part["type"]]
-    words = [WORDS.get(kind, kind) for kind in kinds if kind != "null"]
-    if "maxItems" in part:
-        words = [f"{part['minItems']} values"]
-    return " or ".join(words) + ("?" if "null" in kinds else "")
+def in_words(kind: Any) -> str:
+    """Return a type in as few characters as tell it; `?`: or null."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return "/".join(f"`{value}`" for value in parts if value is not None)
+    if origin in (Union, UnionType):
+        return " or ".join(in_words(part) for part in parts if part is not NoneType) + "?" * (NoneType in parts)
+    if origin is tuple:
+        return "list" if parts[-1] is ... else f"{len(parts)} values"
+    return "record" if isinstance(kind, type) and issubclass(kind, Record) else WORDS[origin or kind]
 
 
 def page() -> str:
@@ -59,13 +61,13 @@ def page() -> str:
         places.setdefault(record, []).append(name)
     lines = [HEAD]
     for record, names in places.items():
-        schema = record.json_schema()
         lines += ["## " + (", ".join(f"`{name}`" for name in names if name) or "The file"), ""]
         lines += [record.__doc__ or "", ""]
-        for key, part in schema["properties"].items():
-            star = "" if key in schema["required"] else r"\*"
-            kind = "" if (words := in_words(part)) == "number?" else f" ({words})"
-            lines.append(f"- `{key}`{star}{kind}: {part['description']}")
+        hints = get_type_hints(record)
+        for one in fields(record):
+            star = "" if one.default is MISSING else r"\*"
+            kind = "" if (words := in_words(one.metadata["kind"] or hints[one.name])) == "number?" else f" ({words})"
+            lines.append(f"- `{one.name}`{star}{kind}: {one.metadata['meta'].description}")
         lines.append("")
     return "\n".join(lines)
 

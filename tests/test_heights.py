@@ -13,7 +13,8 @@ from rasterio import Affine
 
 from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import ControlReference, read_gcps
-from barpc.rasters.dem import Dem, HeightGrid, geoid_file
+from barpc.rasters.dem import Dem, HeightGrid
+from barpc.rasters.vertical import geoid_file
 
 LON, LAT, ALT = 5.4, 43.3, 251.37  # m above the ellipsoid
 N = float(HeightGrid.open(geoid_file("egm96")).sample(LON, LAT))

@@ -199,11 +199,6 @@ class Adjustment:
         return tuple(found)
 
     @property
-    def scene_shift(self) -> Array:
-        """Mean move of the points, east, north, up (3,) [m]."""
-        return self.gauge.shift
-
-    @property
     def observations(self) -> IntArray:
         """Observations kept, of every view (N,)."""
         return np.bincount(self.view[self.inlier], minlength=len(self.names))

@@ -222,6 +222,3 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any
     """Return a member whose header was looked at."""
     with archive.open(member) as file:
         return np.asarray(npy.read_array(file, allow_pickle=False))
-
-
-# --- files that are written whole or not at all -----------------------------------------------------------

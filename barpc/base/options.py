@@ -10,7 +10,7 @@ import math
 import os
 import re
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from importlib import import_module
@@ -55,6 +55,7 @@ class Rule:
     below: float | None = None  # not reached
     rows: str = ""  # the table whose keys are the values allowed, as module and name
     hook: bool = False  # or `module:name`, of a user's own
+    removed: Mapping[str, str] = field(default_factory=dict)  # value of earlier releases -> what it was, what to use
     cli_only: bool = False  # given on the command line or in Python: no options file may set it
 
     def holds(self, number: float) -> bool:
@@ -170,7 +171,8 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
         found = value
     elif choices := rule.choices(kind):
         if type(value) not in (str, int) or value not in choices:
-            raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}")
+            why = rule.removed.get(str(value))
+            raise InputError(f"{name} {value!r} is not {wanted(kind, rule)}" + (f"; removed: {why}" if why else ""))
         found = value
     else:
         found = _as_type(kind, rule, value)
@@ -376,12 +378,15 @@ class AdjustOptions(Options):
 class FitOptions(Options):
     """Options of fitting an RPC to a sensor model or to points."""
 
-    method: Literal["auto", "ridge", "gauss-newton", "minimax", "lcurve-joint", "vendor-denominators"] = option(
+    method: Literal["auto", "ridge", "gauss-newton", "lcurve-joint"] = option(
         "auto",
         """`ridge`: QR compression and a noise-scaled ridge. `lcurve-joint`: the paper's solver, one h for col and
-        row (78 unknowns). `gauss-newton`: the least squares of the error
-        itself, for models without noise; `minimax`: the least largest error instead. `vendor-denominators`: numerators
-        only. `auto`: `ridge`, and another one where the certificate says that it is better.""",
+        row (78 unknowns). `gauss-newton`: the least squares of the error itself, for models without noise. `auto`:
+        `ridge`, and `gauss-newton` where the certificate says that it is better.""",
+        removed={
+            "minimax": "it minimised the largest error, `gauss-newton` minimises the RMSE",
+            "vendor-denominators": "it kept the denominators of the RPC under a model, `auto` fits them",
+        },
     )
     grid: tuple[int, int, int] = option(
         (12, 12, 7), "Control points along col (or lon), row (or lat) and altitude.", least=4
@@ -658,50 +663,36 @@ def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, A
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
-    """Return the JSON schema (draft 7) of a record, as an options file spells it."""
-    properties = {}
+    """Return the JSON schema (2020-12) of a record, as an options file spells it."""
+    import msgspec
+
+    return msgspec.json.schema(_spelled(record))
+
+
+def _spelled(record: type[Options]) -> Any:
+    """Return the type of a record's table in an options file."""
+    from msgspec import UNSET, Meta, UnsetType, defstruct
+
+    rows: list[Any] = []
     for name, one in declared(record).items():
+        rule, kind = one.rule, one.kind
+        if rule.cli_only:
+            continue
         if isinstance(one.default, Options):
-            properties[name] = schema(type(one.default))
-        elif not one.rule.cli_only:
-            properties[name] = {**schema_of(one.kind, one.rule), "description": one.rule.help}
-            if one.default is not None:
-                listed = isinstance(one.default, tuple)
-                properties[name]["default"] = list(one.default) if listed else one.default
-    return {"type": "object", "additionalProperties": False, "properties": properties}
-
-
-_TYPE_NAMES = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
-
-
-def schema_of(kind: Any, rule: Rule = _FREE) -> dict[str, Any]:
-    """Return the JSON schema of a type, its values within the bounds of a rule."""
-    origin, parts = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return {**schema_of(parts[0], rule), **parts[1]}
-    if origin is Mapping:
-        return {"type": "object", "additionalProperties": schema_of(parts[1], rule)}
-    if origin is tuple:
-        count = {} if parts[-1] is ... else {"minItems": len(parts), "maxItems": len(parts)}
-        return {"type": "array", **count, "items": schema_of(parts[0], rule)}
-    if choices := rule.choices(kind):
-        return {"enum": list(choices)}
-    if origin is not None:
-        return _either([schema_of(part, rule) for part in parts])
-    if (of_record := getattr(kind, "json_schema", None)) is not None:
-        return dict(of_record())
-    ends = {"minimum": rule.least, "exclusiveMinimum": rule.above}
-    ends |= {"maximum": rule.most, "exclusiveMaximum": rule.below}
-    bounds = {word: value for word, value in ends.items() if value is not None}
-    return {} if kind is Any else {"type": _TYPE_NAMES[kind], **bounds}
-
-
-def _either(schemas: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    simple: list[Any] = [schema["type"] for schema in schemas if schema.keys() == {"type"}]
-    rest = [schema for schema in schemas if schema.keys() != {"type"}]
-    if len(rest) > 1:
-        return {"anyOf": [{"type": simple}, *rest]}  # the usual first
-    return {**rest[0], "type": [rest[0]["type"], *simple]} if rest else {"type": simple}
+            rows.append((name, _spelled(type(one.default)), {}))
+            continue
+        origin, parts = get_origin(kind), get_args(kind)
+        item = parts[0] if origin is tuple else kind
+        if item in (int, float):
+            ends: Any = {"ge": rule.least, "gt": rule.above, "le": rule.most, "lt": rule.below}
+            limited: Any = Annotated[item, Meta(**ends)]
+        else:
+            limited = Literal[rule.choices(item)] if rule.choices(item) else item
+        if origin is tuple:
+            limited = origin[tuple(... if part is ... else limited for part in parts)]
+        default = UNSET if one.default is None else one.default  # TOML has no null
+        rows.append((name, Annotated[limited | UnsetType, Meta(description=rule.help)], default))
+    return defstruct(record.__name__, rows, forbid_unknown_fields=True)
 
 
 def _documented(record: type[Options]) -> str:

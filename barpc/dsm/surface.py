@@ -34,8 +34,8 @@ from barpc.base.geodesy import Array, utm
 from barpc.base.options import DsmOptions
 from barpc.base.safe_io import plain_path
 from barpc.cameras import open_camera
-from barpc.dsm.consensus import F32
 from barpc.dsm.stereo import (
+    F32,
     MATCHED,
     TILE_NODES,
     Groups,

@@ -211,8 +211,6 @@ class RpcFit:
                 f"row {self.rmse_ckp[1]:.3g}), wanted {tolerance:g}: "
                 + (f"{self.reason}" if self.reason else "fit a smaller altitude range or a smaller image")
                 + ", or raise the tolerance"
-                + ", or fit by the method minimax"
-                * (self.method == "gauss-newton" and bool(self.rmse_ckp.max() <= tolerance))
             )
         if not self.min_denominator > 0:
             return "the RPC has a pole near the scene: use more control points, or a smaller pole_margin"

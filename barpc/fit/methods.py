@@ -8,9 +8,6 @@ noise, hence no penalty; noisy points cannot drive a denominator to zero. sigma 
 coefficients now give in place of y, and damped towards them. No penalty: for models without noise, whose misfit a ridge
 takes for noise. Denominators stay above a tenth over the hull of the points and a margin (`barpc.fit.poles`).
 
-``minimax``: from there on the least largest error, by least squares whose weights grow with the errors (Lawson,
-"Contributions to the theory of linear least maximum approximation", 1961).
-
 ``lcurve-joint``, the paper's solver (Akiki et al. 2021, section 3): one h from the corner of the L-curve, then weighted
 and ICCV iterations. All unknowns are penalised alike, as in the paper; its singular value decompositions are taken of
 the compressed system, which has the same singular values.
@@ -19,13 +16,13 @@ the compressed system, which has the same singular values.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import Array, wrap_longitude
+from barpc.base.geodesy import Array
 from barpc.base.options import FitOptions
 from barpc.fit.points import column_ranges
 from barpc.fit.poles import Region, bounded
@@ -53,7 +50,6 @@ WEIGHTED = 1
 RMSE_TOLERANCE = 1e-10
 """Change of the RMSE [px] at which the iterations stop."""
 _DAMPED = 1e-6  # of the size of a column, at first
-_POWER = 1.5  # of the errors that weights grow with, and 20 rounds: 0.94 px for 1.21 at 89.9 N, 60 rounds 0.89
 _MIN_STEP_GAIN = 1e-3  # of the sum of squares: less in a step, and it stands
 _NEGLIGIBLE_DENOMINATOR = 0.05  # a denominator within 1 -/+ this weights nothing
 
@@ -171,12 +167,11 @@ class FitSolution:
         problem = self.problem
         # from the rows of (M | y) to the unknowns' standard deviations (k, n)
         inverses = [np.asarray(np.linalg.pinv(system.matrix)) for system in self.solved]
-        free = [len(inverse) > len(problem.active) for inverse in inverses]
-        rows = [problem.rows(axis, self.coeffs[2 * axis + 1], free[axis]) for axis in range(2)]
+        rows = [problem.rows(axis, self.coeffs[2 * axis + 1]) for axis in range(2)]
         for both in zip(*rows, strict=True):
             residual = np.empty((len(both[0][1]), 2))
             for axis, (part, block) in enumerate(both):
-                x = problem.packed(self.coeffs[2 * axis : 2 * axis + 2])[: len(inverses[axis])]
+                x = problem.packed(self.coeffs[2 * axis : 2 * axis + 2])
                 spread = block[:, :-1] @ inverses[axis]
                 leverage = np.einsum("ij,ij->i", spread, spread)
                 residual[:, axis] = (block[:, :-1] @ x - block[:, -1]) * problem.norm.image_scale[axis]
@@ -198,20 +193,22 @@ def tidy(values: Array) -> Array:
     return np.array([float(f"{value:.12g}") for value in values])
 
 
-def normalization(ground: Array, image: Array, options: FitOptions, vendor: RPC | None = None) -> Normalization:
-    """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision.
-
-    Those of the ground are the vendor's where one is given.
-    """
+def normalization(ground: Array, image: Array, options: FitOptions) -> Normalization:
+    """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision."""
     (low, high), (left, right) = column_ranges(ground), column_ranges(image)
-    if vendor is not None:
-        offset, scale = vendor.ground_offset, vendor.ground_scale
-    else:
-        offset = tidy(0.5 * (low + high))
-        scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
+    offset = tidy(0.5 * (low + high))
+    scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
-    found = Normalization(offset, scale, middle, half)
-    return found if options.precision is None else PRECISIONS[options.precision].normalization(found)
+    if options.precision is None:
+        return Normalization(offset, scale, middle, half)
+    limits = PRECISIONS[options.precision]
+    if limits.significant:  # from 1 on a coefficient has a decimal less: half of 1e-6 of 20,000 px is 0.01 px
+        # the largest are those of degree one, above 1 where the box of the ground is wider than the image under it;
+        # curvature (cubic terms of 0.03 turn a slope by 3 / 5 of it) and denominators move them by some per cent
+        rows = np.column_stack([np.ones(len(ground)), (ground - offset) / scale])
+        slopes = np.abs(np.linalg.lstsq(rows, (image - middle) / half)[0]).max(axis=0)
+        half = half * np.maximum(1.05 * slopes, 1.0)
+    return limits.normalization(Normalization(offset, scale, middle, half))
 
 
 def solve(
@@ -221,37 +218,31 @@ def solve(
     method: str,
     *,
     weight: Array | None = None,
-    vendor: RPC | None = None,
 ) -> FitSolution:
     """Fit the coefficients of an RPC to points (N, 3) lon (continuous), lat [deg], alt [m] and (N, 2) [px].
 
-    `method` is a row of `METHODS`, weights (N,) are 1 / standard deviation, `vendor` is whose denominators
-    "vendor-denominators" keeps. FitError: too few points, or points that do not determine the coefficients.
+    `method` is a row of `METHODS`, weights (N,) are 1 / standard deviation. FitError: too few points, or points that do
+    not determine the coefficients.
     """
-    keeps = method == "vendor-denominators"
-    if keeps and vendor is None:
-        raise FitError(f"{method}: the model is not built on an RPC whose denominators could be kept")
-    norm = normalization(ground, image, options, vendor if keeps else None)
-    if keeps:  # its offset may lie a whole turn away
-        ground = np.column_stack([wrap_longitude(ground[:, 0], norm.ground_offset[0]), ground[:, 1:]])
+    norm = normalization(ground, image, options)
     problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
-    unknowns = len(problem.active) * (1 if keeps else 2) - (0 if keeps else 1)
+    unknowns = 2 * len(problem.active) - 1
     if len(ground) <= unknowns:
         raise FitError(
             f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
             f"give {unknowns + 1} points or more"
         )
-    return solve_problem(problem, options, method, vendor)
+    return solve_problem(problem, options, method)
 
 
-def solve_problem(problem: FitProblem, options: FitOptions, method: str, vendor: RPC | None = None) -> FitSolution:
+def solve_problem(problem: FitProblem, options: FitOptions, method: str) -> FitSolution:
     """Return the solution of a problem by a method, its numbers rounded to the options' precision."""
     quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
-    coeffs, systems, h, passes = METHODS[method](problem, quantize, vendor)
+    coeffs, systems, h, passes = METHODS[method](problem, quantize)
     return FitSolution(coeffs, problem, systems, h, passes, method)
 
 
-def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
+def _ridge(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
     solved, h, passes = [], np.zeros(2), 1
     expected = expected_size(problem.active)
     for axis in range(2):
@@ -267,8 +258,8 @@ def _ridge(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -
     return _solved_coefficients(problem, solved, quantize), solved, h, passes
 
 
-def _gauss_newton_fit(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
-    start, _, _, passes = _ridge(problem, None, vendor)
+def _gauss_newton_fit(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
+    start, _, _, passes = _ridge(problem, None)
     parts, solved, region = [], [], region_of(problem)
     for axis in range(2):
         part = start[2 * axis : 2 * axis + 2]
@@ -319,25 +310,7 @@ def _ahead(
     return x
 
 
-def _minimax(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
-    coeffs, solved, h, passes = _gauss_newton_fit(problem, None, vendor)
-    given, parts, region = 1.0 if problem.weight is None else problem.weight, [], region_of(problem)
-    for axis in range(2):
-        x, least, weight = (problem.packed(coeffs[2 * axis : 2 * axis + 2]), np.inf, np.ones(len(problem.image)))
-        for _ in range(MAX_PASSES):
-            errors = problem.errors(axis, x)
-            if errors.max() < least:
-                least, best = float(errors.max()), x
-            weight *= errors**_POWER  # Lawson's
-            weight /= weight.mean()
-            heavy = replace(problem, weight=given * np.sqrt(weight), first=None)
-            x, solved[axis], steps = _minimised(heavy, axis, x, region)
-            passes += steps
-        parts.append(problem.expanded(best if quantize is None else solution(solved[axis].solved_by(best), quantize)))
-    return np.concatenate(parts), solved, h, passes
-
-
-def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
+def _lcurve(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
     coeffs, solved, h, passes = solve_lcurve(problem)
     return (
         coeffs if quantize is None else _solved_coefficients(problem, solved, quantize),
@@ -347,27 +320,9 @@ def _lcurve(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) 
     )
 
 
-def _vendor_denominators(problem: FitProblem, quantize: Rounding | None, vendor: RPC | None) -> SolverResult:
-    assert vendor is not None
-    parts, solved = [], []
-    for axis, denominator in enumerate(vendor.coeffs[1::2]):
-        denominator = denominator / denominator[0]
-        if quantize is not None:
-            denominator = quantize(denominator)
-        raw = problem.compressed(axis, denominator, free=False)
-        system, _ = noise_scaled(raw, expected_size(problem.active)[: len(raw.matrix)])
-        parts.append(problem.expanded(solution(system, quantize), denominator))
-        solved.append(system)
-    return np.concatenate(parts), solved, np.zeros(2), 1
-
-
-METHODS: dict[str, Callable[[FitProblem, Rounding | None, RPC | None], SolverResult]] = {
+METHODS: dict[str, Callable[[FitProblem, Rounding | None], SolverResult]] = {
     "ridge": _ridge,
     "gauss-newton": _gauss_newton_fit,
-    "minimax": _minimax,
     "lcurve-joint": _lcurve,
-    "vendor-denominators": _vendor_denominators,
 }
-"""Name -> solver of a problem; ``vendor-denominators`` keeps those of the vendor's RPC."""
-BOUNDED = ("gauss-newton", "minimax")
-"""Methods that keep denominators up, and take scattered points."""
+"""Name -> solver of a problem."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import BarpcWarning, FitError
-from barpc.base.geodesy import CHUNK, Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import CHUNK, WGS84_A, Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.axes import wrong_axes, wrong_axes_of_grid
 from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
-from barpc.fit.methods import BOUNDED, FitSolution, solve, solve_problem
+from barpc.fit.methods import FitSolution, solve, solve_problem
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
     Errors,
@@ -28,6 +27,7 @@ from barpc.fit.points import (
 )
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
+from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -71,21 +71,22 @@ def fit_rpc(
     -----
     BarpcWarning : part of the image has no ground point
     """
-    options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
+    options, alt_range = options or FitOptions(), widened(alt_range)
     sample = _check_sample(model, size, alt_range)
     screened(sample.ground, sample.points[:, :2])
     contradiction = sample.contradiction()
-    axes = "" if vendor is not None else wrong_axes(model, size, alt_range)  # an RPC's lines of sight are cubics' own
+    # the lines of sight of an RPC are cubics' own
+    axes = "" if isinstance(innermost(model), RPC) else wrong_axes(model, size, alt_range)
     given, seen = partial(_points_for_method, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
-        solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method, vendor=vendor)
+        solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         errors = sample.errors(solution.rpc)
         return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
-        fit = _best_method(attempt, options, vendor, False, exact=True)
+        fit = _best_method(attempt, options, False, exact=True)
         if isinstance(model, Splined | Calibrated):
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
@@ -99,12 +100,10 @@ def fit_rpc(
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
 
 
-def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], method: str) -> RPC:
-    """Return the RPC of a sensor model by one method, without a certificate: the caller measures its misfit."""
-    options, alt_range = FitOptions(), widened(alt_range)
-    return solve(
-        *_points_for_method(model, size, alt_range, options, method), options, method, vendor=underlying_rpc(model)
-    ).rpc
+def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> RPC:
+    """Return the RPC of a sensor model by ``ridge``, without a certificate: the caller measures its misfit."""
+    options = FitOptions()
+    return solve(*_points_for_method(model, size, widened(alt_range), options, "ridge"), options, "ridge").rpc
 
 
 def _check_sample(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
@@ -134,7 +133,7 @@ def _points_for_method(
     model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, method: str
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
-    if method in BOUNDED:  # what an RPC cannot follow has any frequency: scattered points alias none
+    if method == "gauss-newton":  # what an RPC cannot follow has any frequency: scattered points alias none
         scattered = Sample.of(model, size, alt_range, _SCATTERED_CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
@@ -154,7 +153,6 @@ def fit_rpc_points(
     sigma: npt.ArrayLike | None = None,
     check: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
     size: tuple[int, int] | None = None,
-    vendor: RPC | None = None,
     options: FitOptions | None = None,
     strict: bool = True,
 ) -> RpcFit:
@@ -168,7 +166,6 @@ def fit_rpc_points(
     check : (ground, image), optional
         Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
     size : (width, height), optional, image whose coverage is stated [px]; else the points' own extent
-    vendor : RPC, optional, whose denominators may be kept
     options : FitOptions, optional
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
     strict : bool, as for `fit_rpc`
@@ -188,7 +185,7 @@ def fit_rpc_points(
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, weight=weight, vendor=vendor)
+        solution = solve(cnp, cnp_image, options, method, weight=weight)
         errors = Errors()
         if held_out is not None:
             errors.add(solution.rpc.project(held_out[0]) - held_out[1])
@@ -196,10 +193,10 @@ def fit_rpc_points(
             errors.add(residual)
         loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
         fit = _certified(solution, errors, errors.largest, loop, size)
-        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None and vendor is None else fit.rpc
+        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None else fit.rpc
         return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
 
-    fit = _best_method(attempt, options, vendor, strict, exact=False)
+    fit = _best_method(attempt, options, strict, exact=False)
     seen = partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
 
@@ -235,11 +232,6 @@ def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Arra
         message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
         warnings.warn(message, BarpcWarning, stacklevel=3)
     return ground, image
-
-
-def underlying_rpc(model: object) -> RPC | None:
-    """Return the RPC under a model: the model itself, or the one inside its corrections."""
-    return inner if isinstance(inner := innermost(model), RPC) else None
 
 
 def innermost(model: object) -> object:
@@ -298,9 +290,7 @@ def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
     return fit
 
 
-def _best_method(
-    attempt: Callable[[str], RpcFit], options: FitOptions, vendor: RPC | None, strict: bool, exact: bool
-) -> RpcFit:
+def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: bool, exact: bool) -> RpcFit:
     """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
@@ -310,8 +300,6 @@ def _best_method(
     fits = [attempt("ridge")]
     if exact and not float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR:
         fits.append(attempt("gauss-newton"))
-    if vendor is not None and all(fit.verdict(options.tolerance) for fit in fits):
-        fits.append(attempt("vendor-denominators"))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
         (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
@@ -386,3 +374,105 @@ def _localised(
     if strict and (wrong := certificate.verdict(options.tolerance)):
         raise FitError(wrong)
     return replace(fit, rpc=rpc, localisation=certificate)
+
+
+# --- axes of a model ------------------------------------------------------------------------------------
+#
+# By its lines of sight. A mirrored image tells nothing: detectors are numbered to the left of the flight or to the
+# right. But the lines of sight of a row of an optical image meet where the camera stood, or those of a column, and a
+# radar's row lies in a plane, that of its beam. On a round Earth both hold in the right order and with the right sign
+# only. A camera stands above.
+
+
+_POINT, _PLANE = 100.0, 1e4
+"""Times that another reading is better before it is accepted. Errors of a model are common to all its readings: of 160
+honest models none was better by more than 2.2 in a wrong one; one over a flat Earth may be by tens, its planes by 2000.
+Of models with axes exchanged or upside down physical ones were better by 320 and more, the planes of radars by 5e6."""
+_FLAT_CONVERGENCE = (
+    2.0 / WGS84_A
+)  # 1/m: of the distance of a camera; verticals meet at the Earth's centre, -1 / WGS84_A
+_ECEF_ROUNDING = 1e-8  # m: of places in ECEF, and of what iterations leave
+_MIN_NODES = 5  # nodes along a line: of few lines of sight any two or three meet
+_LINE_POSITIONS, _POINT_POSITIONS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 0.98, 9)  # of the image's sides
+
+
+def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
+    """Return the fault in the ground axes of a model over an image of `size` and altitudes [m], in words; or empty.
+
+    Exchanged longitude and latitude, or altitudes that grow downwards; of models with a noise of some 1e-3 px, of
+    places where both orders are about the same (lon = lat = 0) and lines of sight of neither kind nothing is said.
+    """
+    rows = np.stack(np.meshgrid(_POINT_POSITIONS, _LINE_POSITIONS), axis=-1)
+    places = np.stack([rows, rows[..., ::-1]]) * size - 0.5
+    image = np.repeat(places[..., None, :], 2, axis=-2)
+    alt = np.broadcast_to(alt_range, image.shape[:-1])
+    ground = model.localize(image, alt)
+    return _geometry_fault(np.concatenate([ground[..., :2], alt[..., None]], axis=-1))  # whatever altitude it gave back
+
+
+def wrong_axes_of_grid(ground: Array, image: Array) -> str:
+    """Return the same of points (N, 3), (N, 2) that are all the nodes of a grid; of others nothing is said."""
+    values = (ground[:, 2], image[:, 1], image[:, 0])
+    axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
+    shape = tuple(len(axis) for axis in axes)
+    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _MIN_NODES:
+        return ""
+    nodes = np.full((*shape, 3), np.nan)
+    nodes[places] = ground
+    nodes = np.moveaxis(nodes[[0, -1]], 0, 2)  # rows, columns, low and high
+    picked = [
+        [(part * (side - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in shape[1:]
+    ]
+    (row, rows), (col, cols) = picked
+    return _geometry_fault(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
+
+
+def _geometry_fault(ground: Array) -> str:
+    """Return the fault of ground points (2, lines, points, 2, 3) of rows and of columns, at two altitudes."""
+    point, plane, _ = _sights(ground)
+    for what, other in _interpretations(ground):
+        at, within, near = _sights(other)
+        if near > _FLAT_CONVERGENCE and (point > _POINT * at or plane > _PLANE * within):
+            return f"the model's lines of sight are those of a camera only {what}: give lon, lat [deg], alt [m], up"
+    return ""
+
+
+def _interpretations(ground: Array) -> Iterator[tuple[str, Array]]:
+    """Yield alternative axes, in words and as ground points, the lower altitude first."""
+    yield "with the altitude's sign changed", ground[..., ::-1, :] * [1.0, 1.0, -1.0]
+    if np.nanmax(np.abs(ground[..., 0]), initial=0.0) < 90.0:
+        yield "with longitude and latitude exchanged", ground[..., [1, 0, 2]]
+
+
+def _sights(ground: Array) -> tuple[float, float, float]:
+    """Return how far lines of sight are from a point and a plane, of rows or columns, whichever are nearer.
+
+    Of ground points (2, lines, points, 2, 3) at two altitudes: root mean square angles [rad], thickness over length,
+    and the largest 1 / distance of the point [1/m], above positive; NaN where no line is all on the ground.
+    """
+    known = [np.array([_bundle(ecef_from_ground(one)) for one in lines if np.isfinite(one).all()]) for lines in ground]
+    known = [bundles for bundles in known if len(bundles)]
+    if not known:
+        return np.nan, np.nan, np.nan
+    point, plane = np.min([np.sqrt((bundles[:, :2] ** 2).mean(axis=0)) for bundles in known], axis=0).tolist()
+    return point, plane, max(float(bundles[:, 2].mean()) for bundles in known)
+
+
+def _bundle(ecef: Array) -> tuple[float, float, float]:
+    """Return how far lines through points (n, 2, 3) [m] are from a point and a plane, and 1 / distance of the point.
+
+    A line through o with the slope t across the mean direction m passes the point at the distance h along m where
+    o + h t is one for all: (o - (o m) (m + t)) / h - g = -t, linear in 1 / h and g.
+    """
+    ecef = ecef - ecef.mean(axis=(0, 1))
+    sight = ecef[:, 1] - ecef[:, 0]
+    mean = sight.sum(axis=0) / np.linalg.norm(sight.sum(axis=0))
+    slope, depth = sight / (sight @ mean)[:, None] - mean, (ecef[:, 0] @ mean)[:, None]
+    across = ecef[:, 0] - depth * (mean + slope)
+    width = np.abs(across).max() or 1.0
+    system = np.column_stack([across.ravel() / width, np.tile(np.eye(3), (len(ecef), 1))])
+    found = np.linalg.lstsq(system, -slope.ravel(), rcond=None)[0]
+    off, rounding = system @ found + slope.ravel(), _ECEF_ROUNDING / np.linalg.norm(sight, axis=1).min()
+    spread = np.linalg.svd(ecef.reshape(-1, 3), compute_uv=False)
+    thickness = (spread[2] + _ECEF_ROUNDING) / spread[0]
+    return float(np.sqrt((off**2).mean()) + rounding), float(thickness), float(found[0] / width)

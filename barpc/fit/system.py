@@ -196,11 +196,6 @@ class FitProblem:
             out[1, 0], out[1, self.active[1:]] = 1.0, solution[m:]
         return out
 
-    def errors(self, axis: int, x: Array) -> Array:
-        """Return the residuals (N,) of a coordinate under a solution, in units of the image scale."""
-        rows = self.rows(axis, self.expanded(x)[-1])
-        return np.concatenate([np.abs(block[:, :-1] @ x - block[:, -1]) for _, block in rows])
-
     def packed(self, expanded: Array) -> Array:
         """Return the solution (k,) of which `expanded` makes these numerators and denominator."""
         return np.concatenate([expanded[0, self.active], expanded[1, self.active[1:]]])
@@ -278,10 +273,11 @@ class Precision(NamedTuple):
 
     normalization: Callable[[Normalization], Normalization]
     coeffs: Callable[[Array], Array]
+    significant: bool  # a coefficient's digits count from its first one, not from the point
 
 
 PRECISIONS: dict[str, Precision] = {
-    "nitf": Precision(_nitf_normalization, _nitf_coeffs),
-    "rpcm": Precision(_rpcm_normalization, lambda coeffs: np.round(coeffs, 12)),
+    "nitf": Precision(_nitf_normalization, _nitf_coeffs, significant=True),
+    "rpcm": Precision(_rpcm_normalization, lambda coeffs: np.round(coeffs, 12), significant=False),
 }
 """Format -> its digits: the RPC00B record of NITF, and text files with twelve decimals as rpcm writes them."""

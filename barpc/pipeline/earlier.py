@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import shapely
 
@@ -92,7 +93,7 @@ class Earlier:
             rows = parse_json(read_text(table, GEOJSON), GEOJSON.values)["images"]
             images = {row["name"]: _parse_known(row, Homes.of(folder)) for row in rows}
             return cls(folder, tuple(images[name] for name in prior.names), prior)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (msgspec.ValidationError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(f"{table}: damaged ({plain(error)}); run the adjustment again") from error
 
     @cached_property
@@ -177,17 +178,13 @@ def refuse_edited(folder: Path, files: Sequence[Path]) -> None:
 
 
 def _parse_known(row: Mapping[str, Any], homes: Homes) -> Known:
-    choices = row["choices"]
+    known = msgspec.convert(row, Known)
+    if min(known.size) < 1:
+        raise ValueError(f"{known.name}: no size")
+    choices = known.choices
     if choices is not None and "camera" in choices:
         choices = {**choices, "camera": homes.located(choices["camera"])}
-    ring = np.array(row["outline"], dtype=np.float64).reshape(-1, 2)
-    if not (np.isfinite(ring).all() and len(row["size"]) == 2 and min(row["size"]) > 0):
-        raise ValueError(f"{row['name']}: no outline, or no size")
-    outline = tuple((lon, lat) for lon, lat in ring.tolist())
-    texts = (str(row.get(key, "")) for key in ("sha256", "camera_sha256", "calibration"))
-    size = (int(row["size"][0]), int(row["size"][1]))
-    path = homes.located(str(row["path"]))
-    return Known(str(row["name"]), path, choices, size, float(row["altitude"]), outline, int(row["bytes"]), *texts)
+    return replace(known, path=homes.located(known.path), choices=choices)
 
 
 def _outline_centre(outline: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.verify_outputs import verify_grid
 from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
-from barpc.sensor import SensorModel
+from barpc.sensor import Behind, SensorModel
 from barpc.sensor.csm import STATE_END as STATE
 from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
@@ -167,15 +167,15 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
 def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
     """Return an RPC and its correction grid, and the errors of both together against the camera of a sample.
 
-    The correction of `rpc` may depend on the altitude, where its denominators absorb errors along the rows. Then an RPC
-    with a larger misfit and its grid are better together: the best of three methods is returned.
+    The correction of `rpc` may depend on the altitude, where its denominators absorb errors along the rows. Then that
+    of the camera without its displacements in the image and their grid are better together: the better is returned.
     """
     model, size, alts = sample.model, sample.size, sample.alt_range
     found: list[tuple[float, float, Array, RPC, CorrectionGrid]] = []
     failed: BarpcError | None = None
-    for method in (None, "vendor-denominators", "ridge"):
+    for given in (rpc, None):
         try:
-            one = rpc if method is None else fit_only(model, size, alts, method)
+            one = given or fit_only(_undisplaced(model), size, alts)
             lacking = CorrectionGrid.between(one, model, size, float(np.mean(alts)))
         except (RpcError, FitError) as error:
             failed = error
@@ -189,6 +189,14 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
     # the largest error is at a step, if there is one
     rms, largest, where, best, lacking = min(found, key=lambda row: row[0])
     return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
+
+
+def _undisplaced(model: Any) -> Any:
+    """Return a camera without the displacements of its image points, whatever stands in front of them."""
+    if not isinstance(model, Behind):
+        return model
+    plain = _undisplaced(model.sensor)
+    return plain if isinstance(model, Displaced) else replace(model, sensor=plain)
 
 
 def _largest_miss(sample: Sample, camera: SensorModel) -> Miss:

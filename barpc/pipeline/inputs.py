@@ -24,9 +24,9 @@ from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
-from barpc.rasters.dem import Dem, geoid_file
+from barpc.rasters.dem import Dem
 from barpc.rasters.raster import hashed
-from barpc.rasters.vertical import ELLIPSOIDAL, NO_GEOID
+from barpc.rasters.vertical import ELLIPSOIDAL, NO_GEOID, geoid_file
 from barpc.report import Run
 from barpc.report.runfiles import table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View

@@ -17,7 +17,8 @@ from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, TABLE, Kind, read_head
-from barpc.pointio.columns import (
+from barpc.pointio.gcp_formats import GcpTable, read_geojson, read_tags
+from barpc.pointio.tables import (
     COLUMNS,
     GROUND_SIGMA,
     TURNS,
@@ -26,14 +27,12 @@ from barpc.pointio.columns import (
     header_of,
     like_altitudes,
     numbers_of,
+    read_table,
     vertical_of_column,
 )
-from barpc.pointio.gcp_formats import read_geojson, read_tags
-from barpc.pointio.gcp_table import GcpTable
-from barpc.pointio.tables import read_table
-from barpc.rasters.dem import HeightGrid, datum_of, geoid_of
+from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.raster import driver_of, open_raster
-from barpc.rasters.vertical import ELLIPSOID, Vertical
+from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of
 from barpc.scene import Altimetry
 
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground

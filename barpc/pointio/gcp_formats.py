@@ -8,7 +8,8 @@ taken as they stand.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,15 +17,133 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from barpc.base.errors import BarpcError, InputError, plain
+from barpc.base.errors import BarpcError, InputError, listed, plain
 from barpc.base.geodesy import INFERRED, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
-from barpc.pointio.columns import IMAGE_SIGMA, degrees, guessed, number_of, numbers_of
-from barpc.pointio.gcp_table import ALONE, GCP_NAMES, KNOWN, NAN, SIGMAS, TEXTS, GcpTable, Row, named, of_columns
-from barpc.pointio.tables import Texts, read_columns, row_of
+from barpc.pointio.tables import (
+    GROUND_SIGMA,
+    IMAGE_SIGMA,
+    Names,
+    Texts,
+    degrees,
+    guessed,
+    lacking,
+    number_of,
+    numbers_of,
+    read_columns,
+    row_of,
+)
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
+
+GCP_NAMES: Names = {
+    "id": ("id", "name", "gcp", "gcp_id", "point", "point_id", "label"),
+    "image": ("image", "file", "filename", "image_name", "img", "view"),
+}
+SIGMAS: Names = {
+    "sigma": ("sigma", "sigma_m", "accuracy"),  # east, north and up
+    "sigma_xy": ("sigma_xy", "sigma_en", "sigma_horizontal", "accuracy_xy"),
+    "sigma_x": ("sigma_x", "sigma_e", "sigma_east", "sigma_lon", "sx"),
+    "sigma_y": ("sigma_y", "sigma_n", "sigma_north", "sigma_lat", "sy"),
+    "sigma_z": ("sigma_z", "sigma_u", "sigma_up", "sigma_alt", "sigma_height", "sz", "accuracy_z"),
+    "sigma_px": ("sigma_px", "sigma_image", "sigma_pixel"),
+    "sigma_col": ("sigma_col", "scol"),
+    "sigma_row": ("sigma_row", "srow"),
+}
+KNOWN: Names = {
+    **GCP_NAMES, **SIGMAS, "enable": ("enable", "enabled"), "crs": ("crs", "epsg", "srid"),
+    "east": ("east",), "north": ("north",),
+}  # fmt: skip
+TEXTS = "id", "image", "enable", "crs"
+ALONE = (GROUND_SIGMA,) * 3
+NAN = float("nan")
+
+Row = tuple[Any, ...]
+"""Name, image (None: not named) and the nine numbers of a GCP in an image."""
+
+
+class GcpTable(NamedTuple):
+    """GCPs (K,) as a file holds them: it repeats the ground point for each of its images."""
+
+    names: Sequence[str]  # empty: called by its place among the points
+    images: Texts | None  # None: the file names none
+    numbers: Array  # (K, 9): x, y, altitude (NaN: none), their sigmas east, north, up [m], col, row, their sigma [px]
+    apart: str = ""  # "ground" or "image" points alone: the other columns are NaN
+    crs: str | None = None  # as the file says it; None: longitude and latitude, or nothing said
+    vertical: Vertical = Vertical()  # what altitudes count from, and their unit, as a column says it
+    said: str = ""  # what was taken for what, where that had to be guessed
+
+    @staticmethod
+    def of_rows(rows: Iterable[Row], apart: str = "") -> GcpTable:
+        """Gather the rows that a reader yields."""
+        names, images, numbers = list[str](), dict[str | None, int](), array("d")
+        index = array("q")
+        for name, image, *values in rows:
+            names.append(name)
+            index.append(images.setdefault(image, len(images)))
+            numbers.extend(values)
+        of = None if None in images else Texts([str(image) for image in images], np.array(index, dtype=np.int64))
+        return GcpTable(names, of, np.array(numbers).reshape(-1, 9), apart)
+
+
+def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str, int], GcpTable]:
+    """Return the columns of a table by their names, and an empty table with their datum and units.
+
+    In a `lax` table columns of errors may stand that are no accuracies. InputError where the names do not tell.
+    """
+    try:
+        columns, said, vertical = guessed(words, KNOWN)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    for word in (word for i, word in enumerate(words) if i not in columns.values() and not lax):
+        if re.match("sigma|std|stdev|acc|err", word.lower()):
+            raise InputError(
+                f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(SIGMAS)}"
+            )
+    place = {"lon", "lat"} <= columns.keys() or {"east", "north"} <= columns.keys()
+    seen = {"col", "row"} <= columns.keys()
+    if not (place or seen) or ("id" not in columns and not (place and seen)):
+        needed = (*(() if place else ("lon", "lat")), "col", "row")
+        raise lacking(path, [name for name in needed if name not in columns], words)
+    apart = "" if place and seen else "ground" if place else "image"
+    return columns, GcpTable([], None, np.empty((0, 9)), apart, None, vertical, ", ".join(said))
+
+
+def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTable:
+    """Return a table of its columns: numbers (NaN or None: blank) or `Texts`; sigmas not stated are the default.
+
+    InputError for points of several reference systems.
+    """
+    num = max(len(cells.index if isinstance(cells, Texts) else cells) for cells in columns.values())
+
+    def stated(key: str, default: float | Array) -> Array:
+        cells = columns.get(key, [None] * num)
+        known = np.array([cell is not None for cell in cells], dtype=bool)
+        return np.where(known, np.array(cells, dtype=np.float64), default)
+
+    level = stated("sigma_xy", every := stated("sigma", GROUND_SIGMA))
+    pixels = np.max([stated(key, -np.inf) for key in ("sigma_px", "sigma_col", "sigma_row")], axis=0)
+    x, y = ("lon", "lat") if {"lon", "lat"} <= columns.keys() else ("east", "north")
+    values = [stated(x, NAN), stated(y, NAN), stated("alt", NAN)]
+    values += [stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every)]
+    values += [stated("col", NAN), stated("row", NAN), np.where(pixels == -np.inf, IMAGE_SIGMA, pixels)]
+    names = [name.strip() for name in columns["id"].per_row()] if "id" in columns else [""] * num
+    crs, said, images, kept = None, empty.said, columns.get("image"), np.arange(num)
+    if "crs" in columns:
+        systems = [str(text).strip() for text in columns["crs"].different]
+        if len(systems) > 1:
+            raise InputError(f"{path}: points of {len(systems)} reference systems, {listed(systems, 3)}; one file each")
+        crs = next((f"EPSG:{text}" if text.isdecimal() else text for text in systems if text), None)
+    if "enable" in columns:
+        off = [str(text).strip().lower() in ("0", "0.0", "false") for text in columns["enable"].different]
+        kept = np.flatnonzero(~np.array(off, dtype=bool)[columns["enable"].index])
+        said += f", points that it switches off: {num - len(kept)}, left out" if len(kept) < num else ""
+        images = images and Texts(images.different, images.index[kept])
+    numbers = np.column_stack(values)[kept]
+    return empty._replace(
+        names=[names[i] for i in kept], images=images, numbers=numbers, crs=crs, said=said.lstrip(", ")
+    )
 
 
 class GcpFormat(NamedTuple):

@@ -17,9 +17,8 @@ from barpc.base.errors import InputError, plain
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import TABLE, read_head
-from barpc.pointio.columns import IMAGE_SIGMA
 from barpc.pointio.names import ViewNames, cell
-from barpc.pointio.tables import distinct, index_texts, read_table
+from barpc.pointio.tables import IMAGE_SIGMA, distinct, index_texts, read_table
 from barpc.pointio.third_party_matches import (
     COLMAP,
     HDF5,

@@ -7,32 +7,32 @@ reference is applied; heights of unknown reference are taken as ellipsoidal, wit
 from __future__ import annotations
 
 import os
-import sys
+import re
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 from rasterio import Affine
 from rasterio._err import CPLE_BaseError
+from rasterio.coords import BoundingBox
 from rasterio.crs import CRS
 from rasterio.errors import CRSError
+from rasterio.transform import array_bounds
 from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
-from barpc.base.geodesy import DEFAULT, MAX_COORDINATE, STATED, Array, HeightDatum
+from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
 from barpc.base.remote import PathOrUrl, location
 from barpc.base.safe_io import GRID, opened
-from barpc.rasters.pgm import open_pgm
 from barpc.rasters.raster import open_raster
-from barpc.rasters.vertical import ELLIPSOID, NO_GEOID, Vertical, vertical_of
+from barpc.rasters.vertical import ELLIPSOID, NO_GEOID, Vertical, geoid_file, geoid_of, vertical_of
 from barpc.sensor import SensorModel
 
 HEIGHT_DRIVERS = {
@@ -430,27 +430,6 @@ def _terrain_intersection(
     return sensor.localize(image, (upper + lower) / 2)
 
 
-def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
-    """Return the geoid file for heights with a datum as `said`, a remark on it, and whether the remark is a warning."""
-    if said.geoid is None:
-        if said.provenance != DEFAULT:
-            return None, "ellipsoidal" if own.reference == ELLIPSOID else "taken as ellipsoidal, as is said", False
-        advice = (
-            "say --geoid egm96 for heights above the sea, --geoid none for ellipsoidal ones: up to 100 m lie between"
-        )
-        return None, f"TAKEN AS ELLIPSOIDAL; {advice}", True
-    of_file = own.reference.lower().replace(" ", "")
-    try:
-        file = geoid_file(said.geoid)
-    except InputError:
-        if by_person:
-            raise
-        file = geoid_file("egm96")  # a metre from it
-    done = f"made ellipsoidal with {location(file).name}"
-    other = not by_person and not any(name in of_file and name in Path(file).name for name in GEOIDS)
-    return file, f"{done}, which lies within some 2 m of it" if other else done, other
-
-
 def datum_of(vertical: Vertical | None, ground: Array, source: str, name: str) -> tuple[HeightDatum, ...]:
     """Return the alternative datum of heights at positions (n, 2 or more), taken as `vertical`.
 
@@ -463,52 +442,66 @@ def datum_of(vertical: Vertical | None, ground: Array, source: str, name: str) -
     return (HeightDatum(source, name, -undulation if converted else undulation, vertical.provenance, converted),)
 
 
-# --- geoids by name ---------------------------------------------------------------------------------------
-
-_OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
-"""15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
-_IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
-GEOIDS = (*_OWN, *_IN_PROJ)
+# --- GeographicLib's grids ------------------------------------------------------------------------------
+#
+# 16-bit numbers from the north pole down, from Greenwich on, one a node; comments of the header state an offset and a
+# scale: height of the geoid [m] = offset + scale * number.
 
 
-def geoid_file(given: str | os.PathLike[str]) -> str:
-    """Return the file of a geoid grid, given by its path or as one of `GEOIDS`; "none" is none.
-
-    Raises
-    ------
-    InputError
-        It is a name, and none of PROJ's folders holds its grid: the message says where to get it.
-    """
-    text = os.fspath(given)
-    name = text.lower()
-    if name == NO_GEOID:
-        return name
-    if name not in GEOIDS or Path(text).exists():
-        return text
-    if name in _OWN:
-        return str(_OWN[name])
-    folders = proj_folders()
-    for folder in folders:
-        for file in _IN_PROJ[name]:
-            if (folder / file).is_file():
-                return str(folder / file)
-    first = _IN_PROJ[name][0]
-    raise InputError(
-        f"geoid {name}: no {' or '.join(_IN_PROJ[name])} in PROJ's folders ({', '.join(map(str, folders)) or 'none'}); "
-        f"get it by 'projsync --file {first}' or from https://cdn.proj.org/{first} and give its path, or take egm96"
-    )
+_PGM_HEADER = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s++((?:#[^\n]*+\n\s*+)*+)65535[ \t\r\n]")
 
 
-def proj_folders() -> list[Path]:
-    """Return the folders in which PROJ looks for grids: of its variables, the user, Python packages, the system."""
-    said = [part for name in ("PROJ_DATA", "PROJ_LIB") for part in os.environ.get(name, "").split(os.pathsep)]
-    data = {
-        "win32": os.environ.get("LOCALAPPDATA", Path.home()),
-        "darwin": Path.home() / "Library/Application Support",
-    }.get(sys.platform, os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share")
-    folders = [Path(part) for part in said if part] + [Path(data) / "proj"]
-    for package, place in (("rasterio", "proj_data"), ("pyproj", "proj_dir/share/proj")):
-        spec = find_spec(package)
-        folders += [Path(spec.origin).parent / place] if spec is not None and spec.origin else []
-    folders += [Path(root) / "share/proj" for root in (sys.prefix, "/usr/local", "/usr")]
-    return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+@dataclass(frozen=True)
+class Pgm:
+    """An open grid with the methods of a dataset for `barpc.rasters.dem`, under rasterio's names."""
+
+    file: BinaryIO
+    start: int  # of the numbers [bytes]
+    shape: tuple[int, int]
+    offsets: tuple[float]
+    scales: tuple[float]
+    crs, units = CRS.from_epsg(4326), ("m",)
+
+    @property
+    def transform(self) -> Affine:
+        """From col, row to lon, lat [deg], nodes at the centres of cells."""
+        rows, cols = self.shape
+        east, south = 360.0 / cols, 180.0 / (rows - 1)
+        return Affine(east, 0.0, -east / 2, 0.0, -south, 90.0 + south / 2)
+
+    @property
+    def bounds(self) -> BoundingBox:
+        """Edges of the cells [deg]."""
+        return BoundingBox(*array_bounds(*self.shape, self.transform))
+
+    def read(self, _band: int, window: Window, masked: bool) -> Any:
+        """Read the numbers of a window, of its rows alone: a grid of one arc minute has half a gigabyte."""
+        (top, bottom), columns = window.toranges()[0], slice(*window.toranges()[1])
+        self.file.seek(self.start + 2 * top * self.shape[1])
+        numbers = np.frombuffer(self.file.read(2 * (bottom - top) * self.shape[1]), dtype=">u2")
+        return np.ma.MaskedArray(numbers.reshape(bottom - top, -1)[:, columns])
+
+
+@contextmanager
+def open_pgm(path: PathOrUrl) -> Iterator[Pgm]:
+    """Open a geoid grid; InputError where it is none of GeographicLib's."""
+    with opened(path, GRID) as file:
+        found = _PGM_HEADER.match(file.read(65536))
+        if found is None:
+            raise InputError(f"{path}: no .pgm of 16-bit numbers (P5, comments, width, height, 65535)")
+        cols, rows = int(found[2]), int(found[3])
+        pairs = re.findall(r"#[ \t]*+(\w++)[ \t]++([^\n]*+)", (found[1] + found[4]).decode("latin-1"))
+        said = {key.lower(): text.strip() for key, text in pairs}
+        try:
+            offset, scale = float(said["offset"]), float(said["scale"])
+        except (KeyError, ValueError):
+            offset = scale = np.nan
+        if not (np.isfinite([offset, scale]).all() and scale > 0):
+            raise InputError(f"{path}: no geoid grid of GeographicLib, whose comments state '# Offset' and '# Scale'")
+        origin, kind = said.get("origin", "90N 0E"), said.get("area_or_point", "Point")
+        if (origin.split(), kind.lower()) != (["90N", "0E"], "point"):
+            raise InputError(f"{path}: Origin {origin}, {kind}: only grids of points from 90N 0E on are read")
+        length = found.end() + 2 * rows * cols
+        if rows < 2 or cols < 2 or file.seek(0, 2) != length:
+            raise InputError(f"{path}: {file.seek(0, 2)} bytes, its header of {cols} x {rows} numbers needs {length}")
+        yield Pgm(file, found.end(), (rows, cols), (offset,), (scale,))

@@ -6,11 +6,16 @@ surface, the geoid that leads from it to the ellipsoid, and whether that was sta
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import DEFAULT, STATED
+from barpc.base.remote import location
 
 ELLIPSOID, UNKNOWN = "ellipsoid", "unknown"
 NO_GEOID, ELLIPSOIDAL = "none", "ellipsoidal"
@@ -95,3 +100,75 @@ def _of_crs(wkt: str) -> Vertical:
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     geoid = next((grid for text, grid in _GEOID_NAMES if text in plain), _OTHERS)
     return Vertical(name, metres, unit, geoid, STATED)
+
+
+# --- geoids by name ---------------------------------------------------------------------------------------
+
+_OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
+"""15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
+_IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
+GEOIDS = (*_OWN, *_IN_PROJ)
+
+
+def geoid_file(given: str | os.PathLike[str]) -> str:
+    """Return the file of a geoid grid, given by its path or as one of `GEOIDS`; "none" is none.
+
+    Raises
+    ------
+    InputError
+        It is a name, and none of PROJ's folders holds its grid: the message says where to get it.
+    """
+    text = os.fspath(given)
+    name = text.lower()
+    if name == NO_GEOID:
+        return name
+    if name not in GEOIDS or Path(text).exists():
+        return text
+    if name in _OWN:
+        return str(_OWN[name])
+    folders = proj_folders()
+    for folder in folders:
+        for file in _IN_PROJ[name]:
+            if (folder / file).is_file():
+                return str(folder / file)
+    first = _IN_PROJ[name][0]
+    raise InputError(
+        f"geoid {name}: no {' or '.join(_IN_PROJ[name])} in PROJ's folders ({', '.join(map(str, folders)) or 'none'}); "
+        f"get it by 'projsync --file {first}' or from https://cdn.proj.org/{first} and give its path, or take egm96"
+    )
+
+
+def proj_folders() -> list[Path]:
+    """Return the folders in which PROJ looks for grids: of its variables, the user, Python packages, the system."""
+    said = [part for name in ("PROJ_DATA", "PROJ_LIB") for part in os.environ.get(name, "").split(os.pathsep)]
+    data = {
+        "win32": os.environ.get("LOCALAPPDATA", Path.home()),
+        "darwin": Path.home() / "Library/Application Support",
+    }.get(sys.platform, os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share")
+    folders = [Path(part) for part in said if part] + [Path(data) / "proj"]
+    for package, place in (("rasterio", "proj_data"), ("pyproj", "proj_dir/share/proj")):
+        spec = find_spec(package)
+        folders += [Path(spec.origin).parent / place] if spec is not None and spec.origin else []
+    folders += [Path(root) / "share/proj" for root in (sys.prefix, "/usr/local", "/usr")]
+    return [folder for folder in dict.fromkeys(folders) if folder.is_dir()]
+
+
+def geoid_of(own: Vertical, said: Vertical, by_person: bool) -> tuple[str | None, str, bool]:
+    """Return the geoid file for heights with a datum as `said`, a remark on it, and whether the remark is a warning."""
+    if said.geoid is None:
+        if said.provenance != DEFAULT:
+            return None, "ellipsoidal" if own.reference == ELLIPSOID else "taken as ellipsoidal, as is said", False
+        advice = (
+            "say --geoid egm96 for heights above the sea, --geoid none for ellipsoidal ones: up to 100 m lie between"
+        )
+        return None, f"TAKEN AS ELLIPSOIDAL; {advice}", True
+    of_file = own.reference.lower().replace(" ", "")
+    try:
+        file = geoid_file(said.geoid)
+    except InputError:
+        if by_person:
+            raise
+        file = geoid_file("egm96")  # a metre from it
+    done = f"made ellipsoidal with {location(file).name}"
+    other = not by_person and not any(name in of_file and name in Path(file).name for name in GEOIDS)
+    return file, f"{done}, which lies within some 2 m of it" if other else done, other

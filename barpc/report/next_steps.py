@@ -11,7 +11,7 @@ from barpc.ba.constraints.gauge import MOTIONS, SIMILAR
 from barpc.ba.constraints.ground import KNOWN_BIAS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
-from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.report.quality_checks import lengths
 from barpc.report.ranking import flagged, sure_pairs
 from barpc.report.records import value_of

@@ -9,12 +9,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, partial
-from types import NoneType, UnionType
-from typing import Any, ClassVar, Self, Union, dataclass_transform, get_args, get_origin, get_type_hints
+from inspect import get_annotations
+from types import NoneType
+from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_args, get_type_hints
 
+import msgspec
 import numpy as np
-
-from barpc.base.options import schema_of
 
 Number = float | None  # A number; None (null) stands for what is not finite
 
@@ -27,7 +27,7 @@ def column(
     *,
     adjusted: bool = False,
     default: Any = MISSING,
-    **schema: Any,
+    **limits: Any,
 ) -> Any:
     """Return a field of a record with its declaration.
 
@@ -41,13 +41,17 @@ def column(
         How its numbers are written there; empty for whole numbers and names.
     adjusted : bool
         Whether only an adjustment has it: other runs leave its column out.
-    default, **schema
-        None for an optional value; more words of its JSON schema.
+    default, **limits
+        None for an optional value; `enum`, the texts that it may be, and those of `msgspec.Meta`: ge, le, min_length,
+        max_length, pattern.
     """
     end = f" [{unit}]" if unit else ""
     heads = f"{head}{end}" if isinstance(head, str) else tuple(f"{words}{end}" for words in head)
-    more = {**schema, "description": f"{text}{end}."}
-    return field(default=default, metadata={"schema": more, "column": (heads, form, adjusted)})
+    enum = limits.pop("enum", None)
+    meta = msgspec.Meta(description=f"{text}{end}.", **limits)
+    texts: Any = enum and Literal[*enum]
+    of_file = {"kind": texts | None if enum and default is None else texts, "meta": meta}
+    return field(default=default, metadata={**of_file, "column": (heads, form, adjusted)})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(column,))
@@ -58,30 +62,23 @@ class Record:
 
     OWN: ClassVar[Mapping[str, Column]] = {}
     """Columns of tables that are no fields."""
-    MORE: ClassVar[Any] = None
-    """Type of values beyond the fields that a file may hold; None: there must be none."""
 
     def __init_subclass__(cls) -> None:
+        kinds = get_annotations(cls)
+        for name, one in vars(cls).items():
+            if isinstance(one, Field):
+                kind, meta = (one.metadata[key] for key in ("kind", "meta"))
+                kinds[name] = Annotated[kind or kinds[name], meta]
+        cls.__annotations__ = kinds
         dataclass(frozen=True)(cls)
 
     @classmethod
-    def read(cls, found: Mapping[str, Any]) -> Self:
-        """Return the record of a file's validated content; what it does not know is passed over."""
-        readers = _field_readers(cls)  # type: ignore[arg-type]  # a class can be hashed
-        known = ((key, value, readers[key]) for key, value in found.items() if key in readers)
-        return cls(**{key: read(item) if read and item is not None else item for key, item, read in known})
-
-    @classmethod
-    def json_schema(cls) -> dict[str, Any]:
-        """Return its JSON schema."""
-        hints = get_type_hints(cls, include_extras=True)
-        words = {one.name: {**schema_of(hints[one.name]), **one.metadata["schema"]} for one in fields(cls)}
-        return {
-            "type": "object",
-            "properties": words,
-            "required": [field.name for field in fields(cls) if field.default is MISSING],
-            "additionalProperties": False if cls.MORE is None else schema_of(cls.MORE),
-        }
+    def read(cls, found: Any) -> Self:
+        """Return the record of a parsed file; keys it does not know are passed over. ValueError where it is damaged."""
+        try:
+            return msgspec.convert(found, cls)
+        except (msgspec.ValidationError, OverflowError) as error:
+            raise ValueError(str(error)) from error
 
 
 @cache
@@ -90,46 +87,23 @@ def _hints(record: Any) -> dict[str, Any]:
     return get_type_hints(record)
 
 
-@cache
-def _field_readers(record: Any) -> dict[str, Callable[[Any], Any] | None]:
-    hints = _hints(record)
-    return {field.name: _reader(hints[field.name]) for field in fields(record)}
-
-
-def _reader(kind: Any) -> Callable[[Any], Any] | None:
-    """Return the function from JSON to a value of a type; None where it stays as it is."""
-    if get_origin(kind) in (Union, UnionType):
-        kind = next(part for part in get_args(kind) if part is not NoneType)
-    if isinstance(kind, type) and issubclass(kind, Record):
-        return kind.read
-    if get_origin(kind) is not tuple:
-        return None
-    item = _reader(get_args(kind)[0])
-    return tuple if item is None else lambda values: tuple(map(item, values))
-
-
 _PLAIN = frozenset({str, int, bool, NoneType})
 
 
-def json_form(value: Any, keep: bool = False) -> Any:
-    """Return the JSON form of a value: arrays as lists, records as mappings, numbers that are not finite as null.
-
-    With `keep` as it is read from there: records stay what they are, lists become tuples.
-    """
+def json_form(value: Any) -> Any:
+    """Return the JSON form of a value: arrays as lists, records as mappings, numbers that are not finite as null."""
     kind: Any = type(value)
     if kind is float:  # most values
         return value if math.isfinite(value) else None
     if kind in _PLAIN or isinstance(value, (int, str)):
         return value
     if isinstance(value, (list, tuple)):
-        found = [json_form(item, keep) for item in value]
-        return tuple(found) if keep else found
+        return [json_form(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
         held = ((name, getattr(value, name), optional) for name, optional in _serialized_fields(kind))
-        items = {name: json_form(item, keep) for name, item, optional in held if item is not None or not optional}
-        return kind(**items) if keep else items
+        return {name: json_form(item) for name, item, optional in held if item is not None or not optional}
     if isinstance(value, (np.ndarray, np.generic)):
-        return json_form(value.tolist(), keep)
+        return json_form(value.tolist())
     return {str(k): json_form(v) for k, v in value.items()} if isinstance(value, Mapping) else str(value)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from barpc.base.errors import BarpcWarning
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.report.summary import SCHEMA
 
 OLD_SCHEMA = 2
@@ -51,13 +51,15 @@ RENAMED_VALUES = {
 def with_new_names(found: Any, path: Path) -> Any:
     """Return the parsed summary.json of schema 2 under the names of schema 3, changed in place; others untouched.
 
-    A BarpcWarning names the file. What is damaged stays, for the validation that follows.
+    A BarpcWarning names the file. What is damaged stays, for the validation that follows; InputError for both names.
     """
     if not isinstance(found, dict) or type(found.get("schema")) is not int or found["schema"] != OLD_SCHEMA:
         return found
     for place, names in RENAMED_KEYS.items():
         for record in _records(found, place.split(".")):
-            record.update({new: record.pop(old) for old, new in names.items() if old in record and new not in record})
+            if both := [old for old, new in names.items() if old in record and new in record]:
+                raise InputError(f"{path}: damaged, {place} has {both[0]} and its new name: run the adjustment again")
+            record.update({new: record.pop(old) for old, new in names.items() if old in record})
     for (place, key), values in RENAMED_VALUES.items():
         for record in _records(found, place.split(".")):
             if isinstance(value := record.get(key), str):

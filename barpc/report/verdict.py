@@ -60,7 +60,7 @@ def summarize(run: Run) -> Summary:
     found = measure_run(run)
     views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
     verdict = block_verdict(run, views)
-    summary: Summary = json_form(replace(found, views=views, passed=verdict["status"] == "good", **verdict), keep=True)
+    summary = Summary.read(json_form(replace(found, views=views, passed=verdict["status"] == "good", **verdict)))
     return replace(summary, next=next_steps(summary))
 
 

@@ -21,8 +21,8 @@ from barpc.base.remote import PathOrUrl, beside, is_url, location
 from barpc.base.safe_io import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
 from barpc.rasters.raster import driver_of, identify, open_raster
 from barpc.rasters.vrt import MAGIC, read_vrt
-from barpc.rpcio.carried import SCANNED, read_nitf, read_tag
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse_rpc
+from barpc.rpcio.images import SCANNED, read_nitf, read_tag
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC

@@ -19,8 +19,7 @@ from barpc.base.errors import BarpcWarning, InputError, RpcError, RpcFormatError
 from barpc.base.safe_io import parse_xml
 from barpc.sensor.curve import fit_orbit
 from barpc.sensor.document import RELIEF_AROUND, XmlFields, seconds, warn_off_grid
-from barpc.sensor.sentinel1.frames import SlantFrame
-from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler
+from barpc.sensor.sentinel1.range_doppler import RELIEF, RangeDoppler, SlantFrame
 
 ROOT = "level1Product"
 

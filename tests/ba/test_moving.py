@@ -321,7 +321,7 @@ def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float,
     assert np.quantile(inside[:, 1], 0.9) < north < np.quantile(inside[:, 1], 0.98)
     assert west < east
     assert south < north
-    assert np.abs(found.scene_shift - without.scene_shift).max() < 0.3 * without.gauge.sigma.max()
+    assert np.abs(found.gauge.shift - without.gauge.shift).max() < 0.3 * without.gauge.sigma.max()
     assert block.held_out_rms(list(found.sensors)) < block.held_out_rms(list(without.sensors)) + 0.02
     assert np.isfinite(found.points[np.unique(tracks.point[found.moving])]).all()
     assert np.isfinite(found.residuals[found.moving]).all()

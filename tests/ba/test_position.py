@@ -51,7 +51,7 @@ def test_a_gcp_that_is_rejected_moves_no_scene(wrong: tuple[float, ...]) -> None
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(), gcps, centers=centers_of(block))
     assert found.control is not None
     assert found.control.used.tolist() == [True, False, True, True]
-    assert np.abs(found.scene_shift).max() < 0.2
+    assert np.abs(found.gauge.shift).max() < 0.2
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() ->
     )
     moved = enu_basis(block.truth.ground[0]) @ np.nanmean((last - first)[:12], axis=0)
     assert moved[2] == pytest.approx(40.0, abs=1.0)
-    np.testing.assert_allclose(found.scene_shift, moved, atol=0.1)
+    np.testing.assert_allclose(found.gauge.shift, moved, atol=0.1)
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_two_images_with_one_rpc_have_no_height_to_move(wrong: float) -> None:
     found = adjust_tracks(views, replace(tracks, xy=xy), AdjustOptions())
     assert found.held.any()
     # both go half of the way, towards each other: the places between them stay
-    assert np.abs(found.scene_shift).max() < 1.0
+    assert np.abs(found.gauge.shift).max() < 1.0
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
     kept = np.unique(old.point[first.inlier])
     moved = enu_basis(block.truth.ground[0]) @ (other - one)[kept].mean(axis=0)
     assert abs(moved[2]) > 5.0
-    np.testing.assert_allclose(both.scene_shift, moved, atol=0.02 * np.abs(moved).max())
+    np.testing.assert_allclose(both.gauge.shift, moved, atol=0.02 * np.abs(moved).max())
     # a third run goes on with the same scene
     again = block_prior(both).scene
     assert again is not None

@@ -30,8 +30,7 @@ from barpc.sensor.corrected import Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
-from barpc.sensor.sicd import open_sicd
-from barpc.sensor.sicd.monostatic import Aperture, Formation
+from barpc.sensor.sicd import Aperture, Formation, open_sicd
 from barpc.sensor.timing import Clocked, Timing
 from barpc.simulate import Look, fly
 from tests.lanes import diagonal, rest_slow

@@ -153,7 +153,7 @@ def test_the_gauge_report_names_the_height_as_the_weakest_mode(adjusted):
     assert adjusted.gauge.modes[0].meaning == "up"
     assert adjusted.gauge.modes[0].sigma > adjusted.gauge.modes[-1].sigma
     assert (adjusted.gauge.sigma > 0).all()
-    assert (np.abs(adjusted.scene_shift) < 5 * np.linalg.norm(adjusted.gauge.sigma)).all()
+    assert (np.abs(adjusted.gauge.shift) < 5 * np.linalg.norm(adjusted.gauge.sigma)).all()
 
 
 def _divided(block: SimulatedBlock, old: int) -> tuple[Tracks, Tracks, np.ndarray]:

@@ -134,12 +134,12 @@ def test_every_file_of_the_repository_that_a_page_names_exists(page):
 
 def value(name: str) -> bool:
     """Whether the schema of summary.json has a value, such as `pairs[].chosen_by`."""
-    part: Any = published_schema()
+    records, part = published_schema()["$defs"], "Summary"
     for step in name.split("."):
-        part = part.get("properties", {}).get(step.removesuffix("[]"))
-        if part is None:
+        found = records.get(part, {}).get("properties", {}).get(step.removesuffix("[]"))
+        if found is None or step.endswith("[]") is not ("items" in str(found)):
             return False
-        part = part.get("items", part) if step.endswith("[]") else part
+        part = next(iter(re.findall(r"/(\w+)'", str(found))), "")
     return True
 
 

@@ -19,7 +19,7 @@ from barpc.cli import COMMANDS, cli
 from tests.docs.pages import DOCS, ROOT
 from tests.docs.test_pages import script
 
-CONDA = {"opencv-python-headless": "py-opencv", "fastjsonschema": "python-fastjsonschema"}
+CONDA = {"opencv-python-headless": "py-opencv"}
 """Names on the package index -> those of conda-forge."""
 REPACKED = {"4.13.0.90": "4.13.0"}
 """Versions of wheels that were built again -> of what is in them."""

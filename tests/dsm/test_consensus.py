@@ -11,8 +11,15 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from barpc.base.options import DsmOptions
 from barpc.dsm import stereo
-from barpc.dsm.consensus import NEIGHBOUR_RADIUS, SURROUNDED, consensus, finite_median
-from barpc.dsm.stereo import block_of_images, gathered, surface_tile
+from barpc.dsm.stereo import (
+    NEIGHBOUR_RADIUS,
+    SURROUNDED,
+    block_of_images,
+    consensus,
+    finite_median,
+    gathered,
+    surface_tile,
+)
 from barpc.dsm.surface import Grid
 from tests.dsm.conftest import SMALL, Rendered
 from tests.lanes import rest_slow

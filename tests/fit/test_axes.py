@@ -18,7 +18,7 @@ from barpc.base.errors import FitError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-from barpc.fit.axes import _bundle, wrong_axes, wrong_axes_of_grid
+from barpc.fit.refit import _bundle, wrong_axes, wrong_axes_of_grid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.simulate import Look, fly
 from tests.fit.cameras import adjusted, synthetic_rpc

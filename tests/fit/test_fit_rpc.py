@@ -125,13 +125,6 @@ def test_a_flat_scene_keeps_its_altitude_terms(camera: Camera) -> None:
     assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-7
 
 
-def test_the_vendors_denominators_may_be_kept(camera: Camera) -> None:
-    options = FitOptions(method="vendor-denominators")
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
-    assert np.array_equal(fit.rpc.coeffs[1::2], camera.rpc.coeffs[1::2])
-    assert fit.max_ckp.max() <= 1e-2
-
-
 def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> None:
     fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(method="lcurve-joint"))
     assert fit.rmse_ckp.max() <= 2e-4
@@ -148,7 +141,7 @@ def test_numbers_fitted_for_nitf_survive_it(some_vendors: list[Camera]) -> None:
         assert np.array_equal(limits.coeffs(rpc.coeffs), rpc.coeffs)
         assert np.array_equal(np.round(rpc.ground_offset, 4), rpc.ground_offset)
         assert np.array_equal(np.round(rpc.image_scale), rpc.image_scale)
-        assert fit.max_ckp.max() <= 0.01
+        assert fit.max_ckp.max() <= 0.002, camera.name
 
 
 def test_an_rpc_that_misses_the_tolerance_is_refused_or_handed_out_with_its_verdict(camera: Camera) -> None:

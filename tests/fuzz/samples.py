@@ -35,8 +35,8 @@ from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
 from barpc.report.runfiles import read_summary, table_path
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
-from barpc.rpcio.carried import put_tag
 from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.images import put_tag
 from barpc.rpcio.sources import light_of
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.scene import View
@@ -126,7 +126,7 @@ def _tiff() -> bytes:
 
 def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
-    from barpc.rpcio.carried import nitf_record
+    from barpc.rpcio.images import nitf_record
 
     fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
     return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50

@@ -45,7 +45,7 @@ def small_block() -> SimulatedBlock:
 
 def sound(found: Adjustment) -> Adjustment:
     """The adjustment, whose cameras are numbers; AssertionError where it says that it is done and they are none."""
-    numbers = {"params": found.params, "noise": found.noise, "shift": found.scene_shift}
+    numbers = {"params": found.params, "noise": found.noise, "shift": found.gauge.shift}
     numbers["residuals"] = found.residuals[found.inlier]
     for name, value in numbers.items():
         if not np.isfinite(value).all():

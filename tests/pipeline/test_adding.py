@@ -21,7 +21,7 @@ from barpc.pipeline import AdjustResult, RunOptions, adjust
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block
 

@@ -27,7 +27,7 @@ from barpc.pipeline.calibrate import _FinishedRun, _refuse_unsure, _row_directio
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, scene

@@ -21,7 +21,7 @@ from barpc.pipeline import adjust, load_views, outputs, run
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio import formats
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 from barpc.sensor.geometry import Several, epipolar_offset
 from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block

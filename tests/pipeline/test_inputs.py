@@ -14,7 +14,7 @@ from barpc.base.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
 from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 
 from .known import errors_at_check_points
 
@@ -152,7 +152,7 @@ def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
     assert sigma[0] > 20
     assert sigma[1] < 20  # as well as a DEM is known as a whole, and no better
     # the crops' terrain stands 0-30 m above the radar DEM's (trees, 90 m cells)
-    assert abs(held.adjustment.scene_shift[2] - free.adjustment.scene_shift[2]) < 60
+    assert abs(held.adjustment.gauge.shift[2] - free.adjustment.gauge.shift[2]) < 60
     assert abs(held.summary["pairs"][0]["epipolar_after"]["median"]) < 0.1
 
 

@@ -106,7 +106,7 @@ def test_an_image_that_was_turned_or_resampled_is_met_all_the_same(shared_data, 
     assert found.findings == ()  # nothing but the image as a whole
     assert not found.moving.any()
     if name == "as delivered":
-        assert np.abs(found.scene_shift).max() < 0.2  # of 7 m, 7 m and 67 m that are not known
+        assert np.abs(found.gauge.shift).max() < 0.2  # of 7 m, 7 m and 67 m that are not known
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_the_images_are_not_shifted_as_a_set(request, which):
 @pytest.mark.parametrize("which", ["triplet", "ventoux"])
 def test_the_scene_stays_where_the_cameras_put_it(request, which):
     result, _ = request.getfixturevalue(which)
-    assert np.abs(result.adjustment.scene_shift).max() <= 1.0
+    assert np.abs(result.adjustment.gauge.shift).max() <= 1.0
     scene = result.summary["scene"]
     assert min(scene["sigma_enu_m"]) > 1.0  # and says that this is all that is known
 

@@ -11,8 +11,8 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.base.errors import InputError
-from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.gcps import read_gcps
+from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 
 NAMES = ["left", "right"]
 

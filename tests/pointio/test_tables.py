@@ -12,7 +12,6 @@ import rasterio
 from rasterio.control import GroundControlPoint
 
 from barpc.base.errors import InputError
-from barpc.pointio.columns import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.correspondences import correspondence_kind, read_correspondences, read_grid
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import Links, asp_text, read_links, read_matches, tracks_of
@@ -25,6 +24,7 @@ from barpc.pointio.names import (
     require_pair_names,
     unique_names,
 )
+from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.third_party_matches import index_pairs, pair_files, pair_of
 
 NAMES = ["left", "right"]

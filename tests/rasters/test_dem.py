@@ -12,8 +12,8 @@ import rasterio
 
 from barpc.base.errors import BarpcWarning, InputError
 from barpc.base.geodesy import ecef_from_ground
-from barpc.rasters.dem import Dem, HeightGrid, geoid_file, localize_on_terrain
-from barpc.rasters.vertical import Vertical
+from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
+from barpc.rasters.vertical import Vertical, geoid_file
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import altitude_range
 from tests.sensor.conftest import make_rpc
@@ -138,7 +138,7 @@ def test_a_datum_without_a_grid_of_its_own_is_met_by_another_which_is_said(tmp_p
         dem = Dem.open(write_dem(tmp_path / "a.tif", "EPSG:4326+5703"))
     assert dem(5.0, 44.0) == pytest.approx(100.0 + float(HeightGrid.open(GEOID).sample(5.0, 44.0)))
     assert dem.known
-    monkeypatch.setattr("barpc.rasters.dem.proj_folders", list)
+    monkeypatch.setattr("barpc.rasters.vertical.proj_folders", list)
     path = write_dem(tmp_path / "b.tif", "EPSG:4326+3855")
     with pytest.warns(BarpcWarning, match="EGM2008 height, made ellipsoidal with egm96"):
         Dem.open(path)

@@ -11,8 +11,9 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.base.options import RunOptions
 from barpc.pipeline.inputs import with_located
-from barpc.rasters import dem as geoids
-from barpc.rasters.dem import Dem, HeightGrid, geoid_file
+from barpc.rasters import vertical as geoids
+from barpc.rasters.dem import Dem, HeightGrid
+from barpc.rasters.vertical import geoid_file
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ import rasterio
 from rasterio.warp import transform
 
 from barpc.base.errors import BarpcWarning, InputError
-from barpc.rasters.dem import Dem, HeightGrid, geoid_file, localize_on_terrain
+from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
+from barpc.rasters.vertical import geoid_file
 from tests.rasters.test_dem import STEP, write_dem, write_geoid
 
 HIGH, LAT = 37.0, 44.0

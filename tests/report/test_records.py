@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar
 
+import msgspec
 import numpy as np
 import pytest
 
 from barpc.base.errors import listed
-from barpc.base.options import schema_of
 from barpc.report.records import (
     Cell,
     Column,
@@ -47,15 +46,18 @@ class Whole(Record):
     num: int = column("How many", head="num")
     part: Part | None = column("A part")
     more: tuple[Part, ...] = column("Parts", default=())
+    kind: str = column("Which", default="a", enum=["a", "b"])
+    share: Share = column("How much", default=0.5)
 
 
 WHOLE = Whole(3, Part(1.5, (0.25, -1.0)), (Part(None),))
-PLAIN = {"num": 3, "part": {"size": 1.5, "both": [0.25, -1.0]}, "more": [{"size": None}]}
+MORE = {"kind": "a", "share": 0.5}
+PLAIN = {"num": 3, "part": {"size": 1.5, "both": [0.25, -1.0]}, "more": [{"size": None}], **MORE}
 
 
 def test_a_record_is_written_without_what_is_optional_and_not_there():
     assert json_form(WHOLE) == PLAIN
-    assert json_form(Whole(3, None)) == {"num": 3, "part": None, "more": []}
+    assert json_form(Whole(3, None)) == {"num": 3, "part": None, "more": [], **MORE}
 
 
 def test_a_record_comes_back_from_its_file_and_passes_over_what_it_does_not_know():
@@ -83,53 +85,29 @@ def test_what_is_not_finite_is_null_and_arrays_are_lists():
     assert json_form(Other()) == {"shown": None}  # of no record all fields are kept
 
 
-def test_the_schema_of_a_type():
-    assert schema_of(int) == {"type": "integer"}
-    assert schema_of(Number) == {"type": ["number", "null"]}
-    assert schema_of(Literal["a", "b"]) == {"enum": ["a", "b"]}
-    assert schema_of(tuple[int, str]) == {
-        "type": "array",
-        "minItems": 2,
-        "maxItems": 2,
-        "items": {"type": "integer"},
-    }
-    assert schema_of(tuple[int, ...]) == {"type": "array", "items": {"type": "integer"}}
-    assert schema_of(Any) == {}
-    assert schema_of(tuple[float, ...] | None)["type"] == ["array", "null"]
-    assert schema_of(float | tuple[float, ...] | tuple[str, ...] | None) == {
-        "anyOf": [
-            {"type": ["number", "null"]},
-            {"type": "array", "items": {"type": "number"}},
-            {"type": "array", "items": {"type": "string"}},
-        ]
-    }
-    assert Whole.json_schema()["required"] == ["num", "part"]
-    assert Whole.json_schema()["additionalProperties"] is False
-    assert Part.json_schema()["properties"]["size"] == {
-        "type": ["number", "null"],
-        "description": "How large [m].",
-    }
-
-
-def described(schema: Any) -> Iterator[str]:
-    """Every description in a schema."""
-    if isinstance(schema, dict):
-        if isinstance(schema.get("description"), str):
-            yield schema["description"]
-        for part in schema.values():
-            yield from described(part)
-    elif isinstance(schema, list):
-        for part in schema:
-            yield from described(part)
+def test_what_a_file_may_hold_is_what_is_declared():
+    for wrong in (
+        {"num": 3}, {"num": "3", "part": None}, {"num": True, "part": None}, {"num": 3.5, "part": None}, [], None,
+        {"num": 3, "part": {"size": 1.5, "both": [1.0]}}, {"num": 3, "part": {"size": "x"}},
+        {"num": 3, "part": None, "more": [1]},
+        {"num": 3, "part": None, "kind": "c"}, {"num": 3, "part": None, "share": 1.5},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"^[A-Z]"):
+            Whole.read(wrong)
+    found = msgspec.json.schema(Whole)["$defs"]
+    assert found["Whole"]["required"] == ["num", "part"]
+    assert found["Part"]["properties"]["size"]["description"] == "How large [m]."
+    assert sorted(found["Whole"]["properties"]["kind"]["enum"]) == ["a", "b"]
 
 
 UNITS = {"px", "m", "deg", "MB", "m above the ellipsoid", "px/px", "urad", "ms", "nats"}
 
 
 def test_what_is_said_of_a_value_ends_with_its_unit():
-    texts = list(described(published_schema()))
+    parts = [part for one in published_schema()["$defs"].values() for part in one["properties"].values()]
+    texts = [part["description"] for part in parts]
     assert len(texts) > 100
-    for text in texts[1:]:
+    for text in texts:
         words, unit = re.fullmatch(r"(.*?)(?: \[([^\]]*)\])?\.", text).groups()
         assert unit is None or unit in UNITS, text
         assert words not in UNITS, text
@@ -137,7 +115,7 @@ def test_what_is_said_of_a_value_ends_with_its_unit():
 
 def test_the_version_of_the_file_is_three():
     assert SCHEMA == 3
-    assert published_schema()["properties"]["schema"]["const"] == 3
+    assert published_schema()["$defs"]["Summary"]["properties"]["schema"]["enum"] == [3]
 
 
 def test_columns_are_fields_parts_and_own_ones():
@@ -235,13 +213,15 @@ def test_an_image_shows_shares_in_percent():
 
 
 def test_what_numbers_a_file_may_hold():
-    assert schema_of(Count) == {"type": "integer", "minimum": 0}
-    assert schema_of(Side) == {"type": "integer", "minimum": 1}
-    assert schema_of(Share) == {"type": "number", "minimum": 0, "maximum": 1}
-    schema = published_schema()["properties"]
-    gcp, view = (schema[name]["items"]["properties"] for name in ("gcps", "views"))
+    for kind, held, beyond in ((Count, [0, 1], [-1]), (Side, [1], [0]), (Share, [0, 1], [-1e-9, 1 + 1e-9])):
+        assert [msgspec.convert(value, kind) for value in held] == held
+        for value in beyond:
+            with pytest.raises(msgspec.ValidationError):
+                msgspec.convert(value, kind)
+    schema = {name: part["properties"] for name, part in published_schema()["$defs"].items()}
+    gcp, view = schema["GcpEntry"], schema["ViewEntry"]
     assert (gcp["lon"]["minimum"], gcp["lon"]["maximum"]) == (-540, 540)
     assert (gcp["lat"]["minimum"], gcp["lat"]["maximum"]) == (-90, 90)
-    assert (schema["views"]["minItems"], view["name"]["minLength"]) == (1, 1)
-    motion = schema["scene"]["properties"]["weakest_modes"]["items"]["properties"]["motion_m"]
+    assert (schema["Summary"]["views"]["minItems"], view["name"]["minLength"]) == (1, 1)
+    motion = schema["ModeEntry"]["motion_m"]
     assert (motion["minItems"], motion["maxItems"]) == (7, 10)  # those of runs before have seven

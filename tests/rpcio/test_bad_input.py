@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from barpc.base.errors import BarpcError, ImageError, RpcFormatError
 from barpc.base.safe_io import RPC_FILE
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
-from barpc.rpcio.carried import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
 from barpc.rpcio.formats import parse_rpc
+from barpc.rpcio.images import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 RPC = make_rpc()

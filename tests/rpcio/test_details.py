@@ -21,7 +21,9 @@ from barpc.base.safe_io import Kind
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio import formats as formats_module
-from barpc.rpcio.carried import (
+from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
+from barpc.rpcio.grids import read_correction, write_correction, write_grid
+from barpc.rpcio.images import (
     Directory,
     Entry,
     nitf_record,
@@ -30,10 +32,9 @@ from barpc.rpcio.carried import (
     read_directory,
     read_tag,
     read_values,
+    write_crop,
+    write_rpc_nitf,
 )
-from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
-from barpc.rpcio.grids import read_correction, write_correction, write_grid
-from barpc.rpcio.images import write_crop, write_rpc_nitf
 from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
 from barpc.rpcio.xml import rpc_domain
@@ -181,7 +182,7 @@ def test_numbers_of_seventeen_digits_are_printable_and_the_camera_stays() -> Non
 
 def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> None:
     """Exaggerated: of nine digits, which by themselves move the image by a hundred times what is left."""
-    from barpc.rpcio import carried
+    from barpc.rpcio import images
 
     rng = np.random.default_rng(4)
     rpc = make_rpc()
@@ -193,7 +194,7 @@ def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> No
         image_offset=rpc.image_offset + 4.4e-6,
         image_scale=rpc.image_scale * (1 + 2.2e-9),
     )
-    monkeypatch.setattr(carried, "_fifteen", lambda values: np.array([float(f"{v:.9g}") for v in values.tolist()]))
+    monkeypatch.setattr(images, "_fifteen", lambda values: np.array([float(f"{v:.9g}") for v in values.tolist()]))
     short = printable(long)
     off = [
         np.abs(replace(short, **{name: getattr(long, name)}).project(grid(rpc)) - long.project(grid(rpc))).max()

@@ -11,8 +11,8 @@ import pytest
 
 from barpc.base.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
-from barpc.rpcio.carried import nitf_record
 from barpc.rpcio.formats import parse_rpc
+from barpc.rpcio.images import nitf_record
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 

@@ -26,7 +26,7 @@ from barpc.rpcio import (
     write_rpc_nitf,
     write_rpc_vrt,
 )
-from barpc.rpcio.carried import printable, put_tag, read_tag
+from barpc.rpcio.images import printable, put_tag, read_tag
 from tests.rpcio.conftest import grid, make_rpc, write_image
 
 

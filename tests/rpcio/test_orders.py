@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from barpc.rpcio import read_rpc, write_rpc_nitf
-from barpc.rpcio.carried import nitf_record
+from barpc.rpcio.images import nitf_record
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import grid, write_image
 

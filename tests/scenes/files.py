@@ -17,7 +17,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc import __version__
 from barpc.base.geodesy import Array
-from barpc.rpcio.carried import put_tag
+from barpc.rpcio.images import put_tag
 from barpc.scene import BoolArray
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Workspace

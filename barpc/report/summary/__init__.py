@@ -9,8 +9,9 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from barpc import __version__
@@ -23,9 +24,9 @@ from barpc.report.summary.pairs import PairEntry, measure_pairs
 from barpc.report.summary.views import ViewEntry, measure_views
 from barpc.report.summary.words import ABOVE, Count, Vector
 
-SCHEMA = 3  # Version of summary.json
-_Plain = float | str | bool | None
-_Value = _Plain | tuple[_Plain, ...] | tuple[tuple[_Plain, ...], ...]
+SCHEMA: Literal[3] = 3  # Version of summary.json
+_Plain = int | float | str | bool | None
+_Value = _Plain | tuple[_Plain | tuple[_Plain, ...], ...]
 
 
 class LeftOutEntry(Record):
@@ -66,7 +67,7 @@ class StepEntry(Record):
     """A next step: use of the results, a further input, or a review."""
 
     kind: Literal["use", "improve", "review"] = column("Files to hand over; further inputs; parts to review")
-    text: str = column("The step as a sentence", minLength=1)
+    text: str = column("The step as a sentence", min_length=1)
     commands: tuple[str, ...] = column("Commands for it, where . is the run folder", default=())
     expected: tuple[ExpectedEntry, ...] = column("Effect of further inputs", default=())
     part: str | None = column("Part of report.html that shows it", default=None)
@@ -91,8 +92,6 @@ class TablesEntry(Record):
 class StageEntry(Record):
     """A stage of the run."""
 
-    MORE: ClassVar = _Plain
-
     stage: str = column("Name", head="stage")
     seconds: float = column("Wall time in seconds", head="seconds", form=".2f")
     cpu_seconds: float = column("CPU time in seconds", head="CPU seconds", form=".2f")
@@ -102,7 +101,7 @@ class StageEntry(Record):
 class Summary(Record):
     """summary.json of a run."""
 
-    schema: int = column("Version of this description", const=SCHEMA)
+    schema: Literal[3] = column("Version of this description")
     barpc: str = column("Release of barpc")
     kind: Literal["adjust", "check", "match"] = column("Whether cameras were adjusted, checked, or only matched")
     status: Literal["good", "look", "bad"] = column("The verdict on the run")
@@ -111,7 +110,7 @@ class Summary(Record):
     reasons: tuple[str, ...] = column("The reservations among them")
     passed: bool = column("Whether it is good: no image, point or file has a reservation (exit code 0, else 3)")
     altitude_m: Number = column("Median altitude of the tie points", ABOVE)
-    views: tuple[ViewEntry, ...] = column("The images", minItems=1)
+    views: tuple[ViewEntry, ...] = column("The images", min_length=1)
     pairs: tuple[PairEntry, ...] = column("Pairs with common tie points")
     left_out: tuple[LeftOutEntry, ...] = column("Files that were left out")
     tracks: TracksEntry = column("Tie points")
@@ -147,7 +146,7 @@ def published_schema() -> dict[str, Any]:
         "title": "summary.json of a barpc run",
         "description": "Pixel (0, 0) is the centre of the first one. A number that is not finite is null. "
         "Paths are relative to the run folder.",
-        **Summary.json_schema(),
+        **msgspec.json.schema(Summary),
     }
 
 

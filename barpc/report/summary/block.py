@@ -42,20 +42,20 @@ class ModeEntry(Record):
     """A motion of the scene that the images determine poorly."""
 
     sigma_m: Number = column("Posterior standard deviation", "m")
-    meaning: str = column("The motion", enum=list(MODES))
+    meaning: str = column("The motion", enum=MODES)
     motion_m: tuple[Number, ...] = column(
         "All motions for an error of this one by sigma_m: east, north, up, tilts, turn, scale, twist, bending",
         "m",
-        minItems=7,
-        maxItems=len(MOTIONS),
+        min_length=7,
+        max_length=len(MOTIONS),
     )
-    words: str = column("Its sentence", minLength=1)
+    words: str = column("Its sentence", min_length=1)
 
 
 class DatumEntry(Record):
     """Sources of a motion of the scene, as shares of its information. Tie points have none."""
 
-    part: str = column("Motion of the scene", head="motion", enum=list(MODES))
+    part: str = column("Motion of the scene", head="motion", enum=MODES)
     sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "sigma", ".2f")
     cameras: Number = column("Accuracies of the cameras as delivered", head="cameras", form=".0%")
     earlier_run: Number = column("The earlier run", head="earlier run", form=".0%")
@@ -117,12 +117,12 @@ class ExplanationEntry(Record):
     PAGE: ClassVar = "sentence gain gap runner_up"
 
     name: str = column("Its kind", enum=[*TERMS, FOREIGN_CAMERA])
-    sentence: str = column("The same as a sentence", head="explanation of residuals", minLength=1)
+    sentence: str = column("The same as a sentence", head="explanation of residuals", min_length=1)
     image: str | None = column("View; null where it concerns several")
     gain: float = column("Logarithm of its evidence over that of the model without it", "nats", "gain", ".0f")
     gap: float = column("The same over the runner-up", "nats", "over the next", ".0f")
     runner_up: str | None = column("Kind of the runner-up; null for none", head="next", default=None)
-    axis: str | None = column("Rows or columns", default=None, enum=[*AXES, None])
+    axis: str | None = column("Rows or columns", default=None, enum=AXES)
     first: Number = column("Its first row or column", "px", default=None)
     last: Number = column("Its last row or column", "px", default=None)
     size_px: Number = column("RMS displacement; of a sinusoid its amplitude", "px", default=None)
@@ -142,7 +142,7 @@ class LeftEntry(Record):
     PAGE: ClassVar = "image axis first last rejected off_px rejected_median_px gain"
 
     image: str = column("View", head="image")
-    axis: str = column("Rows or columns", head="axis", enum=list(AXES))
+    axis: str = column("Rows or columns", head="axis", enum=AXES)
     first: float = column("The first", "px", "first", ".0f")
     last: float = column("The last", "px", "last", ".0f")
     rejected: float = column("Share of their tie points that were rejected", head="rejected", form=".0%")
@@ -158,7 +158,7 @@ class HeldOutEntry(Record):
     PAGE: ClassVar = "sentence count chance"
 
     image: str = column("View")
-    sentence: str = column("The same as a sentence", head="larger residuals of check tie points", minLength=1)
+    sentence: str = column("The same as a sentence", head="larger residuals of check tie points", min_length=1)
     columns: tuple[float, float] | None = column("From, to; null for all", "px")
     rows: tuple[float, float] | None = column("From, to; null for all", "px")
     count: Count = column("Observations tested there", head="tested")
@@ -169,8 +169,6 @@ class HeldOutEntry(Record):
 
 class SceneEntry(Record):
     """The block."""
-
-    MORE: ClassVar = Any  # of earlier releases
 
     shift_enu_m: Vector = column("Mean shift of the tie points, east, north, up", "m")
     sigma_enu_m: Vector = column("Posterior standard deviation of the scene's position", "m")

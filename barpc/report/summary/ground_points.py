@@ -23,8 +23,8 @@ class KnownPoint(Record):
     """A point of given position."""
 
     name: str = column("Name")
-    lon: float = column("Longitude", "deg", minimum=-540, maximum=540)
-    lat: float = column("Latitude", "deg", minimum=-90, maximum=90)
+    lon: float = column("Longitude", "deg", ge=-540, le=540)
+    lat: float = column("Latitude", "deg", ge=-90, le=90)
     alt_m: float = column("Altitude", ABOVE)
 
 

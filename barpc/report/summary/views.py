@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from operator import attrgetter
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 from scipy.special import erf
 
 from barpc.ba import Adjustment
@@ -254,7 +255,7 @@ class ViewEntry(Record):
         """Its verdict and advice as a sentence; without meaning for an image without reservation."""
         return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
 
-    name: str = column("Unique in the run", head="image", minLength=1)
+    name: str = column("Unique in the run", head="image", min_length=1)
     path: str = column("The image; empty for a view without pixels")
     size: tuple[Side, Side] = column("Width, height", "px")
     alt_range_m: tuple[float, float] = column("Altitude range of the camera", ABOVE)
@@ -277,13 +278,12 @@ class ViewEntry(Record):
     correction: CorrectionEntry | None = column("The correction; null for a check")
     camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
     fit: FitEntry | None = column("Certificate of the refitted RPC; null where none was fitted")
-    outputs: Mapping[str, Mapping[str, float | str | None]] = column(
-        "File -> consumer -> difference to P_BA in px, or the reason without one",
-        propertyNames={"pattern": "^[^/]+$"},
+    outputs: Mapping[Annotated[str, Meta(pattern="^[^/]+$")], Mapping[str, float | str | None]] = column(
+        "File -> consumer -> difference to P_BA in px, or the reason without one"
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
-    cause: str | None = column("Name of the reservation; null without one", default=None, enum=[*CAUSES, None])
+    cause: str | None = column("Name of the reservation; null without one", default=None, enum=CAUSES)
     num_moving: Count = column("Excluded observations of tie points that move together", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from barpc.report.records import Number
 
@@ -20,9 +21,9 @@ STATUS_WORDS = {
 }
 """Status of a view -> its displayed word, from good to bad."""
 
-Count = Annotated[int, {"minimum": 0}]
-Side = Annotated[int, {"minimum": 1}]
-Share = Annotated[float, {"minimum": 0, "maximum": 1}]
+Count = Annotated[int, Meta(ge=0)]
+Side = Annotated[int, Meta(ge=1)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 Pixel = tuple[Number, Number]
 Vector = tuple[Number, Number, Number]
 ABOVE = "m above the ellipsoid"

@@ -22,8 +22,16 @@ from barpc.base.safe_io import MAX_XML, PRODUCT, opened, read_head, unread
 from barpc.sensor.curve import Orbit, fit_orbit
 from barpc.sensor.document import seconds
 from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
-from barpc.sensor.sentinel1.frames import Bistatic, Delays, GroundFrame, SlantFrame
-from barpc.sensor.sentinel1.range_doppler import RangeDoppler, grid_residuals, line_extent, swaths_model
+from barpc.sensor.sentinel1.range_doppler import (
+    Bistatic,
+    Delays,
+    GroundFrame,
+    RangeDoppler,
+    SlantFrame,
+    grid_residuals,
+    line_extent,
+    swaths_model,
+)
 
 __all__ = [
     "Annotation",
