@@ -236,7 +236,7 @@ class Draped(Record):
 class PairStrip(Draped):
     """Tiles of a pair along its epipolar lines, a row of them an image and kind of cameras."""
 
-    rows: tuple[str, ...] = column("What each row shows", minItems=1, maxItems=3)
+    rows: tuple[str, ...] = column("What each row shows", min_length=1, max_length=3)
     tiles: Side = column("Tiles of a row")
     half_px: float = column("From the middle of a tile to its edge, in the first image", "px")
 
@@ -336,12 +336,9 @@ def _parse_surface(text: str, run: str) -> tuple[tuple[ReliefWindow, ...], tuple
 
 
 def _parse_pictures(text: str) -> tuple[tuple[Draped, ...], tuple[PairStrip, ...]]:
-    import fastjsonschema
-
     found = parse_json(text)
-    kinds: dict[str, type[Record]] = {"images": Draped, "pairs": PairStrip}
-    lists = {key: {"type": "array", "items": kind.json_schema()} for key, kind in kinds.items()}
-    fastjsonschema.validate({"type": "object", "properties": lists, "required": list(lists)}, found)
+    if not isinstance(found, dict) or not all(isinstance(found.get(key), list) for key in ("images", "pairs")):
+        raise ValueError("no lists of images and of pairs")
     return tuple(map(Draped.read, found["images"])), tuple(map(PairStrip.read, found["pairs"]))
 
 
