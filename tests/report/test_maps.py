@@ -197,7 +197,7 @@ def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
         (first, _), (second, _) = residual_panels(views, files.observations, "after")[0]
         assert Drawing(first).points("gap") == []
         assert "few tie points" not in Drawing(first).described
-        assert Drawing(second).points("gap") == [[(0, 36), (180, 36), (180, 54), (0, 54)]]  # 800 rows on 144 units
+        assert Drawing(second).points("gap") == [[(0, 60), (300, 60), (300, 90), (0, 90)]]  # 800 rows on 240 units
         assert Drawing(second).described.endswith("; shaded: few tie points.")
         caption = _map_section(files).charts[0][1]
         assert caption.endswith("; shaded: rows or columns with few tie points.")
