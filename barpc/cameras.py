@@ -36,7 +36,7 @@ from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
 
-_ON_EARTH = (-500.0, 9000.0)  # m: all ground
+EVERYWHERE = (-500.0, 9000.0)  # m: altitudes of all ground
 
 
 ChoiceReader = Callable[[str], Any]
@@ -228,7 +228,7 @@ def _on_disk(path: PathOrUrl, what: str) -> Path:
     return path
 
 
-def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
+def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = EVERYWHERE) -> Camera:
     from barpc.sensor.csm import open_state
 
     model, size = open_state(_on_disk(path, "a camera's state"))
@@ -292,7 +292,7 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
             return altitude_range(read_rpc_source(file.parent / name).rpc)
         except (ImageError, RpcError):
             continue
-    return _ON_EARTH
+    return EVERYWHERE
 
 
 _has_vendor_root = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
 
+if TYPE_CHECKING:
+    from barpc.tie.tasks import Progress
+
 logger = logging.getLogger(__name__)
 
 CALIBRATION_SCHEMA = "barpc calibration 1"
@@ -51,7 +54,12 @@ class _FinishedRun:
 
 
 def calibrate(
-    runs: Sequence[str | Path], out: str | Path, sensor: str | None = None, *, overwrite: bool = False
+    runs: Sequence[str | Path],
+    out: str | Path,
+    sensor: str | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Estimate the interior distortion of one sensor from finished runs, for `adjust` to apply.
 
@@ -62,6 +70,7 @@ def calibrate(
     sensor : str, optional
         Its name. Images that state another one are excluded; without, all images must state the same.
     overwrite : bool, replace the file
+    progress : callable, optional, `progress(stage, done, total)`
 
     Returns
     -------
@@ -77,9 +86,15 @@ def calibrate(
     refuse_existing(out, overwrite)
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
-    opened = [(Path(folder), *_images_of(Path(folder))) for folder in runs]
-    name = _one_sensor([stated for *_, stated in opened], sensor)
-    found = [_finished_run(*one, name) for one in opened]
+    opened, tell = list[tuple[Path, _OpenedRun]](), progress or (lambda *_: None)
+    for number, folder in enumerate(runs):
+        tell("open", number, len(runs))
+        opened.append((Path(folder), _images_of(Path(folder))))
+    name, found = _one_sensor([stated for _, (*_, stated) in opened], sensor), list[_FinishedRun]()
+    for number, (folder, run) in enumerate(opened):
+        tell("read", number, len(opened))
+        found.append(_finished_run(Path(folder), *run, name))
+    tell("estimate", 0, 1)
     roots = [manifest.read(one.folder)[0] for one in found]
     if len(set(roots)) < len(roots):
         raise InputError(f"{next(one.folder for one, r in zip(found, roots, strict=True) if roots.count(r) > 1)}: "

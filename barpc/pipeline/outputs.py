@@ -194,8 +194,15 @@ class Proved:
     now: str
     note: str = ""
 
+    @property
+    def passed(self) -> bool:
+        """Whether the file is unchanged, as far as it was to be verified."""
+        return self.now in PASSED_STATES
 
-def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None) -> list[Proved]:
+
+def prove(
+    folder: Path, places: Sequence[Path] = (), expected: str | None = None, progress: Progress | None = None
+) -> list[Proved]:
     """Compare a run, or an export, with its SHA256SUMS, and that with an `expected` root, of any of its layers.
 
     Inputs that are gone are looked for by name in `places`. InputError where SHA256SUMS is missing or damaged.
@@ -211,7 +218,11 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     # of what the first command wrote a later one makes the report again, and nothing else
     listed |= {name: sha for name, sha in layers[0].files.items() if name != REPORT_FILE}
     roots = {root, *(layer.after for layer in layers[1:])}
-    found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted, roots)]
+    tell = progress or (lambda *_: None)
+    found = [*_roots(root, noted.get(SUMS, root), layers, expected)]
+    for one in _outputs(folder, listed, noted, roots):
+        tell("verify outputs", len(found), len(listed) + 1)
+        found.append(one)
     for path, image, _ in hidden_by(folder / name for name in listed if name not in layers[0].files):
         if image.name in layers[0].files:  # no command of barpc writes such a file
             found.append(Proved("output", path.name, ADDED, f"for some tools it goes before the RPC of {image.name}"))
@@ -220,7 +231,10 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
             summary = read_summary(folder)
         except InputError as error:
             return [*found, Proved("input", LAST, MISSING, f"what it says of inputs: {error}")]
-        found += [*_inputs(summary, folder, places), *_verify_cameras(summary, folder)]
+        for number, one in enumerate(_inputs(summary, folder, places), start=1):
+            tell("verify inputs", number, len(summary.inputs or ()))
+            found.append(one)
+        found += _verify_cameras(summary, folder)
     return found
 
 

@@ -22,6 +22,7 @@ from barpc.base.geodesy import (
     NEWTON_TOLERANCE,
     Array,
     IntArray,
+    as_image,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
@@ -265,7 +266,7 @@ class Corrected(Behind):
         Where the uncorrected sensor sees them, brought back; at the altitude from which the correction brings them to
         the one asked for. It turns by so little that each step gains four digits. NaN where that does not settle.
         """
-        return pointwise(lambda *part: [self.localize_rows(*part)], [(3,)], image, alt)[0]
+        return pointwise(lambda *part: [self.localize_rows(*part)], [(3,)], as_image(image), alt)[0]
 
     def localize_rows(self, image: Array, alt: Array) -> Array:
         """Localise image points (n, 2) at altitudes (n,), all at once."""

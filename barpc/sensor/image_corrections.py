@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array, IntArray
+from barpc.base.geodesy import Array, IntArray, as_image
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.direct_grid import LINEAR, MAX_NODE_SPACING, linear_axes
 
@@ -67,7 +67,7 @@ class Displaced(Behind):
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
+        return self.sensor.localize(self.correction.undo(as_image(image)), alt)
 
 
 def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
