@@ -20,6 +20,7 @@ _PUBLIC_MODULES = {
     "barpc.verbs.converting": "convert",
     "barpc.verbs.describe": "info",
     "barpc.verbs.fitting": "fit",
+    "barpc.verbs.orthoimages": "ortho",
     "barpc.pipeline.calibrate": "calibrate",
     "barpc.pipeline": "AdjustResult",
     "barpc.cameras": "open_camera",
@@ -69,6 +70,7 @@ if TYPE_CHECKING:
     from barpc.verbs.converting import convert as convert
     from barpc.verbs.describe import info as info
     from barpc.verbs.fitting import fit as fit
+    from barpc.verbs.orthoimages import ortho as ortho
     from barpc.verbs.points import localize as localize
     from barpc.verbs.points import project as project
     from barpc.verbs.points import triangulate as triangulate

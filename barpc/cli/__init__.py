@@ -43,6 +43,7 @@ COMMANDS = {
     "convert": "Write RPCs in other formats, cut out windows, deliver images.",
     "export": "Export a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
+    "ortho": "Orthoimages on one grid, by GDAL's warper.",
     "calibrate": "Estimate a sensor's interior distortion from finished runs.",
     "verify": "Whether inputs, outputs and cameras of a run are unchanged.",
     "report": "Make report.html of a finished run again, or compare two runs.",
@@ -50,7 +51,7 @@ COMMANDS = {
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _COMMAND_MODULES = {
     **dict.fromkeys(("match", "check"), "adjust"),
-    **dict.fromkeys(("report", "export", "verify", "dsm", "calibrate"), "run_commands"),
+    **dict.fromkeys(("report", "export", "verify", "dsm", "ortho", "calibrate"), "run_commands"),
     **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 

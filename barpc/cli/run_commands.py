@@ -13,13 +13,14 @@ import click
 
 from barpc.base.options import DsmOptions, declared
 from barpc.cli.flags import Function, jobs_option
+from barpc.cli.project import with_heights
 from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, remark, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface
 
 
-_TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
+_TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 
 @click.command("report")
@@ -68,9 +69,8 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
     satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
-    each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
-    commands for orthoimages; stac: a collection for catalogues; points: tie points with their covariance. Images are
-    pointed at, relative to OUT_DIR, and never copied.
+    each; s2p, cars, asp: a configuration that is ready to run; stac: a collection for catalogues; points: tie points
+    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied.
 
     \b
     Examples:
@@ -161,6 +161,40 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
             f"residuals of {better} improve"
         )
         tell(out)
+    return 0
+
+
+@click.command("ortho")
+@click.argument("images", nargs=-1, required=True, metavar="RUN | IMAGE...")
+@click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the orthoimages.")
+@with_heights(
+    "Without a DEM: altitude of the ground [m].  [default: of the run's tie points, else the camera's middle]"
+)
+@click.option("--gsd", type=float, metavar="M", help="Side of a pixel.  [default: that of the finest image]")
+@click.option("--crs", metavar="NAME", help="Map projection in metres.  [default: the UTM zone of the first image]")
+@click.option("--overwrite", is_flag=True, help="Replace orthoimages of an earlier call.")
+@click.pass_obj
+def ortho(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+    r"""Make orthoimages of images with RPCs: Cloud-Optimised GeoTIFFs whose pixels lie on one grid.
+
+    A RUN brings its corrected cameras and the DEMs that it was made with. GDAL warps each image by its RPC on the
+    heights, which are above the ellipsoid first, whatever the DEM counts from. Where the DEM has no height, there are
+    no pixels; without a DEM all ground is at one altitude.
+
+    
+    Examples:
+      barpc ortho adjusted --dem srtm.tif --geoid egm96 -o maps
+      barpc ortho image.tif --alt 180 --gsd 0.5 --crs EPSG:2154 -o maps
+    """
+    from barpc.verbs import orthoimages
+
+    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+        done = orthoimages.ortho(images, out_dir, progress=progress, **flags)
+    if wants_json():
+        echo(json.dumps([{**asdict(one), "path": str(one.path)} for one in done]))
+        return 0
+    for one in done:
+        tell(f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}")
     return 0
 
 

@@ -13,7 +13,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.base.identity import fingerprint
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
-from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
+from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
 from barpc.workspace import Homes, Workspace
@@ -23,7 +23,7 @@ __all__ = ["TARGETS", "export_run"]
 logger = logging.getLogger(__name__)
 
 TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
-    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, ortho, stac, points)
+    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, stac, points)
 }
 """Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
 

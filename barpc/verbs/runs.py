@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from barpc import pipeline
 from barpc.base.errors import UsageError
 from barpc.base.options import DsmOptions, with_values
-from barpc.verbs.images import ImageLike, every
+from barpc.verbs.images import ImageLike, every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def dsm(
 
 def run_folder(source: Any) -> Path | None:
     """Return the finished run that is given as images; None for images. UsageError for a run beside others."""
-    given = [source] if isinstance(source, (str, os.PathLike)) else list(source)
+    given, _ = one_or_many(source)
     paths = [Path(one) for one in given if isinstance(one, (str, os.PathLike))]
     runs = [path for path in paths if (path / "summary.json").is_file()]
     if runs and len(given) > 1:
@@ -220,7 +220,7 @@ def export(
     ----------
     run_dir : path of a finished adjustment
     out_dir : path, a new folder; files in it point at images and run relative to it
-    to : str, the tool: satnerf, colmap, s2p, cars, asp, ortho, stac, points
+    to : str, the tool: satnerf, colmap, s2p, cars, asp, stac, points
     alt : (low, high), optional, altitudes of the scene [m above the ellipsoid]; else by its tie points
     overwrite : bool, replace what an earlier export wrote there
 
