@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import barpc
@@ -22,9 +23,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(autouse=True)
 def _an_example_s_folder(request: pytest.FixtureRequest, doctest_namespace: dict[str, Any]) -> None:
-    """A doctest has `barpc`, and writes nowhere else."""
+    """A doctest has `barpc` and `np`, and writes nowhere else."""
     if isinstance(request.node, pytest.DoctestItem):
-        doctest_namespace["barpc"] = barpc
+        doctest_namespace.update(barpc=barpc, np=np)
         folder = request.getfixturevalue("tmp_path")
         (folder / "data_samples").symlink_to(Path(__file__).parent / "data_samples")
         request.getfixturevalue("monkeypatch").chdir(folder)

@@ -69,12 +69,22 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
         centre), ``band``. Sentinel-1: those of `sentinel1.open_product`. Grid: ``altitudes`` of its layers.
         Physical model, where ``model`` is "physical": those of `linescan.read_linescan`, and ``altitudes`` (low, high).
 
+    Returns
+    -------
+    Camera, with `model`, `size`, `alt_range`, `format` and `path`
+
     Raises
     ------
     InputError
         A choice that this kind of camera does not have, or no value of it.
     ImageError, RpcError
         No such file, none of the kinds, or a damaged one.
+
+    Examples
+    --------
+    >>> camera = barpc.open_camera("data_samples/view_00.tif")
+    >>> camera.format, camera.size, camera.alt_range
+    ('tag', (1000, 1000), (-50.0, 550.0))
     """
     return open_split(*split_spec(spec), **choices)
 

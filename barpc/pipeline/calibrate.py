@@ -81,6 +81,12 @@ def calibrate(
     InputError
         Runs that cannot be used or that determine no curve: it changes with time, directions do not suffice, or the
         residuals of runs left out do not improve. Nothing is written then.
+
+    Examples
+    --------
+    >>> barpc.calibrate(["monday", "tuesday"], "sensor.cal")
+    Traceback (most recent call last):
+    barpc.base.errors.InputError: 2 runs given: at least 3 finished runs are needed, to hold some out
     """
     out = Path(out)
     refuse_existing(out, overwrite)

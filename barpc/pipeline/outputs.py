@@ -28,9 +28,10 @@ from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, Written, grid_names
 from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
 from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
+from barpc.report.geopackage import geopackage
 from barpc.report.page import REPORT_FILE, REPORT_STAGE, can_render, report_html
 from barpc.report.records import json_form
-from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, read_summary
+from barpc.report.runfiles import FOLDER, TABLES, gcps_geojson, map_layers, read_summary
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, format_for, hidden_by, sidecars, write_camera
@@ -44,6 +45,7 @@ from barpc.workspace import LAST, Homes, Workspace, noted_outputs, own_files
 
 MATCH_FILES = ("matches.csv", "matches.npz")
 GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
+MAP_FILE = "map.gpkg"
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
@@ -119,7 +121,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{FOLDER}/{name}" for name in TABLES), LAST, SUMS]
+    names = [*(f"{FOLDER}/{name}" for name in TABLES), MAP_FILE, LAST, SUMS]
     names += [REPORT_FILE] * can_render() + [GCP_FILE] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -157,6 +159,8 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
         for name, content in TABLES.items():
             with workspace.output(f"{FOLDER}/{name}") as partial, partial.open("wb") as file:
                 file.writelines(content(run, summary))
+        with workspace.output(MAP_FILE) as partial:
+            partial.write_bytes(geopackage(map_layers(run, summary)))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
             workspace.write_text(GCP_FILE, gcps_geojson(run).decode())
     with workspace.stage(REPORT_STAGE):

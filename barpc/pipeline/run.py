@@ -20,6 +20,7 @@ from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.ba.calibration import CommonErrors
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.frozen import html_table
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
@@ -54,9 +55,10 @@ from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
-from barpc.report.records import json_form
+from barpc.report.records import json_form, table
 from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
+from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import plain_source
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
@@ -82,6 +84,12 @@ class AdjustResult:
         order of their names, `run.views`, whatever the order given.
     record : Summary, content of summary.json as a typed record
     root : str, the SHA-256 of SHA256SUMS, by which `barpc verify` knows the run; empty where nothing was written
+
+    Examples
+    --------
+    >>> found = barpc.check("data_samples/view_0[01].tif", points_per_image=300)
+    >>> found.run.kind, [view.name for view in found.views]
+    ('check', ['view_00', 'view_01'])
     """
 
     views: tuple[View, ...]
@@ -100,6 +108,12 @@ class AdjustResult:
         counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
         written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
         return f"AdjustResult({self.run.kind}: {counts}, {self.record.status}{written})"
+
+    def _repr_html_(self) -> str:
+        record, adjusted = self.record, self.record.adjusted
+        shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
+        heads, *rows = shown.texts
+        return html_table(shown.caption, rows, heads)
 
     @property
     def passed(self) -> bool:

@@ -15,13 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from barpc.base.frozen import Frozen
+from barpc.base.frozen import Frozen, Shown
 from barpc.base.geodesy import Array, as_ground, as_image, pointwise
 
 
 @runtime_checkable
 class SensorModel(Protocol):
-    """The protocol of every camera: projection, its derivative, localisation."""
+    """The protocol of every camera: projection, its derivative, localisation.
+
+    Examples
+    --------
+    >>> isinstance(barpc.read_rpc("data_samples/view_00.tif"), barpc.SensorModel)
+    True
+    """
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
@@ -68,7 +74,7 @@ class Pointwise(Frozen):
 
 
 @dataclass(frozen=True)
-class Behind:
+class Behind(Shown):
     """Base of models that are another one, `sensor`, behind a correction."""
 
     sensor: Any

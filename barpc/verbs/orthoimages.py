@@ -20,6 +20,7 @@ from rasterio.windows import Window
 
 from barpc import __version__
 from barpc.base.errors import InputError, Remark
+from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
 from barpc.export.shots import Scene, read_scene
@@ -70,7 +71,7 @@ class OrthoChoices:
 
 
 @dataclass(frozen=True)
-class Ortho:
+class Ortho(Shown):
     """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with."""
 
     path: Path
