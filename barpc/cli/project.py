@@ -31,7 +31,7 @@ def with_heights(alt: str) -> Callable[[Function], Function]:
 
     def added(verb: Function) -> Function:
         verb = click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)(verb)
-        verb = click.option("--dem", metavar="FILE", multiple=True, help="Take altitudes from a DEM (repeatable).")(
+        verb = click.option("--dem", metavar="FILE", multiple=True, help="Take the altitudes from a DEM (repeatable).")(
             verb
         )
         return click.option("--alt", type=float, help=alt)(verb)

@@ -200,7 +200,7 @@ class Proved:
 
     @property
     def passed(self) -> bool:
-        """Whether the file is unchanged, as far as it was to be verified."""
+        """Whether the file counts as unchanged."""
         return self.now in PASSED_STATES
 
 
