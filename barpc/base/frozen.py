@@ -40,7 +40,8 @@ class Shown:
     """Base of dataclasses that a notebook shows as a table, a row a field."""
 
     def _repr_html_(self) -> str:
-        rows = [(one.name, _short(getattr(self, one.name))) for one in fields(self) if one.init]  # type: ignore[arg-type]
+        given = [(one.name, getattr(self, one.name)) for one in fields(self) if one.init]  # type: ignore[arg-type]
+        rows = [(name, value if isinstance(value, str | Path) else _short(value)) for name, value in given]
         return html_table(type(self).__name__, rows)
 
 

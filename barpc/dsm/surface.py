@@ -104,22 +104,7 @@ def make_dsm(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Surface:
-    """Make a first surface model of a finished run, or of images with their cameras.
-
-    Parameters
-    ----------
-    source : path of a run folder, or a list of images
-    out : path of the GeoTIFF
-    options : DsmOptions, optional
-    executor, progress : as of `barpc.adjust`; the bytes written do not depend on them
-
-    Raises
-    ------
-    NoSurfaceError
-        Images that SGBM cannot match: radar, too large an angle, hardly a pixel that is found back.
-    InputError, OutputError
-        See `barpc.base.errors`; nothing is written then.
-    """
+    """Make a first surface model of a finished run (a path), or of images with their cameras: see `barpc.dsm`."""
     options, out, folder = options or DsmOptions(), Path(out), None
     plain_path(out.absolute())
     if isinstance(source, str | Path):

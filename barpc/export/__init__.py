@@ -36,27 +36,7 @@ def export_run(
     alt_range: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Hand a finished run to another tool.
-
-    Parameters
-    ----------
-    folder : path, of a finished adjustment
-    target : str, a row of `TARGETS`
-    out : path, a new folder; files in it point at images and run relative to it
-    alt_range : (low, high), optional, altitudes of the scene [m above the ellipsoid]; None: by its tie points
-    overwrite : bool, replace what an earlier export wrote there
-
-    Returns
-    -------
-    paths : list of Path, the files written
-
-    Raises
-    ------
-    InputError
-        No such target, no finished adjustment, altitudes that are no interval.
-    OutputError
-        The folder is in use, not empty, or the run's own.
-    """
+    """Hand a finished run to another tool, a row of `TARGETS`; return the files written: see `barpc.export`."""
     folder, out = Path(folder), Path(out)
     if target not in TARGETS:
         raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")

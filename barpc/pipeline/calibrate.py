@@ -92,24 +92,19 @@ def calibrate(
     refuse_existing(out, overwrite)
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
-    opened, tell = list[tuple[Path, _OpenedRun]](), progress or (lambda *_: None)
+    opened, tell = list[_OpenedRun](), progress or (lambda *_: None)
     for number, folder in enumerate(runs):
         tell("open", number, len(runs))
-        opened.append((Path(folder), _images_of(Path(folder))))
-    name, found = _one_sensor([stated for _, (*_, stated) in opened], sensor), list[_FinishedRun]()
-    for number, (folder, run) in enumerate(opened):
+        opened.append(_images_of(Path(folder)))
+    name, found = _one_sensor([stated for *_, stated in opened], sensor), list[_FinishedRun]()
+    for number, run in enumerate(opened):
         tell("read", number, len(opened))
-        found.append(_finished_run(Path(folder), *run, name))
-    tell("estimate", 0, 1)
-    roots = [manifest.read(one.folder)[0] for one in found]
-    if len(set(roots)) < len(roots):
-        raise InputError(f"{next(one.folder for one, r in zip(found, roots, strict=True) if roots.count(r) > 1)}: "
-                         "is given twice")  # fmt: skip
+        found.append(_finished_run(Path(runs[number]), *run, name))
+    roots = _one_root_each(found)
     _one_width(found)
     order = sorted(range(len(found)), key=lambda i: (found[i].ties.date, roots[i]))
     found, roots = [found[i] for i in order], [roots[i] for i in order]
-    learnt = learn([one.ties for one in found])
-    _refuse_unsure(name, learnt, found)
+    _refuse_unsure(name, learnt := learn([one.ties for one in found]), found)
     content = _content(name, learnt, found, roots)
     write_text(out, json.dumps(content, indent=1) + "\n", overwrite=overwrite)
     return content
@@ -179,6 +174,14 @@ def _row_direction(view: View, sensor: SensorModel) -> float:
     first, last = sensor.localize(np.array([[middle, 0.0], [middle, view.size[1] - 1.0]]), np.full(2, view.altitude))
     east, north = ((last - first) * metres_per_unit(first))[:2]
     return float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
+    roots = [manifest.read(one.folder)[0] for one in found]
+    twice = [one.folder for one, root in zip(found, roots, strict=True) if roots.count(root) > 1]
+    if twice:
+        raise InputError(f"{twice[0]}: is given twice")
+    return roots
 
 
 def _one_width(found: Sequence[_FinishedRun]) -> None:

@@ -149,24 +149,7 @@ def adjust(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> AdjustResult:
-    """Correct the cameras of overlapping images and write fresh RPCs.
-
-    Parameters
-    ----------
-    images : sequence of path or View
-        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only.
-        Cameras are found as by `barpc.cameras.open_camera`; a View brings its own model (a frozen dataclass, so
-        that results can be cached).
-    out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
-    options : RunOptions, optional, None: the defaults
-    executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
-    progress : callable, optional, `progress(stage, done, total)`
-
-    Raises
-    ------
-    BarpcError
-        See `barpc.base.errors`; nothing is written then.
-    """
+    """Correct the cameras of overlapping images, paths or Views, and write fresh RPCs: see `barpc.adjust`."""
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
     stages, seen, work = list[dict[str, Any]](), dict[str, Stamp](), Work(executor, progress)

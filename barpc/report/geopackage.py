@@ -49,7 +49,7 @@ class Layer:
     rows: Iterable[Sequence[Any]]
 
 
-def points(lonlatalt: Array) -> Sequence[Any]:
+def point_shapes(lonlatalt: Array) -> Sequence[Any]:
     """Return points (n, 3) as geometries."""
     return [shapely.Point(place) for place in lonlatalt.tolist()]
 
@@ -60,7 +60,7 @@ def geopackage(layers: Sequence[Layer]) -> bytes:
     Examples
     --------
     >>> import numpy as np
-    >>> layer = Layer("ties", points(np.array([[5.4, 43.3, 120.0]])), ["track INTEGER"], [(7,)])
+    >>> layer = Layer("ties", point_shapes(np.array([[5.4, 43.3, 120.0]])), ["track INTEGER"], [(7,)])
     >>> geopackage([layer])[:15]
     b'SQLite format 3'
     """

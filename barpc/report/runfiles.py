@@ -25,7 +25,7 @@ from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array, feature_collection, geojson_feature
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
-from barpc.report.geopackage import Layer, points
+from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, column, value_of
 from barpc.report.renamed import with_new_names
@@ -150,12 +150,12 @@ def map_layers(run: Run, summary: Summary) -> list[Layer]:
     layers = [Layer("footprints", shapes, columns, [tuple(one["properties"].values()) for one in outlines])]
     words = ["residual_px DOUBLE", "observations INTEGER", "residual_before_px DOUBLE", "track INTEGER"]
     rows = ((mean, int(count), before, int(track)) for mean, count, before, track in ties[:, 3:].tolist())
-    layers.append(Layer("tie_points", points(ties[:, :3]), words, rows))
+    layers.append(Layer("tie_points", point_shapes(ties[:, :3]), words, rows))
     words = ["name TEXT", "status TEXT", "east_m DOUBLE", "north_m DOUBLE", "up_m DOUBLE"]
     for name, entries in (("gcps", summary.gcps), ("check_points", summary.check_points)):
         places = np.array([(one.lon, one.lat, one.alt_m) for one in entries]).reshape(-1, 3)
         table = [(one.name, getattr(one, "status", "check"), *one.residual_enu_m) for one in entries]
-        layers.append(Layer(name, points(places), words, table))
+        layers.append(Layer(name, point_shapes(places), words, table))
     return layers
 
 

@@ -31,7 +31,7 @@ from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
-from barpc.verbs.images import ImageLike, camera_of, every, place_of
+from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
 from barpc.verbs.points import Files, altitude_of, ground_at, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
@@ -107,23 +107,21 @@ def ortho(
 
     Warns
     -----
-    Remark
-        An altitude was assumed, or a part of an image has no height and so no pixels.
+    Remark : an altitude was assumed, or a part of an image has no height and so no pixels
 
     Examples
     --------
-    >>> done = barpc.ortho("data_samples/view_00.tif", "maps", alt=120, gsd=2)
-    >>> done[0].crs, done[0].gsd, done[0].path.name
+    >>> (done,) = barpc.ortho("data_samples/view_00.tif", "maps", alt=120, gsd=2)
+    >>> done.crs, done.gsd, done.path.name
     ('EPSG:32631', 2.0, 'view_00.tif')
     """
-    choices, run = OrthoChoices(**keywords), run_folder(images)
-    terrain, alt = terrain_of(choices.dem, choices.geoid, choices.alt), choices.alt
-    if run is None:
-        cameras = [camera_of(image) for image in every(images)]
-        files = [Path(place_of(image)) for image in every(images)]
+    choices, (given, _) = OrthoChoices(**keywords), one_or_many(images)
+    alt, terrain = choices.alt, terrain_of(choices.dem, choices.geoid, choices.alt)
+    if (run := run_folder(given)) is None:
+        cameras, files = zip(*((camera_of(image), Path(place_of(image))) for image in every(given)), strict=True)
     else:
         cameras, heights = _of_run(scene := read_scene(run))
-        files = [Path(camera.path) for camera in cameras]
+        files = tuple(Path(camera.path) for camera in cameras)
         terrain = heights if terrain is None and alt is None else terrain
         alt = scene.summary.altitude_m if alt is None else alt
     middles = [one.model.localize((np.array(one.extent) - 1) / 2, np.array(one.altitude)) for one in cameras]
@@ -140,7 +138,7 @@ def ortho(
     return done
 
 
-def _of_run(scene: Scene) -> tuple[list[Camera], Dem | None]:
+def _of_run(scene: Scene) -> tuple[tuple[Camera, ...], Dem | None]:
     """Return the corrected cameras of a run, used at its altitudes, and the terrain that it was made with."""
     given: Any = scene.summary.options or {}
     at = Homes.of(scene.folder).located
@@ -149,7 +147,7 @@ def _of_run(scene: Scene) -> tuple[list[Camera], Dem | None]:
         name and (at(name) if Path(at(name)).exists() else Path(name).name)
         for name in map(given.get, ("geoid", "heights"))
     ]
-    cameras = [Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots]
+    cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
     return cameras, Dem.open([at(name) for name in dems], *taken) if dems else None
 
 

@@ -190,18 +190,18 @@ def dsm(
     from barpc.dsm import make_dsm
 
     chosen = with_values(options or DsmOptions(), keywords, "dsm")
-    run = run_folder(source)
+    given, _ = one_or_many(source)
+    run = run_folder(given)
     if run is None and chosen.minus is not None:
         raise UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
-    return make_dsm(run or every(source), out, chosen, executor=executor, progress=progress)
+    return make_dsm(run or every(given), out, chosen, executor=executor, progress=progress)
 
 
-def run_folder(source: Any) -> Path | None:
-    """Return the finished run that is given as images; None for images. UsageError for a run beside others."""
-    given, _ = one_or_many(source)
-    paths = [Path(one) for one in given if isinstance(one, (str, os.PathLike))]
+def run_folder(source: Sequence[Any]) -> Path | None:
+    """Return the finished run that is given in place of images, if any. UsageError for a run beside others."""
+    paths = [Path(one) for one in source if isinstance(one, (str, os.PathLike))]
     runs = [path for path in paths if (path / "summary.json").is_file()]
-    if runs and len(given) > 1:
+    if runs and len(source) > 1:
         raise UsageError(f"{runs[0]} is a finished run: give it alone (--minus OTHER_RUN is for two dates)")
     return runs[0] if runs else None
 

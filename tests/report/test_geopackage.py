@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from barpc.report.geopackage import Layer, geopackage, points
+from barpc.report.geopackage import Layer, geopackage, point_shapes
 from barpc.report.runfiles import read_tables
 
 
@@ -74,7 +74,7 @@ def test_the_standard_s_tables_name_every_layer_and_none_that_is_empty(block_run
 
 
 def test_numbers_that_are_not_known_are_null():
-    found = geopackage([Layer("a", points(np.array([[1.0, 2.0, 3.0]])), ["x DOUBLE"], [(float("nan"),)])])
+    found = geopackage([Layer("a", point_shapes(np.array([[1.0, 2.0, 3.0]])), ["x DOUBLE"], [(float("nan"),)])])
     with sqlite3.connect(":memory:") as data:
         data.deserialize(found)
         assert data.execute("SELECT x FROM a").fetchall() == [(None,)]
