@@ -93,13 +93,13 @@ def calibrate(
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
     opened, tell = list[_OpenedRun](), progress or (lambda *_: None)
-    for number, folder in enumerate(runs):
-        tell("open", number, len(runs))
+    for number, folder in enumerate(runs, start=1):
         opened.append(_images_of(Path(folder)))
+        tell("open", number, len(runs))
     name, found = _one_sensor([stated for *_, stated in opened], sensor), list[_FinishedRun]()
-    for number, run in enumerate(opened):
-        tell("read", number, len(opened))
-        found.append(_finished_run(Path(runs[number]), *run, name))
+    for folder, run in zip(runs, opened, strict=True):
+        found.append(_finished_run(Path(folder), *run, name))
+        tell("read", len(found), len(opened))
     roots = _one_root_each(found)
     _one_width(found)
     order = sorted(range(len(found)), key=lambda i: (found[i].ties.date, roots[i]))

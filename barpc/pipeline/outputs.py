@@ -224,8 +224,8 @@ def prove(
     roots = {root, *(layer.after for layer in layers[1:])}
     tell = progress or (lambda *_: None)
     found = [*_roots(root, noted.get(SUMS, root), layers, expected)]
-    for one in _outputs(folder, listed, noted, roots):
-        tell("verify outputs", len(found), len(listed) + 1)
+    for number, one in enumerate(_outputs(folder, listed, noted, roots), start=1):
+        tell("verify outputs", min(number, len(listed)), len(listed))  # more of them where files were added
         found.append(one)
     for path, image, _ in hidden_by(folder / name for name in listed if name not in layers[0].files):
         if image.name in layers[0].files:  # no command of barpc writes such a file

@@ -363,9 +363,9 @@ def _hand_off(
 ) -> Converted:
     """Write images, or windows of them, with their RPCs, and reopen every file as its readers do."""
     readings, reasons, notes, paths = list[Reading](), list[str](), list[str](), list[Path]()
+    tell = progress or (lambda *_: None)
     for number, (path, camera, window) in enumerate(images):
-        if progress is not None:
-            progress("convert", number, len(images))
+        tell("convert", number, len(images))
         rpc, written = camera.rpc, [workspace.folder / (path.stem + end) for end in ends]
         size = _image_size(path) if window is None else window[2:]
         for place in written:
@@ -379,6 +379,7 @@ def _hand_off(
             reasons += _shadow_reasons(path, written)
             notes += unverified(written) if not paths else []
         paths += written
+    tell("convert", len(images), len(images))
     off = [one for one in readings if not one.passed]
     reasons += [f"{r.path}: {r.consumer} {r.note or f'reads it with an error of {r.max_error:.1e} px'}." for r in off]
     return Converted(tuple(paths), tuple(readings), len(images), tuple(reasons), tuple(notes))

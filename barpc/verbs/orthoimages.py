@@ -205,11 +205,11 @@ class _Warp:
             what = {"dtype": kind, "nodata": none, "crs": self.crs, "transform": self.place, "BIGTIFF": "IF_SAFER"}
             with rasterio.open(out, "w", "GTiff", *self.size, source.count, **what, **layout) as file:
                 file.update_tags(BARPC=__version__, IMAGE=image.name, HEIGHTS=self.words)
-                for number, block in enumerate(blocks):
-                    if progress is not None:
-                        progress(f"ortho {image.stem}", number, len(blocks))
+                for number, block in enumerate(blocks, start=1):
                     if (part := self._pixels(block)) is not None:
                         file.write(self._warped(source, part, block, none), window=block)
+                    if progress is not None:
+                        progress(f"ortho {image.stem}", number, len(blocks))
 
     def _pixels(self, block: Window) -> Window | None:
         """Return the part of the image that a block of the map shows; None where it shows none."""

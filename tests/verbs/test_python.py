@@ -241,6 +241,23 @@ def test_what_is_converted_is_a_sentence_with_the_worst_reader(tmp_path):
     assert barpc.convert(VIEWS[0], tmp_path / "a.tif", window=(10, 20, 30, 40)).window == (10, 20, 30, 40)
 
 
+def test_verbs_that_take_time_say_how_far_they_are(tmp_path):
+    told: dict[str, list[tuple[int, int]]] = {}
+
+    def progress(stage, done, total):
+        told.setdefault(stage, []).append((done, total))
+
+    barpc.convert(VIEWS, out_dir=tmp_path / "handoff", progress=progress)
+    barpc.ortho(VIEWS[0], tmp_path / "maps", alt=120, gsd=1, progress=progress)
+    run = tmp_path / "ties"
+    barpc.match(VIEWS[:2], run, points_per_image=300, progress=progress)
+    assert all(one.passed for one in barpc.verify(run, progress=progress))
+    assert {"convert", "ortho view_00", "verify outputs", "verify inputs", "match"} <= told.keys()
+    for stage, rows in told.items():
+        assert rows[-1][0] == rows[-1][1] > 0, stage
+        assert [done for done, _ in rows] == sorted(done for done, _ in rows), stage
+
+
 # --- notebooks --------------------------------------------------------------------------------------------
 
 
