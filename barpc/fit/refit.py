@@ -81,13 +81,13 @@ def fit_rpc(
     >>> bool(barpc.fit_rpc(rpc, (1000, 1000), (0.0, 400.0)).max_ckp.max() < 1e-6)
     True
     """
-    return _fit_model(model, size, widened(alt_range), options or FitOptions(), strict)
+    return _fit_model(model, size, alt_range, options, strict)
 
 
 def _fit_model(
-    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions, strict: bool
+    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions | None, strict: bool
 ) -> RpcFit:
-    vendor = underlying_rpc(model)
+    options, alt_range, vendor = options or FitOptions(), widened(alt_range), underlying_rpc(model)
     sample = _check_sample(model, size, alt_range)
     screened(sample.ground, sample.points[:, :2])
     contradiction = sample.contradiction()
