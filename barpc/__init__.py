@@ -2,37 +2,50 @@
 
 Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
 The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
+A function is called as the verb of the command line: `barpc.fit`, `barpc.dsm` and `barpc.export` are folders, too.
 """
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+
+TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one would cost
 
 __version__ = "0.3.0"
 
 _PUBLIC_MODULES = {
+    "barpc.verbs.runs": "adjust check dsm export match verify",
+    "barpc.verbs.points": "localize project triangulate",
+    "barpc.verbs.converting": "convert",
+    "barpc.verbs.describe": "info",
+    "barpc.verbs.fitting": "fit",
+    "barpc.verbs.orthoimages": "ortho",
+    "barpc.pipeline.calibrate": "calibrate",
+    "barpc.pipeline": "AdjustResult",
+    "barpc.cameras": "open_camera",
+    "barpc.sensor": "SensorModel",
     "barpc.sensor.rpc": "RPC",
     "barpc.sensor.pushbroom": "Pushbroom",
     "barpc.sensor.sentinel1": "RangeDoppler",
-    "barpc.sensor": "SensorModel",
     "barpc.sensor.corrected": "Correction Corrected",
     "barpc.sensor.image_corrections": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
-    "barpc.pipeline": "adjust check AdjustResult",
-    "barpc.pipeline.calibrate": "calibrate",
-    "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
-    "barpc.cameras": "open_camera",
+    "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions DsmOptions",
     "barpc.base.errors": "BarpcError BarpcWarning",
 }
 _PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
+    from types import ModuleType
+    from typing import Any
+
     from barpc.base.errors import BarpcError as BarpcError
     from barpc.base.errors import BarpcWarning as BarpcWarning
     from barpc.base.options import AdjustOptions as AdjustOptions
+    from barpc.base.options import DsmOptions as DsmOptions
     from barpc.base.options import FitOptions as FitOptions
     from barpc.base.options import RunOptions as RunOptions
     from barpc.base.options import TieOptions as TieOptions
@@ -40,8 +53,6 @@ if TYPE_CHECKING:
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import AdjustResult as AdjustResult
-    from barpc.pipeline import adjust as adjust
-    from barpc.pipeline import check as check
     from barpc.pipeline.calibrate import calibrate as calibrate
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
@@ -56,14 +67,54 @@ if TYPE_CHECKING:
     from barpc.sensor.pushbroom import Pushbroom as Pushbroom
     from barpc.sensor.rpc import RPC as RPC
     from barpc.sensor.sentinel1 import RangeDoppler as RangeDoppler
+    from barpc.verbs.converting import convert as convert
+    from barpc.verbs.describe import info as info
+    from barpc.verbs.fitting import fit as fit
+    from barpc.verbs.orthoimages import ortho as ortho
+    from barpc.verbs.points import localize as localize
+    from barpc.verbs.points import project as project
+    from barpc.verbs.points import triangulate as triangulate
+    from barpc.verbs.runs import adjust as adjust
+    from barpc.verbs.runs import check as check
+    from barpc.verbs.runs import dsm as dsm
+    from barpc.verbs.runs import export as export
+    from barpc.verbs.runs import match as match
+    from barpc.verbs.runs import verify as verify
+else:
+    ModuleType = type(sys)
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
+_FOLDERS = frozenset({"dsm", "export", "fit"})
+
+
+class _Verb(ModuleType):
+    """A folder with the name of a verb: called, it is the verb."""
+
+    def __call__(self, *args: Any, **keywords: Any) -> Any:
+        return self.__wrapped__(*args, **keywords)
+
+    @property
+    def __wrapped__(self) -> Any:
+        name = self.__name__.rpartition(".")[2]
+        return getattr(import_module(_PUBLIC[name]), name)
+
+
+class _Package(ModuleType):
+    """barpc itself, in which an import of a folder puts it in the place of its verb."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _FOLDERS and isinstance(value, ModuleType):
+            value.__class__ = _Verb
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'barpc' has no attribute {name!r}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    return import_module(f"barpc.{name}") if name in _FOLDERS else getattr(import_module(_PUBLIC[name]), name)
 
 
 def __dir__() -> list[str]:

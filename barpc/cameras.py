@@ -36,7 +36,7 @@ from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
 
-_ON_EARTH = (-500.0, 9000.0)  # m: all ground
+EVERYWHERE = (-500.0, 9000.0)  # m: altitudes of all ground
 
 
 ChoiceReader = Callable[[str], Any]
@@ -69,12 +69,22 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
         centre), ``band``. Sentinel-1: those of `sentinel1.open_product`. Grid: ``altitudes`` of its layers.
         Physical model, where ``model`` is "physical": those of `linescan.read_linescan`, and ``altitudes`` (low, high).
 
+    Returns
+    -------
+    Camera, with `model`, `size`, `alt_range`, `format` and `path`
+
     Raises
     ------
     InputError
         A choice that this kind of camera does not have, or no value of it.
     ImageError, RpcError
         No such file, none of the kinds, or a damaged one.
+
+    Examples
+    --------
+    >>> camera = barpc.open_camera("data_samples/view_00.tif")
+    >>> camera.format, camera.size, camera.alt_range
+    ('tag', (1000, 1000), (-50.0, 550.0))
     """
     return open_split(*split_spec(spec), **choices)
 
@@ -228,7 +238,7 @@ def _on_disk(path: PathOrUrl, what: str) -> Path:
     return path
 
 
-def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = _ON_EARTH) -> Camera:
+def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = EVERYWHERE) -> Camera:
     from barpc.sensor.csm import open_state
 
     model, size = open_state(_on_disk(path, "a camera's state"))
@@ -292,7 +302,7 @@ def _stated_altitudes(file: Path) -> tuple[float, float]:
             return altitude_range(read_rpc_source(file.parent / name).rpc)
         except (ImageError, RpcError):
             continue
-    return _ON_EARTH
+    return EVERYWHERE
 
 
 _has_vendor_root = re.compile(rb"<(\w+:)?(isd|Dimap_Document)\b").search

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import InputError
-from barpc.base.frozen import Frozen
+from barpc.base.frozen import Frozen, Shown
 from barpc.base.geodesy import Array, HeightDatum
 from barpc.base.geodesy import BoolArray as BoolArray
 from barpc.base.geodesy import IntArray as IntArray
@@ -28,7 +28,7 @@ Terrain = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(Shown):
     """A camera and where it came from."""
 
     model: SensorModel
@@ -79,6 +79,12 @@ class View(Frozen):
     sensor : SensorModel, the camera as delivered
     alt_range : (float, float), altitudes [m above the ellipsoid] that the camera is used for
     date : str, the day the image was taken (2013-04-17); empty where nobody says
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> barpc.View("view_00", "data_samples/view_00.tif", (1000, 1000), rpc, (-50.0, 550.0))
+    View('view_00', 1000 x 1000 px, RPC for -50 to 550 m)
     """
 
     name: str
@@ -115,6 +121,11 @@ class Tracks(Frozen):
     point : (K,), index of the track, 0 .. P-1; rows of one track stand together, views ascending
     xy : (K, 2), col, row [px]
     sigma : (K,), standard deviation of each coordinate [px]
+
+    Examples
+    --------
+    >>> barpc.Tracks([0, 1], [0, 0], [[10.0, 20.0], [11.0, 21.0]], [0.3, 0.3])
+    Tracks(1 tie points, ...)
     """
 
     view: IntArray
@@ -177,6 +188,12 @@ class GroundPoints(Frozen):
     left_out : tuple of str, points left out of their files, with the reason, in sentences
     said : tuple of str, how their files were read, where that had to be guessed or converted, in sentences
     datums : tuple of HeightDatum, what the altitudes of their files were taken to count from, where no person said it
+
+    Examples
+    --------
+    >>> place = {"lonlatalt": [[5.4, 43.3, 120.0]], "sigma": [[1.0, 1.0, 2.0]]}
+    >>> barpc.GroundPoints(("A",), **place, point=[0], view=[0], xy=[[509.8, 494.6]], xy_sigma=[0.3])
+    GroundPoints(...)
     """
 
     names: tuple[str, ...]

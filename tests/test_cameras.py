@@ -21,7 +21,7 @@ from barpc.base.geodesy import (
     ground_from_ecef,
 )
 from barpc.base.remote import Remote
-from barpc.cameras import _ON_EARTH as ON_EARTH
+from barpc.cameras import EVERYWHERE as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
 from barpc.cli import cli, main
 from barpc.rpcio import read_rpc, write_rpc

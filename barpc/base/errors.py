@@ -78,12 +78,20 @@ class InputError(BarpcError, ValueError):
     """Options or side files (GCPs, tie points, AOI, DEM) contradict each other or do not parse."""
 
 
+class UsageError(InputError):
+    """Arguments that do not go together, or that name nothing in the input: exit code 2 of a command."""
+
+
 class OutputError(BarpcError, OSError):
     """A result cannot be written: it exists already, the disk is full, the folder is read-only."""
 
 
 class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
+
+
+class Remark(BarpcWarning):
+    """An assumption that a result is based on, or a side effect: a command prints it and ends with exit code 0."""
 
 
 _MEMORY_ALLOWANCE = (

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from barpc.base.errors import InputError
+
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -62,6 +64,28 @@ def parts(stop: int, size: int = CHUNK, start: int = 0) -> Iterator[slice]:
         yield slice(first, min(first + size, stop))
 
 
+def as_points(values: npt.ArrayLike, width: int, what: str, axis: str) -> Array:
+    """Return points as float64 (..., width); InputError names the last axis that is expected and the shape found."""
+    try:
+        points = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what}: numbers are expected, (..., {width}): {axis} ({error})") from error
+    if points.shape[-1:] != (width,):
+        turned = "; transpose them" if points.ndim == 2 and len(points) == width else ""
+        raise InputError(f"{what} of shape {points.shape}: (..., {width}) is expected, {axis} on the last axis{turned}")
+    return points
+
+
+def as_ground(ground: npt.ArrayLike) -> Array:
+    """Return ground points as float64 (..., 3); see `as_points`."""
+    return as_points(ground, 3, "ground points", "lon, lat [deg], altitude [m]")
+
+
+def as_image(image: npt.ArrayLike) -> Array:
+    """Return image points as float64 (..., 2); see `as_points`."""
+    return as_points(image, 2, "image points", "col, row [px]")
+
+
 def pointwise(
     function: Callable[..., Iterable[Array]],
     shapes: Sequence[tuple[int, ...]],
@@ -80,7 +104,11 @@ def pointwise(
     if alt is not None:
         alt = np.asarray(alt, dtype=np.float64)
         if alt.shape != lead:
-            lead = np.broadcast_shapes(lead, alt.shape)
+            try:
+                lead = np.broadcast_shapes(lead, alt.shape)
+            except ValueError:
+                expected = f"one, or an array that broadcasts with {lead}"
+                raise InputError(f"altitudes of shape {alt.shape} for points {points.shape}: {expected}") from None
             points, alt = np.broadcast_to(points, (*lead, k)), np.broadcast_to(alt, lead)
         flat = [points.reshape(-1, k), alt.reshape(-1)]
     count = len(flat[0])
@@ -98,7 +126,7 @@ def pointwise(
 
 def ecef_from_ground(ground: npt.ArrayLike) -> Array:
     """Return ECEF coordinates (..., 3) [m] of ground points (..., 3)."""
-    ground = np.asarray(ground, dtype=np.float64)
+    ground = as_ground(ground)
     lon, lat, alt = ground[..., 0] * _RAD, ground[..., 1] * _RAD, ground[..., 2]
     sin_lat, cos_lat = np.sin(lat), np.cos(lat)
     normal = WGS84_A / np.sqrt(1.0 - WGS84_E2 * sin_lat * sin_lat)

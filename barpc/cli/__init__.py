@@ -19,14 +19,14 @@ from typing import Any
 import click
 
 from barpc import __version__
-from barpc.base.errors import BarpcError, BarpcWarning, has_room, out_of_memory
+from barpc.base.errors import BarpcError, BarpcWarning, Remark, UsageError, has_room, out_of_memory
 from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible, quicken
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
-from barpc.cli.terminal import THREADS, Formatter, echo, say
+from barpc.cli.terminal import THREADS, Formatter, echo, remark, say
 
 _LIBRARIES = 512 << 20  # bytes that numpy, scipy, GDAL and OpenCV map: 460 MB, of which OpenBLAS waits for its own
 
-EXIT_FAILED = 1
+EXIT_FAILED, EXIT_USAGE = 1, 2
 
 _NO_ARGUMENTS: Any = getattr(click.exceptions, "NoArgsIsHelpError", click.exceptions.Exit)  # not in click 8.1
 
@@ -43,6 +43,7 @@ COMMANDS = {
     "convert": "Write RPCs in other formats, cut out windows, deliver images.",
     "export": "Export a finished run to Sat-NeRF, COLMAP, s2p, CARS, ASP or a catalogue.",
     "dsm": "A first surface model, with its uncertainty.",
+    "ortho": "Orthoimages on one grid, by GDAL's warper.",
     "calibrate": "Estimate a sensor's interior distortion from finished runs.",
     "verify": "Whether inputs, outputs and cameras of a run are unchanged.",
     "report": "Make report.html of a finished run again, or compare two runs.",
@@ -50,7 +51,7 @@ COMMANDS = {
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _COMMAND_MODULES = {
     **dict.fromkeys(("match", "check"), "adjust"),
-    **dict.fromkeys(("report", "export", "verify", "dsm", "calibrate"), "run_commands"),
+    **dict.fromkeys(("report", "export", "verify", "dsm", "ortho", "calibrate"), "run_commands"),
     **dict.fromkeys(("localize", "triangulate"), "project"),
 }
 
@@ -140,6 +141,7 @@ def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
         handler.addFilter(logging.Filter("barpc"))
     logging.basicConfig(level=level, handlers=[handler])
     warnings.showwarning = _log_warning
+    warnings.simplefilter("always", Remark)
 
 
 cli.help = _kept_lines(cli.help)
@@ -196,15 +198,17 @@ def _exit_message(error: BaseException) -> tuple[int, str]:
         text = f"out of memory; {kept}"
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename or 'the system'}: {error.strerror}"
-    return EXIT_FAILED, text
+    return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED, text
 
 
 def _log_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object, **__: object
 ) -> None:
-    """Log a warning as one line: barpc's own always, those of libraries with -v."""
+    """Log a warning as one line: barpc's own always, those of libraries with -v; a remark is printed."""
     text = " ".join(str(message).split())
-    if issubclass(category, BarpcWarning):
+    if issubclass(category, Remark):
+        remark(text)
+    elif issubclass(category, BarpcWarning):
         logging.getLogger("barpc").warning(text)
     else:
         logging.getLogger("py.warnings").info("%s:%d: %s: %s", filename, lineno, category.__name__, text)

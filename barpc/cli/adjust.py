@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, expanded, image_paths, paper, run_options, with_flags
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
 from barpc.cli.terminal import (
     echo,
     executor_for,
@@ -59,9 +58,9 @@ def adjust(
 
     IMAGE may be a folder or a pattern: its rasters in the order of their names.
     """
-    from barpc import pipeline
+    from barpc.verbs import runs
 
-    return _run_pipeline(obj, pipeline.adjust, images, flags, out_dir=out_dir)
+    return _run_pipeline(obj, runs.adjust, images, flags, out_dir=out_dir)
 
 
 @click.command("match", cls=Grouped)
@@ -79,9 +78,9 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
       barpc match scene/*.tif -o ties
       barpc adjust scene/*.tif --matches ties/matches.npz --matches-only -o adjusted
     """
-    from barpc import pipeline
+    from barpc.verbs import runs
 
-    return _run_pipeline(obj, pipeline.adjust, images, flags, {"stop_after": "matching"}, out_dir=out_dir)
+    return _run_pipeline(obj, runs.match, images, flags, out_dir=out_dir)
 
 
 @click.command("check", cls=Grouped)
@@ -100,11 +99,11 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
       barpc check adjusted/*.vrt
       barpc check adjusted/*.vrt --against delivered/
     """
-    from barpc import pipeline
+    from barpc.verbs import runs
 
     if against is not None:
-        return _compare(_image_arguments(images, flags), Path(against))
-    return _run_pipeline(obj, pipeline.check, images, flags)
+        return _compare(image_paths(images, flags["image_list"]), Path(against))
+    return _run_pipeline(obj, runs.check, images, flags)
 
 
 def _run_pipeline(
@@ -112,18 +111,13 @@ def _run_pipeline(
     work: Callable[..., AdjustResult],
     images: tuple[str, ...],
     flags: dict[str, Any],
-    fixed: Mapping[str, Any] | None = None,
     **where: str,
 ) -> int:
-    """Run an entry of the pipeline with the flags and the options `fixed` by the verb, and print the result."""
-    options = replace(run_options(flags, flags["options_file"]), **(fixed or {}))
-    paths = _image_arguments(images, flags, options.keep_going)
+    """Run a verb of the pipeline with the options of the flags, and print the result."""
+    options = run_options(flags, flags["options_file"])
+    paths = image_paths(images, flags["image_list"], options.keep_going)
     with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
         return _tell_result(obj, work(paths, options=options, executor=executor, progress=progress, **where))
-
-
-def _image_arguments(images: tuple[str, ...], flags: Mapping[str, Any], keep_going: bool = False) -> list[str]:
-    return expanded(image_paths(images, flags["image_list"], keep_going))
 
 
 def _tell_result(obj: Mapping[str, Any], result: AdjustResult) -> int:
@@ -140,21 +134,15 @@ def _tell_result(obj: Mapping[str, Any], result: AdjustResult) -> int:
 
 
 def _compare(images: list[str], against: Path) -> int:
-    from barpc.cameras import open_camera
-    from barpc.pipeline import load_views
-    from barpc.pipeline.verify_outputs import READING_TOLERANCE, difference
-    from barpc.rpcio import find_rpc
+    from barpc.pipeline.verify_outputs import READING_TOLERANCE
+    from barpc.verbs.runs import compared
 
-    found = []
-    for view in load_views(images, min_views=1, distinct=False).views:
-        other = find_rpc(against, Path(view.path)) if against.is_dir() else against
-        far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
-        found.append((view.path, str(other), far))
+    found = compared(images, against)
     if wants_json():
         rows = [dict(zip(("image", "against", "max_px"), row, strict=True)) for row in found]
         echo(json.dumps(rows, indent=1))
     else:
-        for path, compared, px in found:
-            tell(f"{path}  {compared}  max {px:.3g} px")
+        for path, other, px in found:
+            tell(f"{path}  {other}  max {px:.3g} px")
     off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= READING_TOLERANCE]
     return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

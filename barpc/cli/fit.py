@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from barpc.base.options import GEOID_HELP
 from barpc.cli.flags import flag, paper, run_options
-from barpc.cli.terminal import echo, remark, say, tell_gate, wants_json
+from barpc.cli.terminal import echo, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.fit import RpcFit
-
-_MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
 
 
 @click.command("fit")
@@ -68,97 +64,25 @@ def fit(
       barpc fit S1A_IW_SLC__1SDV_....SAFE,swath=iw1,pol=vv -o iw1_RPC.TXT
       barpc fit image.tif,model=physical -o new/image_RPC.TXT --tolerance 0.5
     """
-    from barpc.cameras import split_spec
+    from barpc.verbs.fitting import fitted
 
-    image = str(split_spec(source)[0])
-    if output is not None:
-        from barpc.cli.convert import check_target
-
-        check_target(output, [image], overwrite)
-    fit, tolerance, size = _fit_source(source, output, flags)
-    written = False
-    if output is not None and (keep_going or not fit.verdict(tolerance)):
-        fit, written = _write_rpc_file(fit, image, output, overwrite, None if keep_going else tolerance, size)
-    verdict = fit.verdict(tolerance)
+    options = run_options(flags, flags["options_file"])
+    keywords = {name: value for name, value in flags.items() if name in ("alt_range", "dem", "dem_margin", "geoid")}
+    done = fitted(source, output, options, {**keywords, "keep_going": keep_going, "overwrite": overwrite})
+    verdict = done.verdict
     if wants_json():
-        summary = {**fit.summary(), "verdict": verdict, "output": output if written else None}
+        summary = {**done.fit.summary(), "verdict": verdict, "output": output if done.written else None}
         echo(json.dumps(summary, indent=1))
     elif not obj["quiet"]:
-        echo(_certificate(fit, verdict))
-        if written:
+        echo(_certificate(done.fit, verdict))
+        if done.written:
             echo(f"written       {output} (read back: these are its figures)")
-    if flags["flag_fit_localisation"] and written and fit.rpc.direct is None:
+    if flags["flag_fit_localisation"] and done.written and done.fit.rpc.direct is None:
         return tell_gate(f"{output} holds no localisation RPC: give a name in _RPC.TXT, .json or .vrt", [])
     if not verdict:
         return 0
-    how = "written all the same" if written else "nothing written (--keep-going writes it all the same)"
+    how = "written all the same" if done.written else "nothing written (--keep-going writes it all the same)"
     return tell_gate(f"{verdict}; {how}", [])
-
-
-def _fit_source(source: str, output: str | None, flags: dict[str, Any]) -> tuple[RpcFit, float, tuple[int, int] | None]:
-    """Return the fit, the tolerance [px] that it is to meet, and the image's width and height, if known."""
-    from barpc.cameras import open_camera, read_points, split_spec
-    from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-    from barpc.fit.points import terrain_range
-    from barpc.rasters.dem import Dem
-    from barpc.rpcio import Carrier, format_for
-
-    options = run_options(flags, flags["options_file"]).fit
-    row = None if output is None else format_for(output)
-    if isinstance(row, Carrier) and options.precision is None:
-        options = replace(options, precision=row.precision)
-    points, size = read_points(source)
-    if points is not None:
-        ground, image = points.ground, points.image
-        if points.note:
-            remark(points.note)
-        if (alt := ground[:, 2]).min() == alt.max():
-            say(f"all points are at {alt[0]:g} m: the RPC has no terms in height and is valid at that altitude only")
-        fit = fit_rpc_points(ground, image, sigma=points.sigma, size=size, options=options, strict=False)
-        return fit, options.tolerance, size
-    camera = open_camera(source)
-    if split_spec(source)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
-        options = replace(options, grid=_MOSAIC_GRID)
-    alt_range = flags["alt_range"] or camera.alt_range
-    if flags["dem"] and not flags["alt_range"]:
-        terrain = Dem.open(flags["dem"], flags["geoid"])
-        alt_range = terrain_range(camera.model, camera.extent, alt_range, terrain, flags["dem_margin"])
-    elif not flags["alt_range"] and (all_ground := getattr(camera.model, "all_ground", None)):
-        fit = fit_rpc(camera.model, camera.extent, all_ground, options=options, strict=False)
-        if not fit.verdict(options.tolerance):
-            return fit, options.tolerance, camera.size
-        low, high = alt_range
-        remark(
-            f"no RPC represents all altitudes on Earth here: fitted over the scene's altitudes, {low:g} to {high:g} m"
-        )
-    fit = fit_rpc(camera.model, camera.extent, alt_range, options=options, strict=False)
-    return fit, options.tolerance, camera.size
-
-
-class _Missed(Exception):  # noqa: N818 - it never leaves this page
-    """The written file does not reproduce the fit: it is removed."""
-
-
-def _write_rpc_file(
-    fit: RpcFit,
-    source: str,
-    output: str,
-    overwrite: bool,
-    tolerance: float | None,
-    size: tuple[int, int] | None,
-) -> tuple[RpcFit, bool]:
-    """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
-    from barpc.base.atomic import replacing
-    from barpc.rpcio import read_rpc, write_camera
-
-    stays = False
-    with suppress(_Missed), replacing(output, overwrite=overwrite) as partial:
-        write_camera(fit.rpc, partial, source, place=output, overwrite=True, size=size)
-        fit = fit.as_written(read_rpc(partial))
-        if tolerance is not None and fit.verdict(tolerance):
-            raise _Missed
-        stays = True
-    return fit, stays
 
 
 def _certificate(fit: RpcFit, verdict: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import Any, TypeVar, get_origin
 
 import click
 
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import InputError
 from barpc.base.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
 from barpc.base.remote import is_url
-from barpc.base.safe_io import IMAGE, read_head, read_names, unread
+from barpc.base.safe_io import read_names
 from barpc.cli.terminal import echo
+from barpc.verbs.options import FLAG_NAMES, with_keywords
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -40,12 +41,12 @@ ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
 RUN = (*MATCH, "images", "rpc_formats", "grids", "resample")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
-_FLAG_NAMES = {"rpc_formats": "--rpc-format"}
 
 
 def flag_name(target: str) -> str:
     """Return the flag that sets a field."""
-    return _FLAG_NAMES.get(target) or "--" + target.rpartition(".")[2].replace("_", "-")
+    name = target.rpartition(".")[2]
+    return "--" + FLAG_NAMES.get(name, name).replace("_", "-")
 
 
 def field_of(target: str) -> Declared:
@@ -191,37 +192,12 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Return defaults, or the paper's options, then the options file, then the flags that were given."""
     options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
     options = options if options_file is None else read_options(options_file, options)
-    values: dict[str, Any] = {}
-    for target in (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation"):
-        value = flags.get(_parameter(target))
-        if value is None:
-            continue
-        *table, name = target.split(".")
-        (values.setdefault(table[0], {}) if table else values)[name] = value
-    return with_values(options, values, "command line")
+    targets = (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation")
+    given = {target.rpartition(".")[2]: flags.get(_parameter(target)) for target in targets}
+    return with_keywords(options, {name: value for name, value in given.items() if value is not None}, "command line")
 
 
 # --- images -----------------------------------------------------------------------------------------------
-
-
-_ENDS = (".tif", ".tiff", ".ntf", ".nitf", ".nsf", ".jp2", ".j2k", ".vrt")
-
-
-def expanded(specs: Sequence[str]) -> list[str]:
-    """Return files instead of folders (their rasters; a radar product is one) and of patterns that no shell took.
-
-    InputError for an empty name, a folder that holds no raster, a pattern that finds nothing.
-    """
-    found: list[str] = []
-    for spec in specs:
-        if not spec:  # what an unset variable of a shell leaves, and the current folder to all who open it
-            raise InputError("an empty name among the images; give '.' for the current folder")
-        name, choices = spec, ""
-        if not os.path.lexists(spec) and not is_url(spec):
-            name = os.fspath(name_of(spec))
-            choices = spec[len(name) :]
-        found += [one + choices for one in _matching_files(name)]
-    return found
 
 
 def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: bool = False) -> list[str]:
@@ -233,6 +209,8 @@ def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: boo
     if image_list is None:
         return paths
     folder = Path(image_list).parent
+    from barpc.verbs.images import name_of  # with all that opens cameras
+
     for number, line in enumerate(read_names(image_list, "a list of images"), start=1):
         name = line.strip()
         if not name or line.startswith("#"):
@@ -243,47 +221,3 @@ def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: boo
             where = f"relative paths count from the list's folder, {folder.absolute()}"
             raise InputError(f"{image_list}, line {number}: {file}: no such file; {where}")
     return paths
-
-
-def name_of(spec: str) -> str:
-    """Return the file name of an argument with choices behind it, as typed."""
-    from barpc.cameras import split_spec
-
-    with suppress(BarpcError):
-        _, choices = split_spec(spec)
-        for key, text in choices.items():
-            spec = spec.removesuffix(f",{key}={text}")
-        return spec.partition(",")[0] if choices and not os.path.lexists(spec) else spec
-    return spec
-
-
-def _matching_files(name: str) -> list[str]:
-    path = Path(name)
-    if is_url(name) or not (path.is_dir() or any(char in name for char in "*?[")):
-        return [name]
-    if path.is_dir():
-        if (path / "manifest.safe").exists() or path.suffix.upper() == ".SAFE":
-            return [name]
-        inside = sorted(entry.name for entry in os.scandir(path) if entry.is_file())
-        rasters = [str(path / one) for one in inside if one.lower().endswith(_ENDS) and _is_raster(path / one)]
-        if not rasters:
-            from barpc.sensor.terrasar import find_annotation
-
-            if find_annotation(path):
-                return [name]
-            raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
-        return rasters
-    if os.path.lexists(name):
-        return [name]
-    matching = sorted(glob.glob(name))  # noqa: PTH207  (a Path would take the ./ away)
-    if not matching:
-        raise InputError(f"{name}: no file has such a name")
-    return matching
-
-
-def _is_raster(path: Path) -> bool:
-    from barpc.rasters.raster import driver_of
-
-    with suppress(BarpcError):
-        return driver_of(read_head(path, IMAGE, 64)) is not None
-    return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict
@@ -13,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.base.options import DsmOptions, declared
-from barpc.cli.flags import Function, expanded, jobs_option
+from barpc.cli.flags import Function, jobs_option
+from barpc.cli.project import with_heights
 from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, remark, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface
 
 
-_TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "ortho", "stac", "points")
+_TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 
 @click.command("report")
@@ -69,9 +69,8 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
     satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
-    each; s2p, cars, asp: a configuration that is ready to run; ortho: GDAL's
-    commands for orthoimages; stac: a collection for catalogues; points: tie points with their covariance. Images are
-    pointed at, relative to OUT_DIR, and never copied.
+    each; s2p, cars, asp: a configuration that is ready to run; stac: a collection for catalogues; points: tie points
+    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied.
 
     \b
     Examples:
@@ -79,9 +78,9 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
       barpc export adjusted sparse --to colmap --alt 80 320
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
-    from barpc.export import export_run
+    from barpc.verbs import runs
 
-    paths = export_run(run_dir, target, out_dir, alt_range=alt, overwrite=overwrite)
+    paths = runs.export(run_dir, out_dir, target, alt=alt, overwrite=overwrite)
     if wants_json():
         echo(json.dumps([str(path) for path in paths]))
         return 0
@@ -96,7 +95,8 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
 @click.option("--expect", metavar="ROOT", help="The root that was printed, or a later one.")
-def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
+@click.pass_obj
+def verify(obj: dict[str, Any], /, run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
     r"""List changed, missing and added files of a run or export, and check that cameras read as certified.
 
     SHA256SUMS lists all (but .barpc), also for `sha256sum -c`; its own SHA-256 is the root. Only --expect detects
@@ -109,12 +109,12 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
       barpc verify adjusted
       barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
-    from barpc.pipeline.outputs import PASSED_STATES, SAME, prove
+    from barpc.pipeline.outputs import SAME
+    from barpc.verbs import runs
 
-    if expect is not None and not re.fullmatch("[0-9a-fA-F]{64}", expect):
-        raise click.UsageError(f"--expect {expect}: a root has 64 hexadecimal digits")
-    found = prove(Path(run_dir), [Path(place) for place in places], expect and expect.lower())
-    wrong = [one for one in found if one.now not in PASSED_STATES]
+    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+        found = runs.verify(run_dir, places, expect=expect, progress=progress)
+    wrong = [one for one in found if not one.passed]
     if wants_json():
         echo(json.dumps([asdict(one) for one in found]))
     else:
@@ -148,7 +148,8 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
     """
     from barpc.pipeline.calibrate import calibrate as learn
 
-    found = learn(runs, out, sensor, overwrite=overwrite)
+    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+        found = learn(runs, out, sensor, overwrite=overwrite, progress=progress)
     if wants_json():
         echo(json.dumps(found, indent=1))
     elif not obj["quiet"]:
@@ -160,6 +161,40 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
             f"residuals of {better} improve"
         )
         tell(out)
+    return 0
+
+
+@click.command("ortho")
+@click.argument("images", nargs=-1, required=True, metavar="RUN | IMAGE...")
+@click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the orthoimages.")
+@with_heights(
+    "Without a DEM: altitude of the ground [m].  [default: of the run's tie points, else the camera's middle]"
+)
+@click.option("--gsd", type=float, metavar="M", help="Side of a pixel.  [default: that of the finest image]")
+@click.option("--crs", metavar="NAME", help="Map projection in metres.  [default: the UTM zone of the first image]")
+@click.option("--overwrite", is_flag=True, help="Replace orthoimages of an earlier call.")
+@click.pass_obj
+def ortho(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+    r"""Make orthoimages of images with RPCs: Cloud-Optimised GeoTIFFs whose pixels lie on one grid.
+
+    A RUN brings its corrected cameras and the DEMs that it was made with. GDAL warps each image by its RPC on the
+    heights, which are above the ellipsoid first, whatever the DEM counts from. Where the DEM has no height, there are
+    no pixels; without a DEM all ground is at one altitude.
+
+    
+    Examples:
+      barpc ortho adjusted --dem srtm.tif --geoid egm96 -o maps
+      barpc ortho image.tif --alt 180 --gsd 0.5 --crs EPSG:2154 -o maps
+    """
+    from barpc.verbs import orthoimages
+
+    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+        done = orthoimages.ortho(images, out_dir, progress=progress, **flags)
+    if wants_json():
+        echo(json.dumps([{**asdict(one), "path": str(one.path)} for one in done]))
+        return 0
+    for one in done:
+        tell(f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}")
     return 0
 
 
@@ -207,36 +242,22 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    runs = [Path(one) for one in source if (Path(one) / "summary.json").is_file()]
-    if runs and len(source) > 1:
-        raise click.UsageError(f"{runs[0]} is a finished run: give it alone (--minus OTHER_RUN is for two dates)")
-    run = runs[0] if runs else None
-    options = DsmOptions(**{name: value for name, value in flags.items() if value is not None})
-    if run is None and options.minus is not None:
-        raise click.UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
-    surface = made(obj, run or expanded(source), out, options, jobs)
-    if surface is not None and wants_json():
-        from barpc.report.records import json_form
-
-        echo(json.dumps(json_form(surface), indent=1))
-    return 3 if surface is None else 0
-
-
-def made(
-    obj: dict[str, Any], source: Path | list[str], out: str | Path, options: DsmOptions, jobs: int | str
-) -> Surface | None:
-    """Make a surface and print its figures; None, with a line on the reason, where the images cannot be matched."""
-    from barpc.dsm import NoSurfaceError, make_dsm
+    given = {name: value for name, value in flags.items() if value is not None}
+    from barpc.dsm import NoSurfaceError
+    from barpc.verbs import runs
 
     try:
         with executor_for(jobs) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-            surface = make_dsm(source, out, options, executor=executor, progress=progress)
+            surface = runs.dsm(source, out, executor=executor, progress=progress, **given)
     except NoSurfaceError as error:
-        tell_gate(f"no surface: {error}", [])
-        return None
-    if not (wants_json() or obj["quiet"]):
+        return tell_gate(f"no surface: {error}", [])
+    if wants_json():
+        from barpc.report.records import json_form
+
+        echo(json.dumps(json_form(surface), indent=1))
+    elif not obj["quiet"]:
         _tell_surface(surface)
-    return surface
+    return 0
 
 
 def _tell_surface(surface: Surface) -> None:

@@ -22,7 +22,7 @@ import rasterio.shutil
 import shapely
 from rasterio import Affine
 from rasterio.crs import CRS
-from rasterio.errors import CRSError, NotGeoreferencedWarning
+from rasterio.errors import NotGeoreferencedWarning
 from rasterio.warp import transform
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
@@ -30,7 +30,8 @@ from scipy.ndimage import map_coordinates
 from barpc import __version__
 from barpc.base.atomic import refuse_existing, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
-from barpc.base.geodesy import Array, utm
+from barpc.base.frozen import Shown
+from barpc.base.geodesy import Array
 from barpc.base.options import DsmOptions
 from barpc.base.safe_io import plain_path
 from barpc.cameras import open_camera
@@ -49,7 +50,7 @@ from barpc.dsm.stereo import (
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
 from barpc.pipeline.pictures import encoded
-from barpc.rasters.raster import BLOCK_SIZE, hashed, open_raster
+from barpc.rasters.raster import BLOCK_SIZE, hashed, map_crs, open_raster
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key
 from barpc.report.summary import Summary
@@ -76,7 +77,7 @@ _SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west,
 
 
 @dataclass(frozen=True)
-class Surface:
+class Surface(Shown):
     """Result of a surface: its file, its cells, and medians over them [m]; NaN where not known.
 
     `known`: cells with a height; `share`: of the pixels that both images of a pair show so many were matched;
@@ -103,22 +104,7 @@ def make_dsm(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Surface:
-    """Make a first surface model of a finished run, or of images with their cameras.
-
-    Parameters
-    ----------
-    source : path of a run folder, or a list of images
-    out : path of the GeoTIFF
-    options : DsmOptions, optional
-    executor, progress : as of `barpc.adjust`; the bytes written do not depend on them
-
-    Raises
-    ------
-    NoSurfaceError
-        Images that SGBM cannot match: radar, too large an angle, hardly a pixel that is found back.
-    InputError, OutputError
-        See `barpc.base.errors`; nothing is written then.
-    """
+    """Make a first surface model of a finished run (a path), or of images with their cameras: see `barpc.dsm`."""
     options, out, folder = options or DsmOptions(), Path(out), None
     plain_path(out.absolute())
     if isinstance(source, str | Path):
@@ -171,7 +157,7 @@ class Grid:
     def __init__(self, block: StereoBlock, options: DsmOptions) -> None:
         self.block, self.options, views = block, options, block.views
         middles = [v.sensor.localize((np.array(v.size) - 1) / 2, np.array(v.altitude)) for v in views]
-        crs = _crs(options.crs, middles[block.groups[0][0][0]])
+        crs = map_crs(options.crs, middles[block.groups[0][0][0]])
         pixels = [float(ground_sample_distance(v.sensor, at)[1]) for v, at in zip(views, middles, strict=True)]
         step = options.gsd or float(f"{2 * max(pixels):.2g}")
         if (step / min(pixels)) ** 2 < MATCHED:
@@ -291,21 +277,6 @@ class Grid:
         file.update_tags(BARPC=__version__, VERTICAL_REFERENCE="WGS84 ellipsoid", IMAGES=self.block.source)
         file.descriptions = (BANDS[0] if len(self.block.groups) == 1 else CHANGE, *BANDS[1:])
         return file
-
-
-def _crs(given: str | None, middle: Array) -> CRS:
-    """Return the requested CRS, in metres, or the UTM zone of a position."""
-    if given is None:
-        return CRS.from_string(utm(*middle[:2])[1])
-    try:
-        if given.upper().startswith("EPSG:"):
-            int(given[5:])  # older GDAL reads a code up to what is no digit
-        found = CRS.from_user_input(given)
-    except (CRSError, ValueError) as error:
-        raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
-    if not found.is_projected or found.linear_units_factor[1] != 1.0:
-        raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
-    return found
 
 
 def _common_ground(first: View, second: View, crs: CRS) -> Any:

@@ -13,7 +13,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.base.identity import fingerprint
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
-from barpc.export.files import Files, asp, cars, ortho, points, s2p, satnerf, stac
+from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
 from barpc.workspace import Homes, Workspace
@@ -23,7 +23,7 @@ __all__ = ["TARGETS", "export_run"]
 logger = logging.getLogger(__name__)
 
 TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
-    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, ortho, stac, points)
+    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, stac, points)
 }
 """Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
 
@@ -36,27 +36,7 @@ def export_run(
     alt_range: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Hand a finished run to another tool.
-
-    Parameters
-    ----------
-    folder : path, of a finished adjustment
-    target : str, a row of `TARGETS`
-    out : path, a new folder; files in it point at images and run relative to it
-    alt_range : (low, high), optional, altitudes of the scene [m above the ellipsoid]; None: by its tie points
-    overwrite : bool, replace what an earlier export wrote there
-
-    Returns
-    -------
-    paths : list of Path, the files written
-
-    Raises
-    ------
-    InputError
-        No such target, no finished adjustment, altitudes that are no interval.
-    OutputError
-        The folder is in use, not empty, or the run's own.
-    """
+    """Hand a finished run to another tool, a row of `TARGETS`; return the files written: see `barpc.export`."""
     folder, out = Path(folder), Path(out)
     if target not in TARGETS:
         raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import io
 import json
-import shlex
-import warnings
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from barpc.base.errors import BarpcError, InputError, listed
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, utm, wrap_longitude
+from barpc.base.errors import InputError
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, wrap_longitude
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
-from barpc.rasters.dem import Dem
-from barpc.rasters.vertical import NO_GEOID
 from barpc.report.records import json_form
 from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
-from barpc.workspace import Homes
 
 Files = dict[str, bytes]
 
@@ -252,74 +246,3 @@ def _covariances(scene: Scene) -> Array:
     out = np.full_like(normal, np.nan)
     out[known] = scene.noise**2 * (axes[known] / values[known, None]) @ axes[known].swapaxes(1, 2)
     return out
-
-
-# --- orthoimages ------------------------------------------------------------------------------------------
-
-
-_SCRIPT_HEADER = """#!/bin/sh
-# Orthoimages of the corrected cameras: gdalwarp is of GDAL ({about}).
-set -e
-cd "$(dirname "$0")"
-"""
-
-
-def ortho(scene: Scene, out: Path) -> Files:
-    """``ortho.sh``: a line of gdalwarp an image, in the scene's UTM zone, at the image's own resolution.
-
-    On the run's DEMs, made ellipsoidal where they had a geoid; without one at the altitude of the tie points.
-    """
-    given: Any = scene.summary.options or {}
-    at, named = Homes.of(scene.folder).located, given.get("dem") or ()
-    dems = [at(name) for name in ((named,) if isinstance(named, str) else named)]
-    lines, heights = list[str](), f"RPC_HEIGHT={scene.origin[2]:.0f}"
-    about = "all ground at one altitude; give a DEM to adjust"
-    if dems:
-        geoid = str(given.get("geoid") or "")
-        lines, terrain = _ellipsoidal(dems, geoid if geoid in ("", NO_GEOID) else at(geoid), out)
-        heights, about = f"RPC_DEM={terrain}", f"heights of {listed([Path(dem).name for dem in dems])}"
-    crs = utm(*scene.origin[:2])[1]
-    lines += [_warp(shot, heights, crs, out) for shot in scene.shots]
-    return {"ortho.sh": (_SCRIPT_HEADER.format(about=about) + "\n".join(lines) + "\n").encode()}
-
-
-def _ellipsoidal(dems: Sequence[str], geoid: str, out: Path) -> tuple[list[str], str]:
-    """Return the lines that make one ellipsoidal DEM of those of a run, and its name.
-
-    A DEM counts from the geoid that the run took for it; of one that is no longer there from the geoid given.
-    """
-    sources = [f"{_LONLAT} +geoidgrids={geoid} +vto_meter=1" if geoid not in ("", NO_GEOID) else ""] * len(dems)
-    with warnings.catch_warnings(), suppress(BarpcError):
-        warnings.simplefilter("ignore")
-        sources = [_crs_of(part) for part in Dem.open(dems, geoid or None).parts]
-    if len(dems) == 1 and not sources[0]:
-        return [], relative_link(dems[0], out)
-    names = ["dem_ellipsoidal.tif"] if len(dems) == 1 else [f"dem_{n}.tif" for n in range(1, len(dems) + 1)]
-    lines = [
-        _gdalwarp(*(("-s_srs", source) if source else ()), "-t_srs", "EPSG:4979", relative_link(dem, out), name)
-        for dem, source, name in zip(dems, sources, names, strict=True)
-    ]
-    if len(dems) == 1:
-        return lines, names[0]
-    # what comes later lies above
-    return [*lines, shlex.join(("gdalbuildvrt", "-resolution", "highest", "dem.vrt", *names[::-1]))], "dem.vrt"
-
-
-def _crs_of(dem: Dem) -> str:
-    """Return the reference system of a DEM with the geoid that was taken for it; empty for ellipsoidal heights."""
-    grid, geoid = dem.grid, dem.geoid
-    own = f"{grid.crs.to_proj4()} +geoidgrids={{}} +vto_meter={abs(grid.vertical.metres):.12g}"
-    return own.format(geoid.path) if geoid else ""
-
-
-_LONLAT = "+proj=longlat +datum=WGS84"
-
-
-def _warp(shot: Shot, heights: str, crs: str, out: Path) -> str:
-    side = f"{shot.entry.gsd_m:.2g}" if shot.entry.gsd_m else None
-    pixel = ("-tr", side, side) if side else ()
-    return _gdalwarp("-rpc", "-to", heights, "-t_srs", crs, *pixel, _image(shot, out), f"{shot.name}.tif")
-
-
-def _gdalwarp(*words: str) -> str:
-    return shlex.join(("gdalwarp", *words))

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from barpc.base.frozen import Shown
 from barpc.base.geodesy import Array, metres_per_unit, parts, wrap_longitude
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
@@ -118,7 +119,7 @@ def localisation_errors(rpc: RPC, found: Array, ground: Array, image: Array) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class RpcFit:
+class RpcFit(Shown):
     """A fitted RPC and its certificate.
 
     Parameters

@@ -60,6 +60,10 @@ def fit_rpc(
         Raise where the tolerance is missed; otherwise give the best fit found, to be judged by `RpcFit.verdict`. A
         camera behind a spline (`barpc.sensor.image_corrections`) is expected to miss it.
 
+    Returns
+    -------
+    RpcFit, the RPC and its certificate
+
     Raises
     ------
     FitError
@@ -70,7 +74,19 @@ def fit_rpc(
     Warns
     -----
     BarpcWarning : part of the image has no ground point
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> bool(barpc.fit_rpc(rpc, (1000, 1000), (0.0, 400.0)).max_ckp.max() < 1e-6)
+    True
     """
+    return _fit_model(model, size, alt_range, options, strict)
+
+
+def _fit_model(
+    model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], options: FitOptions | None, strict: bool
+) -> RpcFit:
     options, alt_range = options or FitOptions(), widened(alt_range)
     sample = _check_sample(model, size, alt_range)
     screened(sample.ground, sample.points[:, :2])
@@ -170,6 +186,10 @@ def fit_rpc_points(
         Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
     strict : bool, as for `fit_rpc`
 
+    Returns
+    -------
+    RpcFit, the RPC and its certificate
+
     Raises
     ------
     FitError
@@ -178,6 +198,14 @@ def fit_rpc_points(
     Warns
     -----
     BarpcWarning : the points show the ground mirrored
+
+    Examples
+    --------
+    >>> rng, rpc = np.random.default_rng(0), barpc.read_rpc("data_samples/view_00.tif")
+    >>> image = rng.uniform(0, 1000, (400, 2))
+    >>> ground = rpc.localize(image, rng.uniform(0, 400, 400))
+    >>> bool(barpc.fit_rpc_points(ground, image).max_ckp.max() < 1e-3)
+    True
     """
     options = options or FitOptions()
     cnp, cnp_image = given = _looked_at(ground, image)

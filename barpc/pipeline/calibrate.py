@@ -7,7 +7,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
 from barpc.sensor.timing import is_clocked
 
+if TYPE_CHECKING:
+    from barpc.tie.tasks import Progress
+
 logger = logging.getLogger(__name__)
 
 CALIBRATION_SCHEMA = "barpc calibration 1"
@@ -53,7 +56,12 @@ class _FinishedRun:
 
 
 def calibrate(
-    runs: Sequence[str | Path], out: str | Path, sensor: str | None = None, *, overwrite: bool = False
+    runs: Sequence[str | Path],
+    out: str | Path,
+    sensor: str | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Estimate the interior distortion of one sensor from finished runs, for `adjust` to apply.
 
@@ -64,6 +72,7 @@ def calibrate(
     sensor : str, optional
         Its name. Images that state another one are excluded; without, all images must state the same.
     overwrite : bool, replace the file
+    progress : callable, optional, `progress(stage, done, total)`
 
     Returns
     -------
@@ -74,23 +83,30 @@ def calibrate(
     InputError
         Runs that cannot be used or that determine no curve: it changes with time, directions do not suffice, or the
         residuals of runs left out do not improve. Nothing is written then.
+
+    Examples
+    --------
+    >>> barpc.calibrate(["monday", "tuesday"], "sensor.cal")
+    Traceback (most recent call last):
+    barpc.base.errors.InputError: 2 runs given: at least 3 finished runs are needed, to hold some out
     """
     out = Path(out)
     refuse_existing(out, overwrite)
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
-    opened = [(Path(folder), *_images_of(Path(folder))) for folder in runs]
-    name = _one_sensor([stated for *_, stated in opened], sensor)
-    found = [_finished_run(*one, name) for one in opened]
-    roots = [manifest.read(one.folder)[0] for one in found]
-    if len(set(roots)) < len(roots):
-        raise InputError(f"{next(one.folder for one, r in zip(found, roots, strict=True) if roots.count(r) > 1)}: "
-                         "is given twice")  # fmt: skip
+    opened, tell = list[_OpenedRun](), progress or (lambda *_: None)
+    for number, folder in enumerate(runs, start=1):
+        opened.append(_images_of(Path(folder)))
+        tell("open", number, len(runs))
+    name, found = _one_sensor([stated for *_, stated in opened], sensor), list[_FinishedRun]()
+    for folder, run in zip(runs, opened, strict=True):
+        found.append(_finished_run(Path(folder), *run, name))
+        tell("read", len(found), len(opened))
+    roots = _one_root_each(found)
     _one_width(found)
     order = sorted(range(len(found)), key=lambda i: (found[i].ties.date, roots[i]))
     found, roots = [found[i] for i in order], [roots[i] for i in order]
-    learnt = learn([one.ties for one in found])
-    _refuse_unsure(name, learnt, found)
+    _refuse_unsure(name, learnt := learn([one.ties for one in found]), found)
     content = _content(name, learnt, found, roots)
     write_text(out, json.dumps(content, indent=1) + "\n", overwrite=overwrite)
     return content
@@ -160,6 +176,14 @@ def _row_direction(view: View, sensor: SensorModel) -> float:
     first, last = sensor.localize(np.array([[middle, 0.0], [middle, view.size[1] - 1.0]]), np.full(2, view.altitude))
     east, north = ((last - first) * metres_per_unit(first))[:2]
     return float(np.degrees(np.arctan2(east, north)) % 360.0)
+
+
+def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
+    roots = [manifest.read(one.folder)[0] for one in found]
+    twice = [one.folder for one, root in zip(found, roots, strict=True) if roots.count(root) > 1]
+    if twice:
+        raise InputError(f"{twice[0]}: is given twice")
+    return roots
 
 
 def _one_width(found: Sequence[_FinishedRun]) -> None:

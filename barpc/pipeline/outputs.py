@@ -28,9 +28,10 @@ from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, Written, grid_names
 from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
 from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
+from barpc.report.geopackage import geopackage
 from barpc.report.page import REPORT_FILE, REPORT_STAGE, can_render, report_html
 from barpc.report.records import json_form
-from barpc.report.runfiles import FOLDER, PICTURES, TABLES, gcps_geojson, read_summary
+from barpc.report.runfiles import FOLDER, PICTURES, TABLES, gcps_geojson, map_layers, read_summary
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, format_for, hidden_by, sidecars, write_camera
@@ -44,6 +45,7 @@ from barpc.workspace import LAST, Homes, Workspace, noted_outputs, own_files
 
 MATCH_FILES = ("matches.csv", "matches.npz")
 GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
+MAP_FILE = "map.gpkg"
 
 
 Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
@@ -119,7 +121,7 @@ def file_names(view: View, images: str, formats: Sequence[str]) -> list[str]:
 
 def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> list[str]:
     """Return the names of a run's outputs before it starts; of match files those that are already in the folder."""
-    names = [*(f"{FOLDER}/{name}" for name in (*TABLES, PICTURES)), LAST, SUMS]
+    names = [*(f"{FOLDER}/{name}" for name in (*TABLES, PICTURES)), MAP_FILE, LAST, SUMS]
     names += [REPORT_FILE] * can_render() + [GCP_FILE] * bool(options.reference)
     if options.stop_after == "matching":
         stems = {view.name for view in views}
@@ -157,6 +159,8 @@ def write_tables(workspace: Workspace, run: Run, summary: Summary) -> Summary:
         for name, content in TABLES.items():
             with workspace.output(f"{FOLDER}/{name}") as partial, partial.open("wb") as file:
                 file.writelines(content(run, summary))
+        with workspace.output(MAP_FILE) as partial:
+            partial.write_bytes(geopackage(map_layers(run, summary)))
         if run.reference is not None and run.reference.control is not None and run.adjustment is not None:
             workspace.write_text(GCP_FILE, gcps_geojson(run).decode())
     with workspace.stage(REPORT_STAGE):
@@ -195,8 +199,15 @@ class Proved:
     now: str
     note: str = ""
 
+    @property
+    def passed(self) -> bool:
+        """Whether the file counts as unchanged."""
+        return self.now in PASSED_STATES
 
-def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None) -> list[Proved]:
+
+def prove(
+    folder: Path, places: Sequence[Path] = (), expected: str | None = None, progress: Progress | None = None
+) -> list[Proved]:
     """Compare a run, or an export, with its SHA256SUMS, and that with an `expected` root, of any of its layers.
 
     Inputs that are gone are looked for by name in `places`. InputError where SHA256SUMS is missing or damaged.
@@ -212,7 +223,11 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
     # of what the first command wrote a later one makes the report again, and nothing else
     listed |= {name: sha for name, sha in layers[0].files.items() if name != REPORT_FILE}
     roots = {root, *(layer.after for layer in layers[1:])}
-    found = [*_roots(root, noted.get(SUMS, root), layers, expected), *_outputs(folder, listed, noted, roots)]
+    tell = progress or (lambda *_: None)
+    found = [*_roots(root, noted.get(SUMS, root), layers, expected)]
+    for number, one in enumerate(_outputs(folder, listed, noted, roots), start=1):
+        tell("verify outputs", min(number, len(listed)), len(listed))  # more of them where files were added
+        found.append(one)
     for path, image, _ in hidden_by(folder / name for name in listed if name not in layers[0].files):
         if image.name in layers[0].files:  # no command of barpc writes such a file
             found.append(Proved("output", path.name, ADDED, f"for some tools it goes before the RPC of {image.name}"))
@@ -221,7 +236,10 @@ def prove(folder: Path, places: Sequence[Path] = (), expected: str | None = None
             summary = read_summary(folder)
         except InputError as error:
             return [*found, Proved("input", LAST, MISSING, f"what it says of inputs: {error}")]
-        found += [*_inputs(summary, folder, places), *_verify_cameras(summary, folder)]
+        for number, one in enumerate(_inputs(summary, folder, places), start=1):
+            tell("verify inputs", number, len(summary.inputs or ()))
+            found.append(one)
+        found += _verify_cameras(summary, folder)
     return found
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.frozen import html_table
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
@@ -54,9 +55,10 @@ from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
-from barpc.report.records import json_form
+from barpc.report.records import json_form, table
 from barpc.report.runfiles import FOLDER
 from barpc.report.summary import InputEntry, StageEntry
+from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import plain_source
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
@@ -82,6 +84,12 @@ class AdjustResult:
         order of their names, `run.views`, whatever the order given.
     record : Summary, content of summary.json as a typed record
     root : str, the SHA-256 of SHA256SUMS, by which `barpc verify` knows the run; empty where nothing was written
+
+    Examples
+    --------
+    >>> found = barpc.check("data_samples/view_0[01].tif", points_per_image=300)
+    >>> found.run.kind, [view.name for view in found.views]
+    ('check', ['view_00', 'view_01'])
     """
 
     views: tuple[View, ...]
@@ -100,6 +108,12 @@ class AdjustResult:
         counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
         written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
         return f"AdjustResult({self.run.kind}: {counts}, {self.record.status}{written})"
+
+    def _repr_html_(self) -> str:
+        record, adjusted = self.record, self.record.adjusted
+        shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
+        heads, *rows = shown.texts
+        return html_table(shown.caption, rows, heads)
 
     @property
     def passed(self) -> bool:
@@ -135,24 +149,7 @@ def adjust(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> AdjustResult:
-    """Correct the cameras of overlapping images and write fresh RPCs.
-
-    Parameters
-    ----------
-    images : sequence of path or View
-        Two or more rasters, in any order: the files written do not depend on it. They are opened read-only.
-        Cameras are found as by `barpc.cameras.open_camera`; a View brings its own model (a frozen dataclass, so
-        that results can be cached).
-    out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``
-    options : RunOptions, optional, None: the defaults
-    executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
-    progress : callable, optional, `progress(stage, done, total)`
-
-    Raises
-    ------
-    BarpcError
-        See `barpc.base.errors`; nothing is written then.
-    """
+    """Correct the cameras of overlapping images, paths or Views, and write fresh RPCs: see `barpc.adjust`."""
     options, folder = with_located(options or RunOptions()), Path(out_dir)
     plain_path(folder.absolute())
     stages, seen, work = list[dict[str, Any]](), dict[str, Stamp](), Work(executor, progress)

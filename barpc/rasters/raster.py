@@ -29,7 +29,8 @@ from rasterio.transform import array_bounds
 from rasterio.windows import Window
 
 from barpc.base import identity
-from barpc.base.errors import ImageError
+from barpc.base.errors import ImageError, InputError
+from barpc.base.geodesy import Array, utm
 from barpc.base.identity import Input
 from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
 from barpc.base.safe_io import IMAGE, read_head
@@ -150,6 +151,21 @@ def _open_mosaic(file: PathOrUrl, name: str) -> Mosaic:
             if drivers[source.file] == "VRT":
                 raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")
     return Mosaic(name, vrt, lambda source: _open_dataset(source, drivers[source]))
+
+
+def map_crs(given: str | None, middle: Array) -> CRS:
+    """Return the requested CRS, in metres, or the UTM zone of a position."""
+    if given is None:
+        return CRS.from_string(utm(*middle[:2])[1])
+    try:
+        if given.upper().startswith("EPSG:"):
+            int(given[5:])  # older GDAL reads a code up to what is no digit
+        found = CRS.from_user_input(given)
+    except (CRSError, ValueError) as error:
+        raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
+    if not found.is_projected or found.linear_units_factor[1] != 1.0:
+        raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
+    return found
 
 
 def hashed(path: PathOrUrl | str) -> Input:

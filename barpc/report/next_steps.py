@@ -63,7 +63,7 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
     # the file that stands for the image, before texts of RPCs alone
     files = [next((f for f in view.outputs if f.endswith((".vrt", ".tif"))), next(iter(view.outputs))) for view in good]
     heights = [pair for pair in sure_pairs(summary.views, summary.pairs) if pair.height_m_per_px]
-    commands = ["barpc export . ortho --to ortho && sh ortho/ortho.sh"]
+    commands = ["barpc ortho . -o ortho"]
     best = ""
     if heights:
         pair = min(heights, key=lambda pair: pair.height_m_per_px or np.inf)

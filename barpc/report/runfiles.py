@@ -1,4 +1,4 @@
-"""The files of a run, written and read back: residuals, pairs, outlines and tie points as CSV, GeoJSON and PLY.
+"""The files of a run, written and read back: residuals, pairs and outlines as CSV and GeoJSON, layers of a map.
 
 Residual tables carry the column names of ASP's ``bundle_adjust``. Every file is a function of the run alone:
 the same run gives the same bytes.
@@ -19,12 +19,13 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
-from barpc import __version__
 from barpc.base.errors import BarpcError, InputError, plain
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, feature_collection, geojson_feature
+from barpc.base.geodesy import Array, feature_collection, geojson_feature
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
+from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
 from barpc.report.records import Number, Record, column, value_of
 from barpc.report.renamed import with_new_names
@@ -128,24 +129,34 @@ def _rounded(value: float | None, digits: int) -> str:
 
 def _footprints_geojson(run: Run, summary: Summary) -> Iterable[bytes]:
     """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
-    rings, features = footprints(run.after or run.before, [view.size for view in run.views], run.altitude), []
-    for ring, entry in zip(np.round(rings, 9), summary.views, strict=True):
-        properties = {key: getattr(entry, key) for key in ViewEntry.FOOTPRINT.split()}
-        features.append(geojson_feature(ring, **properties, altitude_m=summary.altitude_m))
-    return [(json.dumps(feature_collection(features)) + "\n").encode()]
+    return [(json.dumps(feature_collection(_outlines(run, summary))) + "\n").encode()]
 
 
-def _points_ply(run: Run, _: Summary) -> Iterable[bytes]:
-    """Return the tie points in metres east, north, up of an origin that the header states, binary."""
-    rows = _per_track(run)
-    origin = rows[:, :3].mean(axis=0) if len(rows) else np.zeros(3)
-    if len(rows):
-        origin[0] = rows[0, 0]  # a mean of longitudes may fall on the other side of the Earth
-    local = (ecef_from_ground(rows[:, :3]) - ecef_from_ground(origin)) @ enu_basis(origin).T
-    columns: dict[str, Any] = dict(zip("xyz", local.T, strict=True))
-    columns |= {"mean_residual": rows[:, 3].astype(np.float32), "num_observations": rows[:, 4].astype(np.int32)}
-    place = f"lon {origin[0]:.9f} lat {origin[1]:.9f} alt {origin[2]:.4f} (WGS84, above the ellipsoid)"
-    return [ply(columns, f"barpc {__version__}: x east, y north, z up [m] of {place}")]
+def _outlines(run: Run, summary: Summary) -> list[dict[str, Any]]:
+    rings = footprints(run.after or run.before, [view.size for view in run.views], run.altitude)
+    names, altitude = ViewEntry.FOOTPRINT.split(), {"altitude_m": summary.altitude_m}
+    return [
+        geojson_feature(ring, **{key: getattr(entry, key) for key in names}, **altitude)
+        for ring, entry in zip(np.round(rings, 9), summary.views, strict=True)
+    ]
+
+
+def map_layers(run: Run, summary: Summary) -> list[Layer]:
+    """Return the layers of a run for a GIS: footprints, tie points, GCPs and check points, with their residuals."""
+    outlines, ties = [one for one in _outlines(run, summary) if one["geometry"]], _per_track(run)
+    kinds = ("TEXT", "TEXT", "TEXT", "INTEGER", "DOUBLE", "DOUBLE", "DOUBLE", "DOUBLE")
+    columns = [f"{name} {kind}" for name, kind in zip((*ViewEntry.FOOTPRINT.split(), "altitude_m"), kinds, strict=True)]
+    shapes = [shapely.geometry.shape(one["geometry"]) for one in outlines]
+    layers = [Layer("footprints", shapes, columns, [tuple(one["properties"].values()) for one in outlines])]
+    words = ["residual_px DOUBLE", "observations INTEGER", "residual_before_px DOUBLE", "track INTEGER"]
+    rows = ((mean, int(count), before, int(track)) for mean, count, before, track in ties[:, 3:].tolist())
+    layers.append(Layer("tie_points", point_shapes(ties[:, :3]), words, rows))
+    words = ["name TEXT", "status TEXT", "east_m DOUBLE", "north_m DOUBLE", "up_m DOUBLE"]
+    for name, entries in (("gcps", summary.gcps), ("check_points", summary.check_points)):
+        places = np.array([(one.lon, one.lat, one.alt_m) for one in entries]).reshape(-1, 3)
+        table = [(one.name, getattr(one, "status", "check"), *one.residual_enu_m) for one in entries]
+        layers.append(Layer(name, point_shapes(places), words, table))
+    return layers
 
 
 _PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar"}
@@ -185,7 +196,6 @@ TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
     "observations.csv": _observations_csv,
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints_geojson,
-    "points.ply": _points_ply,
 }
 """File name -> the parts of its bytes, of a run and its summary."""
 SURFACE = "surface.json"

@@ -190,12 +190,23 @@ def write_rpc(
     overwrite : bool, replace an existing file
     size : tuple of int, optional, width and height of the image [px]: Maxar's XML states it
 
+    Returns
+    -------
+    None, once the file is whole
+
     Raises
     ------
     RpcFormatError
         No format by that name.
     OutputError
         The file exists or cannot be written.
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> barpc.write_rpc(rpc, "view_00.RPB")
+    >>> barpc.read_rpc("view_00.RPB") == rpc
+    True
     """
     write_text(path, _text_of(rpc, Path(path), format, size), overwrite=overwrite)
 

@@ -170,7 +170,26 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
 
 
 def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
-    """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too."""
+    """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too.
+
+    Parameters
+    ----------
+    path, first_pixel, band : as of `barpc.rpcio.read_rpc_source`
+
+    Returns
+    -------
+    RPC
+
+    Raises
+    ------
+    RpcFormatError, ImageError
+        As of `barpc.rpcio.read_rpc_source`.
+
+    Examples
+    --------
+    >>> barpc.read_rpc("data_samples/view_00.tif")
+    RPC(lon 5.3962 to 5.4038, ...)
+    """
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
 
 

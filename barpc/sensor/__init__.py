@@ -15,13 +15,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array, pointwise
+from barpc.base.frozen import Frozen, Shown
+from barpc.base.geodesy import Array, as_ground, as_image, pointwise
 
 
 @runtime_checkable
 class SensorModel(Protocol):
-    """The protocol of every camera: projection, its derivative, localisation."""
+    """The protocol of every camera: projection, its derivative, localisation.
+
+    Examples
+    --------
+    >>> isinstance(barpc.read_rpc("data_samples/view_00.tif"), barpc.SensorModel)
+    True
+    """
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
@@ -50,11 +56,12 @@ class Pointwise(Frozen):
 
     def project(self, ground: Array) -> Array:
         """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]; NaN where they are not seen."""
-        return pointwise(lambda *part: [self._project(*part)], [(2,)], ground, rows=self._memory)[0]
+        return pointwise(lambda *part: [self._project(*part)], [(2,)], as_ground(ground), rows=self._memory)[0]
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
         """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
         shapes = [(2,), (2, 3)]
+        ground = as_ground(ground)
         image, jacobian = pointwise(lambda *part: self._derivatives(*part)[:2], shapes, ground, rows=self._memory)
         return image, jacobian
 
@@ -63,11 +70,11 @@ class Pointwise(Frozen):
 
         Longitudes run on across the antimeridian; NaN outside the model's validity, or off the ground.
         """
-        return pointwise(lambda *part: [self._localize(*part)], [(3,)], image, alt, rows=self._memory)[0]
+        return pointwise(lambda *part: [self._localize(*part)], [(3,)], as_image(image), alt, rows=self._memory)[0]
 
 
 @dataclass(frozen=True)
-class Behind:
+class Behind(Shown):
     """Base of models that are another one, `sensor`, behind a correction."""
 
     sensor: Any

@@ -22,6 +22,7 @@ from barpc.base.geodesy import (
     NEWTON_TOLERANCE,
     Array,
     IntArray,
+    as_image,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
@@ -103,6 +104,12 @@ class Correction(Frozen):
         row u = (row - row_offset) / row_scale at which the point is seen; D = 0: none.
     row_offset, row_scale : float, row of u = 0 and rows to u = 1 [px]
     scale : float, s; 1 in an adjustment, else of a similarity that another tool found
+
+    Examples
+    --------
+    >>> move = barpc.Correction(np.zeros(3), [1.0, 0.0, 0.0], [7.1e6, 0.0, 0.0])
+    >>> move
+    Correction(rotation 0 urad, translation 1 m)
     """
 
     rotation: Array
@@ -214,7 +221,15 @@ def correction_of(matrix: Array, at: Array) -> Correction:
 
 @dataclass(frozen=True)
 class Corrected(Behind):
-    """P_BA: `sensor` behind `correction`; itself a `SensorModel`."""
+    """P_BA: `sensor` behind `correction`; itself a `SensorModel`.
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> still = barpc.Correction(np.zeros(3), np.zeros(3), [7.1e6, 0.0, 0.0])
+    >>> bool(np.allclose(barpc.Corrected(rpc, still).project([5.4, 43.3, 120.0]), rpc.project([5.4, 43.3, 120.0])))
+    True
+    """
 
     sensor: SensorModel  # the model as delivered, P
     correction: Correction  # R, T and C
@@ -265,7 +280,7 @@ class Corrected(Behind):
         Where the uncorrected sensor sees them, brought back; at the altitude from which the correction brings them to
         the one asked for. It turns by so little that each step gains four digits. NaN where that does not settle.
         """
-        return pointwise(lambda *part: [self.localize_rows(*part)], [(3,)], image, alt)[0]
+        return pointwise(lambda *part: [self.localize_rows(*part)], [(3,)], as_image(image), alt)[0]
 
     def localize_rows(self, image: Array, alt: Array) -> Array:
         """Localise image points (n, 2) at altitudes (n,), all at once."""

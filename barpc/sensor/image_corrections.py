@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
-from barpc.base.geodesy import Array, IntArray
+from barpc.base.geodesy import Array, IntArray, as_image
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.direct_grid import LINEAR, MAX_NODE_SPACING, linear_axes
 
@@ -67,7 +67,7 @@ class Displaced(Behind):
 
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        return self.sensor.localize(self.correction.undo(np.asarray(image, dtype=np.float64)), alt)
+        return self.sensor.localize(self.correction.undo(as_image(image)), alt)
 
 
 def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
@@ -173,6 +173,12 @@ class RowSpline(Frozen):
     moved : (M, 2), displacement of each strip, (col, row) [px]; with a decay, at its origin
     periods : (M,), periods of the sinusoids over all rows [px]
     swings : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
+
+    Examples
+    --------
+    >>> step = barpc.RowSpline(np.zeros((0, 2)), edges=[500.0], steps=[[0.0, 0.0], [0.2, 0.0]])
+    >>> step.apply(np.array([[100.0, 7.0], [600.0, 7.0]])).tolist()
+    [[100.0, 7.0], [600.2, 7.0]]
     """
 
     coeffs: Array
@@ -257,7 +263,15 @@ class RowSpline(Frozen):
 
 @dataclass(frozen=True)
 class Splined(Displaced):
-    """`sensor`, usually P_BA, with image points displaced by spline, steps and sinusoids; itself a `SensorModel`."""
+    """`sensor`, usually P_BA, with image points displaced by spline, steps and sinusoids; itself a `SensorModel`.
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> step = barpc.RowSpline(np.zeros((0, 2)), edges=[500.0], steps=[[0.0, 0.0], [0.2, 0.0]])
+    >>> (barpc.Splined(rpc, step).project([5.4, 43.3, 120.0]) - rpc.project([5.4, 43.3, 120.0])).round(9).tolist()
+    [0.2, 0.0]
+    """
 
     correction: RowSpline  # added to its image points
 

@@ -129,6 +129,13 @@ class Pushbroom(Pointwise):
     ------
     RpcError
         A wrong shape, a value that is not finite, a `mount` that is no rotation, a line period of zero.
+
+    Examples
+    --------
+    >>> from barpc.simulate import fly, looks
+    >>> camera = fly(np.array([5.4, 43.3, 120.0]), looks(3)[0], (1000, 1000), 0.5)
+    >>> camera.project([5.4, 43.3, 120.0]).round(1)
+    array([499.5, 499.5])
     """
 
     orbit: Curve

@@ -55,6 +55,14 @@ class RPC(Pointwise):
     ------
     RpcError
         A wrong shape, a value that is not finite, a scale or a denominator that is zero.
+
+    Examples
+    --------
+    >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
+    >>> rpc.project([5.4, 43.3, 120.0]).round(2)
+    array([509.77, 494.61])
+    >>> rpc.localize([509.77, 494.61], 120.0).round(5)
+    array([  5.4,  43.3, 120. ])
     """
 
     coeffs: Array

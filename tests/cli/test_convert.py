@@ -8,30 +8,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pytest
 import rasterio
 from rasterio.windows import Window
 
-from barpc.base.errors import InputError, OutputError
+from barpc.base.errors import InputError, OutputError, Remark, UsageError
 from barpc.cameras import open_camera
-from barpc.cli import convert as module
-from barpc.cli.convert import (
-    _readers_agreement,
-    _refuse_source_folder,
-    _shadow_reasons,
-    _tell_readings,
-    _window_chooser,
-    box_of,
-    check_target,
-    window_of,
-)
+from barpc.cli import convert as printing
+from barpc.cli.convert import _tell_readings
 from barpc.fit.points import Sample
 from barpc.pipeline.verify_outputs import Reading
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
+from barpc.verbs import converting as module
+from barpc.verbs.converting import (
+    Conversion,
+    Converted,
+    _refuse_source_folder,
+    _shadow_reasons,
+    _window_chooser,
+    box_of,
+    check_target,
+    window_of,
+)
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -119,7 +120,7 @@ def test_what_reads_back_elsewhere_ends_with_3(
 def test_notes_of_a_camera_are_told_but_not_beside_json(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(module, "open_camera", lambda spec: replace(open_camera(spec), notes=("a note",)))
+    monkeypatch.setattr(module, "camera_of", lambda spec: replace(open_camera(spec), notes=("a note",)))
     assert run("convert", str(file), str(file.parent / "b.geom")) == 0
     assert capsys.readouterr().err == "barpc: a note\n"
     assert run("convert", str(file), str(file.parent / "c.geom"), "--json") == 0
@@ -137,18 +138,14 @@ def test_no_input_is_ever_replaced(image: Path, tmp_path: Path) -> None:
     check_target(tmp_path / "new.tif", [image], overwrite=False)
 
 
-def test_a_file_that_would_be_read_in_place_of_an_rpc_is_refused_or_told(
-    image: Path, file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_would_be_read_in_place_of_an_rpc_is_refused_or_told(image: Path, file: Path) -> None:
     target = image.with_suffix(".RPB")  # of an image that is no input here
     with pytest.raises(OutputError, match="would be read in place of the RPC that") as error:
         check_target(target, [file], overwrite=False)
     assert str(image) in str(error.value)
-    assert capsys.readouterr().err == ""
-    check_target(target, [file], overwrite=True)
-    assert capsys.readouterr().err == f"barpc: {target} is read in place of the RPC that {image} had\n"
+    with pytest.warns(Remark, match=f"{target} is read in place of the RPC that {image} had"):
+        check_target(target, [file], overwrite=True)
     check_target(target, [file], overwrite=False, rpc=read_rpc(image))  # the same: nothing changes
-    assert capsys.readouterr().err == ""
     with pytest.raises(OutputError):
         check_target(target, [file], overwrite=False, rpc=make_rpc())
 
@@ -202,15 +199,14 @@ def test_a_box_moves_with_its_altitude_and_a_dem() -> None:
     assert slope == (10, 20, 41, 21)
 
 
-def test_a_box_beyond_the_image_is_cut_off_and_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert window((9.894, 49.756, 10.094, 50.254)) == (0, 0, 10, 25)  # of 21 x 50
-    told = "barpc: flat.tif: --bbox reaches beyond the image; 76 % of it is cut off\n"
-    assert capsys.readouterr().err == told
+def test_a_box_beyond_the_image_is_cut_off_and_told() -> None:
+    with pytest.warns(Remark, match=r"^flat.tif: --bbox reaches beyond the image; 76 % of it is cut off$"):
+        assert window((9.894, 49.756, 10.094, 50.254)) == (0, 0, 10, 25)  # of 21 x 50
 
 
 @pytest.mark.parametrize("bbox", [(12.1, 49.6, 12.3, 49.8), (10.1, 48.0, 10.3, 48.9), (9.5, 49.6, 9.9, 49.8)])
 def test_a_box_beside_the_image_is_wrong_usage(bbox: Any) -> None:
-    with pytest.raises(click.UsageError, match=r"does not meet flat \(ground at 5 m\)"):
+    with pytest.raises(UsageError, match=r"does not meet flat \(ground at 5 m\)"):
         window(bbox, alt=5.0)
 
 
@@ -224,15 +220,15 @@ def test_a_box_may_lie_across_the_antimeridian() -> None:
 
 
 def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
-    none: dict[str, Any] = {"window": None, "bbox": None, "aoi": None}
-    assert _window_chooser({**none, "window": (1, 2, 3, 4)})(CAMERA, Path("a")) == (1, 2, 3, 4)
+    assert _window_chooser(Conversion(window=(1, 2, 3, 4)))(CAMERA, Path("a")) == (1, 2, 3, 4)
+    none: dict[str, Any] = {}
     for both in (
-        {},
+        none,
         {"window": (1, 2, 3, 4), "bbox": (0.0, 0.0, 1.0, 1.0)},
         {"bbox": (0.0,) * 4, "aoi": "a"},
     ):
-        with pytest.raises(click.UsageError, match="give one of --window, --bbox and --aoi"):
-            _window_chooser({**none, **both})
+        with pytest.raises(UsageError, match="give one of --window, --bbox and --aoi"):
+            _window_chooser(Conversion(**both))
 
 
 # --- a part of the ground out of many images --------------------------------------------------------------
@@ -383,7 +379,7 @@ def test_a_grid_goes_into_an_rpc_where_one_holds_it(
     assert "belongs to the input and is never replaced" in capsys.readouterr().err
     poor = type("Fit", (), {"verdict": lambda self, tolerance: f"misses {tolerance == options.tolerance}"})()
     options = module.FitOptions()
-    monkeypatch.setattr("barpc.cli.moving.fit_rpc", lambda *_, **__: poor)
+    monkeypatch.setattr("barpc.verbs.moving.fit_rpc", lambda *_, **__: poor)
     assert run("convert", str(grid), str(file.parent / "none.geom")) == 1
     assert f"{grid}: misses True ('barpc fit --keep-going' writes it" in capsys.readouterr().err
     assert not (file.parent / "none.geom").exists()
@@ -412,7 +408,7 @@ def test_what_readers_see_is_a_line_or_a_row_each(
     readings = [Reading(Path("a"), "gdal", 1.3e-9), Reading(Path("b"), "rpcm", NAN, "no field")]
     _tell_readings(readings)
     assert capsys.readouterr().out == "a: gdal 1.3e-09 px\nb: rpcm no field\n"
-    monkeypatch.setattr(module, "wants_json", lambda: True)
+    monkeypatch.setattr(printing, "wants_json", lambda: True)
     _tell_readings(readings)
     assert json.loads(capsys.readouterr().out) == [
         {"path": "a", "consumer": "gdal", "max_px": 1.3e-9, "note": ""},
@@ -428,14 +424,14 @@ def test_what_readers_see_is_a_line_or_a_row_each(
 ])  # fmt: skip
 def test_a_hand_off_ends_with_the_largest_difference_of_all_readers(errors: Sequence[float | None], said: str) -> None:
     seen = [Reading(Path("a"), "gdal", NAN if e is None else e, "no field" if e is None else "") for e in errors]
-    assert _readers_agreement(2, seen) == said
+    assert str(Converted((), tuple(seen), 2)) == said
 
 
 def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
     a, b = tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif"
     out = tmp_path / "out"
     _refuse_source_folder([a, b.with_name("y.tif")], out, ["txt", "geom"])
-    with pytest.raises(click.UsageError, match="--rpc-format doc: not a format that is written"):
+    with pytest.raises(UsageError, match="--rpc-format doc: not a format that is written"):
         _refuse_source_folder([a], out, ["txt", "doc"])
     with pytest.raises(InputError, match="several images named x: apply them one folder at a time"):
         _refuse_source_folder([a, b], out, ["txt"])
@@ -445,19 +441,18 @@ def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
         _refuse_source_folder([a], Path(str(tmp_path / "a\0b")), ["txt"])
 
 
-def test_what_hides_an_rpc_is_told_of_the_input_and_counts_in_the_output(
-    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_hides_an_rpc_is_told_of_the_input_and_counts_in_the_output(image: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "scene.tif"
     write_rpc_copy(read_rpc(image), image, out)
     assert _shadow_reasons(image, [out]) == []
-    assert capsys.readouterr().err == ""
     write_rpc(make_rpc(), image.with_suffix(".RPB"))
     write_rpc(make_rpc(), out.with_suffix(".RPB"))
     hiding = out.with_suffix(".RPB")
-    assert _shadow_reasons(image, [out]) == [f"{hiding} hides the RPC of {out}: move it away."]
-    assert capsys.readouterr().err == f"barpc: beside {image}: scene.RPB hides an RPC put into the image\n"
-    assert _shadow_reasons(image, [out, hiding]) == []  # it is one of those just written
+    told = f"^beside {image}: scene.RPB hides an RPC put into the image$"
+    with pytest.warns(Remark, match=told):
+        assert _shadow_reasons(image, [out]) == [f"{hiding} hides the RPC of {out}: move it away."]
+    with pytest.warns(Remark, match=told):
+        assert _shadow_reasons(image, [out, hiding]) == []  # it is one of those just written
 
 
 def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(

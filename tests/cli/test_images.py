@@ -11,8 +11,8 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.cli import main
-from barpc.cli.flags import expanded
 from barpc.rpcio import write_rpc, write_rpc_copy
+from barpc.verbs.images import expanded
 from tests.rpcio.conftest import make_rpc, write_image
 
 

@@ -13,10 +13,11 @@ import pytest
 
 from barpc.base.errors import InputError, RpcError
 from barpc.cameras import open_camera
-from barpc.cli import info as module
-from barpc.cli.info import _altitude, _describe, _labelled_sentences, _outlines_geojson, _viewed_together
+from barpc.cli.info import _labelled_sentences
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
+from barpc.verbs import describe as module
+from barpc.verbs.describe import _altitude, _describe, _viewed_together, outlines_geojson
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc
 
@@ -210,7 +211,7 @@ def test_a_camera_that_sees_no_ground_has_a_problem(pair: list[str]) -> None:
     camera = replace(open_camera(pair[0]), model=Blind())
     assert _describe(camera, 1.0, None)["problem"] == "no ground point at the image's centre"
     with pytest.raises(RpcError, match=r"left.*: no ground point at its image's border at 7 m"):
-        _outlines_geojson(pair[:1], [camera], 7.0, None)
+        outlines_geojson([camera], 7.0, None)
 
 
 # --- altitudes and outlines -------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.cli import project as module
 from barpc.cli.project import _print_points, _tell_failures, given_points
+from barpc.rasters.dem import Dem
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from tests.cli.test_main import run
@@ -175,7 +175,7 @@ def test_a_dem_tells_the_altitudes_of_projected_points(
     rpc_file: tuple[Path, RPC], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, rpc = rpc_file
-    monkeypatch.setattr(module.Dem, "open", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43))
+    monkeypatch.setattr(Dem, "open", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43))
     assert run("project", str(file), "5.4", "43.2", "--dem", "d.tif") == 0
     np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.4, 43.2, 103.8]), atol=6e-7)
 

@@ -22,6 +22,7 @@ DONE = {
     "export": ("{out}", "{new}", "--to", "stac"),
     "verify": ("{out}",),
     "report": ("{out}",),
+    "ortho": ("{out}", "-o", "{new}"),
     "dsm": ("{out}", "-o", "{new}.tif"),
 }
 """Verbs that do something."""

@@ -63,7 +63,7 @@ def source(tmp_path: Path) -> str:
 @pytest.fixture
 def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """What every fit is asked for: size, altitudes, options."""
-    from barpc import fit
+    from barpc.verbs import fitting as fit
 
     asked, real = list[tuple[Any, ...]](), fit.fit_rpc
 
@@ -132,10 +132,10 @@ def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
         return 100.0 - margin, 100.0 + margin
 
     monkeypatch.setattr(Dem, "open", lambda dem, geoid: (dem, geoid))
-    monkeypatch.setattr("barpc.fit.points.terrain_range", terrain_range)
+    monkeypatch.setattr("barpc.verbs.fitting.terrain_range", terrain_range)
     assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
     assert run("fit", source, "--dem", "d.tif", "--dem", "e.tif") == 0
-    assert asked == [((600, 500), (("d.tif",), "g.gtx"), 50.0), ((600, 500), (("d.tif", "e.tif"), None), 500.0)]
+    assert asked == [((600, 500), (["d.tif"], "g.gtx"), 50.0), ((600, 500), (["d.tif", "e.tif"], None), 500.0)]
     assert [row[1] for row in fitted] == [(50.0, 150.0), (-400.0, 600.0)]
     assert run("fit", source, "--dem", "d.tif", "--alt-range", "0", "300") == 0
     assert len(asked) == 2
@@ -147,7 +147,7 @@ def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
 def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
     wide: str, count: int, source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from barpc import cameras, fit
+    from barpc.verbs import fitting as fit
 
     asked = list[Any]()
 
@@ -158,7 +158,7 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
     ground = SimpleNamespace(all_ground=(-500.0, 9000.0))
     camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5))
     monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
-    monkeypatch.setattr(cameras, "open_camera", lambda _: camera)
+    monkeypatch.setattr(fit, "camera_of", lambda _: camera)
     assert run("fit", source) == 0
     assert [alts for alts, _ in asked] == [(-500.0, 9000.0), (1.0, 200.5)][:count]
     error = capsys.readouterr().err

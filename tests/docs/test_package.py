@@ -90,7 +90,13 @@ def test_the_source_archive_holds_what_it_takes_to_test_and_to_build_the_manual(
         names = {name.partition("/")[2] for name in archive.getnames()}
     for name in ("pyproject.toml", "README.md", "LICENSE", "CITATION.cff", "mkdocs.yml", "barpc/py.typed"):
         assert name in names, name
-    for name in ("tests/conftest.py", "data_samples/view_00.tif", "docs/index.md", "benchmarks/kernels.py"):
+    for name in (
+        "conftest.py",
+        "tests/conftest.py",
+        "data_samples/view_00.tif",
+        "docs/index.md",
+        "benchmarks/kernels.py",
+    ):
         assert name in names, name
     for name in ("recipe/recipe.yaml", "Dockerfile", "docs/man/barpc.1", "notebooks/first_run.ipynb"):
         assert name in names, name

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
-import re
-import shlex
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
 from barpc.export import TARGETS, _link_image, export_run, pinholes
-from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
-from tests.rasters.test_dem import write_dem, write_geoid
-from tests.rpcio.conftest import write_image
 
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
@@ -329,12 +324,12 @@ def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp
 
 
 def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
-    run, out = in_one_folder(southern, tmp_path), tmp_path / "ortho"
+    run, out = in_one_folder(southern, tmp_path), tmp_path / "stereo"
     summary = read(run / "summary.json")
-    summary["views"][0]["path"] = str(out / "ortho.sh")
+    summary["views"][0]["path"] = str(out / "config.json")
     (run / "summary.json").write_text(json.dumps(summary))
-    with pytest.raises(OutputError, match=r"ortho\.sh: is an input and is never written"):
-        export_run(run, "ortho", out)
+    with pytest.raises(OutputError, match=r"config\.json: is an input and is never written"):
+        export_run(run, "s2p", out)
 
 
 def test_the_run_s_own_folder_is_never_an_export(southern):
@@ -425,75 +420,3 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
             export_run(southern, "s2p", tmp_path / "x", alt_range=altitudes)
     assert not (tmp_path / "x").exists()
     assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]
-
-
-def test_the_commands_of_orthoimages_are_ones_that_gdal_takes(southern, tmp_path):
-    """Each line, with its options, through GDAL's own warper: the tie points' ground is where it belongs."""
-    from rasterio.vrt import WarpedVRT
-
-    script = exported(southern, "ortho", tmp_path) / "ortho.sh"
-    head, *lines = script.read_text().split("\n")
-    assert head == "#!/bin/sh"
-    commands = [shlex.split(line) for line in lines if line.startswith("gdalwarp")]
-    views = read(southern / "summary.json")["views"]
-    assert [command[-1] for command in commands] == [f"{view['name']}.tif" for view in views]
-    for command, view in zip(commands, views, strict=True):
-        options = dict(zip(command[2:-2:2], command[3:-2:2], strict=False))
-        assert command[:2] == ["gdalwarp", "-rpc"]
-        key, height = options["-to"].split("=")
-        assert key == "RPC_HEIGHT"
-        assert float(height) == pytest.approx(read(southern / "summary.json")["altitude_m"], abs=300)
-        assert options["-t_srs"].startswith("EPSG:327")
-        assert float(options["-tr"]) == pytest.approx(view["gsd_m"], rel=0.06)
-        assert (script.parent / command[-2]).resolve() == Path(view["path"]).resolve()
-        rpc = read_rpc(southern / next(iter(view["outputs"])))
-        raw = write_image(tmp_path / f"{view['name']}.tif", shape=(1, 700, 900))
-        write_rpc_copy(rpc, raw, tmp_path / "with" / raw.name)
-        how = {"src_crs": "EPSG:4326", "crs": options["-t_srs"], "RPC_HEIGHT": height}
-        with rasterio.open(tmp_path / "with" / raw.name) as opened, WarpedVRT(opened, **how) as ortho:
-            middle = rpc.localize(np.array([450.0, 350.0]), float(height))
-            assert ortho.lnglat() == pytest.approx(tuple(middle[:2]), abs=5e-4)
-
-
-def test_orthoimages_stand_on_the_run_s_dem_made_ellipsoidal(southern, tmp_path):
-    shutil.copytree(southern, tmp_path / "run")
-    summary = read(tmp_path / "run/summary.json")
-    for options, first in (
-        ({"dem": "/d/my dem.tif", "geoid": None}, "gdalwarp -rpc -to 'RPC_DEM="),
-        (
-            {"dem": "/d/my dem.tif", "geoid": "/g/egm96.tif"},
-            "gdalwarp -s_srs '+proj=longlat +datum=WGS84 +geoidgrids=",
-        ),
-    ):
-        (tmp_path / "run/summary.json").write_text(json.dumps({**summary, "options": options}))
-        export_run(tmp_path / "run", "ortho", tmp_path / "maps", overwrite=True)
-        lines = (tmp_path / "maps/ortho.sh").read_text().splitlines()
-        found = [line for line in lines if line.startswith("gdalwarp")]
-        assert found[0].startswith(first)
-        assert found[-1].count("RPC_DEM") == 1
-        assert "my dem.tif" in " ".join(shlex.split(found[0]))
-        assert ("RPC_DEM=dem_ellipsoidal.tif" in found[-1]) == (options["geoid"] is not None)
-
-
-def test_orthoimages_stand_on_several_dems_each_above_what_it_counted_from(southern, tmp_path):
-    shutil.copytree(southern, tmp_path / "run")
-    where = {"heights": np.zeros((9, 9), np.float32), "transform": rasterio.Affine(30, 0, 5e5, 0, -30, 6e6)}
-    level = write_dem(tmp_path / "level.tif", 4979, where["heights"])
-    named = write_dem(tmp_path / "named.tif", "EPSG:32731+5773", **where)
-    feet = write_dem(tmp_path / "feet.tif", 32731, band={"units": "ft"}, **where)
-    options = {"dem": [str(level), str(named), str(feet)], "geoid": str(write_geoid(tmp_path / "g.gtx"))}
-    summary = read(tmp_path / "run/summary.json")
-    (tmp_path / "run/summary.json").write_text(json.dumps({**summary, "options": options}))
-    export_run(tmp_path / "run", "ortho", tmp_path / "maps")
-    text = (tmp_path / "maps/ortho.sh").read_text()
-    lines = [shlex.split(line) for line in text.splitlines() if line.startswith("gdal")]
-    assert [line[-1] for line in lines[:3]] == ["dem_1.tif", "dem_2.tif", "dem_3.tif"]
-    assert "-s_srs" not in lines[0]
-    for line, geoid, unit in ((lines[1], "egm96_15.tif", "1"), (lines[2], "g.gtx", "0.3048")):
-        system = line[line.index("-s_srs") + 1]
-        assert re.match(r"\+proj=utm \+zone=31 \+south|\+init=epsg:32731", system)  # as older GDALs write it
-        assert re.search(rf"\+geoidgrids=\S*{geoid} \+vto_meter={unit}$", system)
-    assert lines[3][0] == "gdalbuildvrt"
-    assert lines[3][-4:] == ["dem.vrt", "dem_3.tif", "dem_2.tif", "dem_1.tif"]  # the first lies above
-    assert all("RPC_DEM=dem.vrt" in line for line in lines[4:])
-    assert "heights of level.tif, named.tif, feet.tif" in text

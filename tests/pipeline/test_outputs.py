@@ -282,7 +282,7 @@ def test_the_outputs_of_a_run_are_known_before_it_starts(tmp_path, view) -> None
     }
     prior, common = (
         f"tables/{PRIOR_FILE}",
-        [*(f"tables/{name}" for name in (*TABLES, "pictures.json")), "summary.json", "SHA256SUMS"]
+        [*(f"tables/{name}" for name in (*TABLES, "pictures.json")), "map.gpkg", "summary.json", "SHA256SUMS"]
         + ["report.html"] * can_render(),
     )
     pairs, known = ["asp/b__c__scene.txt", "asp/scene__b__c.txt"], "tables/images.json"
@@ -301,6 +301,7 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     """Tables, the page where it can be drawn, and the summary, in this order."""
     written = []
     monkeypatch.setattr(outputs, "TABLES", {"a.csv": lambda run, summary: [b"1"], "b.csv": lambda run, summary: [b"2"]})
+    monkeypatch.setattr(outputs, "map_layers", lambda run, summary: [])
     monkeypatch.setattr(outputs, "can_render", lambda: page)
     monkeypatch.setattr(outputs, "report_html", lambda summary, folder: f"<p>{summary.of} in {folder.name}</p>")
     for method in ("write_text", "output"):
@@ -310,15 +311,16 @@ def test_a_folder_with_a_summary_is_complete(tmp_path, monkeypatch, page: bool) 
     with Workspace(tmp_path / "out") as run:
         plain = SimpleNamespace(reference=None, options=RunOptions())
         told = outputs.write_tables(run, plain, Said("what was found"))  # type: ignore[arg-type]
-    names = ["tables/a.csv", "tables/b.csv", *(["report.html"] if page else []), "summary.json"]
+    names = ["tables/a.csv", "tables/b.csv", "map.gpkg", *(["report.html"] if page else []), "summary.json"]
     assert list(dict.fromkeys(written)) == names
     folder = tmp_path / "out"
     assert [(folder / name).read_bytes() for name in names[:2]] == [b"1", b"2"]
+    assert (folder / "map.gpkg").read_bytes().startswith(b"SQLite format 3")
     if page:
         assert (folder / "report.html").read_text() == "<p>what was found in out</p>"
     summary = json.loads((folder / "summary.json").read_text())
     assert summary.pop("outputs") == [
-        {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()} for name in names[:2]
+        {"file": name, "sha256": hashlib.sha256((folder / name).read_bytes()).hexdigest()} for name in sorted(names[:3])
     ]
     assert summary == {"of": "what was found"}
     assert told.of == "what was found"
@@ -419,6 +421,7 @@ def test_points_of_a_reference_are_written_where_it_held_the_block(
     tmp_path, monkeypatch, reference, control, adjusted, written
 ) -> None:
     monkeypatch.setattr(outputs, "TABLES", {})
+    monkeypatch.setattr(outputs, "map_layers", lambda run, summary: [])
     monkeypatch.setattr(outputs, "can_render", lambda: False)
     monkeypatch.setattr(outputs, "gcps_geojson", lambda run: b"points")
     held = SimpleNamespace(control=object() if control else None) if reference else None

@@ -100,6 +100,7 @@ def names_and_pixels(folder: Path, names: dict[str, bytes]) -> dict[str, object]
             "summary.json",
             "report.html",
             "SHA256SUMS",
+            "map.gpkg",
             "tables/footprints.geojson",
             "tables/images.json",
         ):

@@ -169,7 +169,7 @@ def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
     best = min(plain.pairs, key=lambda pair: pair.height_m_per_px)
     assert f"{best.a} - {best.b}, " in use.text
     assert [command.split()[1:4] for command in use.commands] == [
-        ["dsm", ".", "-o"], ["export", ".", "s2p"], ["export", ".", "ortho"]
+        ["dsm", ".", "-o"], ["export", ".", "s2p"], ["ortho", ".", "-o"]
     ]  # fmt: skip
     for command in use.commands:
         verb = cli.get_command(click.Context(cli), command.split()[1])

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.report import outcome as runs
 from barpc.report import runfiles as modules
 from barpc.report import summarize
+from barpc.report.geopackage import geopackage
 from barpc.report.records import json_form
 from barpc.report.runfiles import (
     OBSERVATION_COLUMNS,
@@ -30,6 +30,7 @@ from barpc.report.runfiles import (
     _table_columns,
     _track_numbers,
     gcps_geojson,
+    map_layers,
     read_tables,
     run_key,
 )
@@ -92,20 +93,6 @@ def test_pairs_hold_the_figures_of_the_summary(block_run):
     assert float(row["epipolar_after_rms_px"]) == pytest.approx(pair["epipolar_after"]["rms"], abs=1e-5)
 
 
-def test_the_point_cloud_is_the_tie_points_about_the_origin_it_states(block_run):
-    data = (block_run.folder / "tables/points.ply").read_bytes()
-    head, body = data.split(b"end_header\n", 1)
-    words = next(line for line in head.decode().splitlines() if line.startswith("comment")).split()
-    origin = np.array([float(words[words.index(key) + 1]) for key in ("lon", "lat", "alt")])
-    kind = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("mean_residual", "<f4"), ("num_observations", "<i4")])
-    cloud = np.frombuffer(body, dtype=kind)
-    assert f"element vertex {len(cloud)}" in head.decode()
-    local = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=-1)
-    ecef = local @ enu_basis(origin) + ecef_from_ground(origin)
-    usable = np.isfinite(block_run.run.ground).all(axis=1)
-    assert np.abs(ecef - ecef_from_ground(block_run.run.ground[usable])).max() < 1e-3  # the origin's 9 decimals
-
-
 def test_the_same_run_gives_the_same_bytes(block_run):
     run, summary = block_run.run, block_run.record
     # tables and report count, too, once they are written
@@ -114,6 +101,7 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     assert json.dumps(json_form(again)) == json.dumps(block_run.summary)
     for name, content in TABLES.items():
         assert b"".join(content(run, again)) == (block_run.folder / "tables" / name).read_bytes(), name
+    assert geopackage(map_layers(run, again)) == (block_run.folder / "map.gpkg").read_bytes()
 
 
 def test_tables_are_written_and_read_in_parts_of_any_size(block_run, monkeypatch):
@@ -297,26 +285,6 @@ def test_an_observation_s_numbers_have_three_and_four_decimals(block_run, check_
         _, rows = rows_of(finished.folder / "tables/observations.csv")
         digits = [len(cell.partition(".")[2]) for cell in rows[0][2:8]]
         assert digits[:filled] == ([3, 3, 4, 4, 4, 4] if filled == 6 else [4, 4, 4, 4])
-
-
-def test_a_point_cloud_across_the_antimeridian_is_in_one_place(antimeridian_run):
-    data = (antimeridian_run.folder / "tables/points.ply").read_bytes()
-    head, body = data.split(b"end_header\n", 1)
-    kind = np.dtype([("xyz", "<f8", 3), ("mean_residual", "<f4"), ("num_observations", "<i4")])
-    cloud = np.frombuffer(body, dtype=kind)
-    assert np.abs(cloud["xyz"]).max() < 30e3
-    _, rows = rows_of(antimeridian_run.folder / "tables/residuals.csv")
-    assert cloud["mean_residual"] == pytest.approx(np.array([float(row[3]) for row in rows]), abs=1e-4)
-    assert cloud["num_observations"].tolist() == [int(row[4]) for row in rows]
-    assert b"property float mean_residual\nproperty int num_observations\n" in head + b"\n"
-
-
-def test_the_cloud_of_no_tie_point_is_empty(block_run, monkeypatch):
-    monkeypatch.setattr(modules, "_per_track", lambda _: np.zeros((0, 7)))
-    data = b"".join(TABLES["points.ply"](block_run.run, block_run.record))
-    assert b"element vertex 0\n" in data
-    assert b"lon 0.000000000 lat 0.000000000 alt 0.0000" in data
-    assert data.endswith(b"end_header\n")
 
 
 def test_points_of_a_reference_are_written_as_control_is_read():

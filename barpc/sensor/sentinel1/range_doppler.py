@@ -236,6 +236,11 @@ class RangeDoppler(Clocked):
     look : "right" or "left", side of the track; a point on the other side projects to NaN
     delays : Delays, smooth corrections between geometry and annotated times; none by default
     accuracy : (float, float) or None, standard deviations of range and of the place along the flight [m]
+
+    Examples
+    --------
+    >>> barpc.open_camera("S1A_IW_SLC_....SAFE,swath=iw1").model.look  # doctest: +SKIP
+    'right'
     """
 
     azimuth_axis: ClassVar[int] = 1

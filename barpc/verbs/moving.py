@@ -1,4 +1,4 @@
-"""A motion of the ground, `--move` or `--transform`, brought back into cameras; and cameras refitted into RPCs."""
+"""A motion of the ground brought back into cameras; and cameras refitted into RPCs."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
-import click
 import numpy as np
+import numpy.typing as npt
 
-from barpc.base.errors import BarpcWarning, FitError, InputError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.cli.terminal import remark
+from barpc.base.errors import BarpcWarning, FitError, InputError, Remark, UsageError
+from barpc.base.geodesy import Array, as_points, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pointio.tables import read_transform
 from barpc.rpcio import CARRIERS
@@ -24,26 +24,15 @@ from barpc.sensor.rpc import RPC
 
 _DEEPEST, _HIGHEST = -12e3, 10e3
 """Altitudes between which all ground on Earth lies [m], that of the sea's bottom, too."""
+LONGEST_MOVE = _HIGHEST - _DEEPEST  # m, along an axis
 _NOTEWORTHY_ROUNDING = 0.01  # m: rounding of a matrix that is told
 _EXACT_REFIT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC states; else its image goes first
 _MOVED_NOTE = "moved and refitted"
 
 
-def read_move(_: click.Context, __: click.Parameter, text: str | None) -> Array | None:
-    """Return the three numbers of --move, metres east, north and up."""
-    if text is None:
-        return None
-    try:
-        east, north, up = (float(word) for word in text.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is not three numbers E,N,U [m] with commas between") from None
-    move = np.array([east, north, up])
-    if not (np.abs(move) < _HIGHEST - _DEEPEST).all():
-        raise click.BadParameter(f"{text!r}: a motion of less than 22 km along each axis is expected [m]")
-    return move
-
-
-def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, carrier: str) -> list[Camera]:
+def moved(
+    cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str | Path | None, carrier: str
+) -> list[Camera]:
     """Return cameras that show the moved ground where these show it unmoved, each refitted into an RPC and certified.
 
     The motion is `move` (3,) [m], east, north and up at the middle of all the images, or that of the file
@@ -57,9 +46,11 @@ def moved(cameras: Sequence[Camera], move: Array | None, transform: str | None, 
     if transform is not None:
         matrix = read_transform(transform)
     else:
-        assert move is not None
-        _check_position(move, np.concatenate(corners))
-        matrix = np.column_stack([np.eye(3), enu_basis(at).T @ move])
+        metres = as_points(() if move is None else move, 3, "a motion", "metres east, north, up")
+        if not (np.abs(metres) < LONGEST_MOVE).all():
+            raise UsageError(f"--move {metres}: less than 22 km along each axis is expected [m]")
+        _check_position(metres, np.concatenate(corners))
+        matrix = np.column_stack([np.eye(3), enu_basis(at).T @ metres])
     out = []
     for camera, ground in zip(cameras, corners, strict=True):
         there = ground_from_ecef(ecef_from_ground(ground) @ matrix[:, :3].T + matrix[:, 3])
@@ -105,14 +96,14 @@ def _refitted(camera: Camera, correction: Correction, alt_range: tuple[float, fl
     if isinstance(camera.model, RPC):
         low, high = _domain(camera.model, camera.extent)
         moving = Corrected(camera.model.crop(*low), correction)
-        with suppress(FitError), warnings.catch_warnings():
-            warnings.simplefilter("ignore", BarpcWarning)  # of what lies beyond the image
-            size, ridge = (high[0] - low[0], high[1] - low[1]), replace(options, method="ridge")
-            fit = fit_rpc(moving, size, alt_range, options=ridge, strict=False)
+        with suppress(FitError):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BarpcWarning)  # of what lies beyond the image
+                size, ridge = (high[0] - low[0], high[1] - low[1]), replace(options, method="ridge")
+                fit = fit_rpc(moving, size, alt_range, options=ridge, strict=False)
             if fit.max_ckp.max() <= _EXACT_REFIT and not fit.verdict(options.tolerance):
-                return _announced(
-                    replace(camera, model=fit.rpc.crop(-low[0], -low[1]), alt_range=alt_range), fit, _MOVED_NOTE
-                )
+                back = replace(camera, model=fit.rpc.crop(-low[0], -low[1]), alt_range=alt_range)
+                return _announced(back, fit, _MOVED_NOTE)
     return refitted(camera, Corrected(camera.model, correction), alt_range, options, _MOVED_NOTE)
 
 
@@ -135,7 +126,7 @@ def refitted(
 
 
 def _announced(camera: Camera, fit: RpcFit, done: str) -> Camera:
-    remark(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px")
+    warnings.warn(f"{camera.path}: {done} to {float(fit.max_ckp.max()):.1g} px", Remark, stacklevel=3)
     return camera
 
 
@@ -144,10 +135,15 @@ def _tell_motion(matrix: Array, middle: Array) -> None:
     at, stretch = ground_from_ecef(middle), np.linalg.svd(matrix[:, :3], compute_uv=False)
     rounding = float((stretch[0] - stretch[-1]) / stretch.mean() * np.linalg.norm(middle))
     if rounding > _NOTEWORTHY_ROUNDING:
-        remark(f"the matrix is written with few digits: it determines the ground to some {rounding:.2g} m only")
+        warnings.warn(
+            f"the matrix is written with few digits: it determines the ground to some {rounding:.2g} m only",
+            Remark,
+            stacklevel=3,
+        )
     east, north, up = enu_basis(at) @ (matrix @ np.append(middle, 1.0) - middle)
     scale, place = float(stretch.mean()), f"lon {at[0]:.7f}, lat {at[1]:.7f}"
     turn = float(np.arccos(np.clip((np.trace(matrix[:, :3]) / scale - 1.0) / 2.0, -1.0, 1.0)))
     more = f", turned by {1e6 * turn:.3g} urad, scaled by {scale:.9g}"
     more *= bool((matrix[:, :3] != np.eye(3)).any())
-    remark(f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle, {place}{more}")
+    motion = f"the ground moves by {east:+.3f} m east, {north:+.3f} m north, {up:+.3f} m up at its middle"
+    warnings.warn(f"{motion}, {place}{more}", Remark, stacklevel=3)

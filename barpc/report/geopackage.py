@@ -1,0 +1,86 @@
+"""Layers of a run in one GeoPackage (OGC 12-128r19), for a GIS: by sqlite3 and shapely, as rasterio has no vectors."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import shapely
+
+from barpc.base.geodesy import Array
+
+_WGS84 = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]'
+)
+_SCHEMA = """
+PRAGMA application_id = 0x47504B47;
+PRAGMA user_version = 10300;
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
+    organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+    description TEXT DEFAULT '', last_change DATETIME NOT NULL, min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE,
+    srs_id INTEGER REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL UNIQUE REFERENCES gpkg_contents(table_name),
+    column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL
+    REFERENCES gpkg_spatial_ref_sys(srs_id), z TINYINT NOT NULL, m TINYINT NOT NULL,
+    PRIMARY KEY (table_name, column_name));
+"""
+_SYSTEMS = (
+    ("undefined cartesian", -1, "NONE", -1, "undefined"),
+    ("undefined geographic", 0, "NONE", 0, "undefined"),
+    ("WGS 84", 4326, "EPSG", 4326, _WGS84),
+)
+_UNCHANGED = "1970-01-01T00:00:00.000Z"  # a date would make two runs of the same differ
+_HEAD = struct.pack("<2sBBi", b"GP", 0, 1, 4326)  # little-endian, without an envelope
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Geometries in lon, lat [deg], points with altitude [m above the ellipsoid], and columns with their SQL types."""
+
+    name: str
+    shapes: Sequence[Any]
+    columns: Sequence[str]
+    rows: Iterable[Sequence[Any]]
+
+
+def point_shapes(lonlatalt: Array) -> Sequence[Any]:
+    """Return points (n, 3) as geometries."""
+    return [shapely.Point(place) for place in lonlatalt.tolist()]
+
+
+def geopackage(layers: Sequence[Layer]) -> bytes:
+    """Return the bytes of a GeoPackage; layers without geometries are left out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> layer = Layer("ties", point_shapes(np.array([[5.4, 43.3, 120.0]])), ["track INTEGER"], [(7,)])
+    >>> geopackage([layer])[:15]
+    b'SQLite format 3'
+    """
+    with closing(sqlite3.connect(":memory:")) as data:
+        data.executescript(_SCHEMA)
+        data.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", _SYSTEMS)
+        for layer in layers:
+            if not len(layer.shapes):
+                continue
+            kinds, box = {shape.geom_type for shape in layer.shapes}, shapely.total_bounds(layer.shapes)
+            kind, has_z = kinds.pop() if len(kinds) == 1 else "Geometry", int(layer.shapes[0].has_z)
+            columns = ["fid INTEGER PRIMARY KEY", f"geom {kind.upper()}", *layer.columns]
+            data.execute(f"CREATE TABLE {layer.name} ({', '.join(columns)})")
+            about = (layer.name, "features", layer.name, _UNCHANGED, *map(float, box), 4326)
+            data.execute("INSERT INTO gpkg_contents VALUES (?, ?, ?, '', ?, ?, ?, ?, ?, ?)", about)
+            column = (layer.name, "geom", kind.upper(), 4326, has_z, 0)
+            data.execute("INSERT INTO gpkg_geometry_columns VALUES (?, ?, ?, ?, ?, ?)", column)
+            marks = ", ".join("?" * (1 + len(layer.columns)))
+            blobs = (_HEAD + one for one in shapely.to_wkb(layer.shapes, byte_order=1, flavor="iso").tolist())
+            rows = ((blob, *row) for blob, row in zip(blobs, layer.rows, strict=True))
+            data.executemany(f"INSERT INTO {layer.name} VALUES (NULL, {marks})", rows)  # noqa: S608  (our own names)
+        data.commit()
+        return bytes(data.serialize())

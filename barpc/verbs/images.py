@@ -1,0 +1,132 @@
+"""Images as the verbs take them: one or many paths, patterns and folders, open datasets, views and cameras."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from barpc.base.errors import BarpcError, InputError
+from barpc.base.remote import PathOrUrl, is_url
+from barpc.base.safe_io import IMAGE, read_head, unread
+from barpc.cameras import EVERYWHERE, open_camera, split_spec
+from barpc.scene import Camera, View
+from barpc.sensor import SensorModel
+from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import RPC
+
+ImageLike = Any
+"""A path, perhaps with choices behind it (`barpc.open_camera`), an open rasterio dataset, a View or a Camera."""
+
+
+def file_of(image: ImageLike) -> Any:
+    """Return the path of an open dataset; anything else as it is. InputError for a dataset without a file."""
+    name, mode = getattr(image, "name", None), getattr(image, "mode", None)
+    if isinstance(image, (str, os.PathLike, View, Camera)) or not (hasattr(image, "crs") and isinstance(name, str)):
+        return image
+    if mode != "r" or not (is_url(name) or os.path.lexists(name)):
+        raise InputError(f"{name}: a dataset without a file that can be read (mode {mode}); write it to disk first")
+    return name
+
+
+def one_or_many(images: ImageLike | Iterable[ImageLike]) -> tuple[list[ImageLike], bool]:
+    """Return images as a list, open datasets as their paths, and whether several were asked for."""
+    alone = isinstance(images, (str, os.PathLike, View, Camera, SensorModel)) or file_of(images) is not images
+    return [file_of(image) for image in ([images] if alone else images)], not alone
+
+
+def every(images: ImageLike | Iterable[ImageLike]) -> list[Any]:
+    """Return images as a list, with folders and patterns expanded."""
+    found = list[Any]()
+    for image in one_or_many(images)[0]:
+        found += expanded([os.fspath(image)]) if isinstance(image, (str, os.PathLike)) else [image]
+    return found
+
+
+def camera_of(image: ImageLike | SensorModel) -> Camera:
+    """Return the camera of an image, of a view or of a sensor model, opened where it is a path."""
+    image = file_of(image)
+    if isinstance(image, Camera):
+        return image
+    if isinstance(image, View):
+        return Camera(image.sensor, Path(image.path or image.name), "view", image.size, image.alt_range)
+    if isinstance(image, (str, os.PathLike)):
+        return open_camera(os.fspath(image))
+    if isinstance(image, SensorModel):
+        levels = altitude_range(image) if isinstance(image, RPC) else EVERYWHERE
+        return Camera(image, Path(type(image).__name__), "model", getattr(image, "size", None), levels)
+    raise InputError(f"{image!r} is no image: give a path, an open dataset, a View or a Camera")
+
+
+def place_of(image: ImageLike | SensorModel) -> PathOrUrl:
+    """Return the file of an image, as given."""
+    given = file_of(image)
+    return split_spec(os.fspath(given))[0] if isinstance(given, (str, os.PathLike)) else camera_of(given).path
+
+
+# --- folders and patterns ---------------------------------------------------------------------------------
+
+
+_ENDS = (".tif", ".tiff", ".ntf", ".nitf", ".nsf", ".jp2", ".j2k", ".vrt")
+
+
+def expanded(specs: Sequence[str]) -> list[str]:
+    """Return files instead of folders (their rasters; a radar product is one) and of patterns that no shell took.
+
+    InputError for an empty name, a folder that holds no raster, a pattern that finds nothing.
+    """
+    found: list[str] = []
+    for spec in specs:
+        if not spec:  # what an unset variable of a shell leaves, and the current folder to all who open it
+            raise InputError("an empty name among the images; give '.' for the current folder")
+        name, choices = spec, ""
+        if not os.path.lexists(spec) and not is_url(spec):
+            name = os.fspath(name_of(spec))
+            choices = spec[len(name) :]
+        found += [one + choices for one in _matching_files(name)]
+    return found
+
+
+def name_of(spec: str) -> str:
+    """Return the file name of an argument with choices behind it, as typed."""
+    with suppress(BarpcError):
+        _, choices = split_spec(spec)
+        for key, text in choices.items():
+            spec = spec.removesuffix(f",{key}={text}")
+        return spec.partition(",")[0] if choices and not os.path.lexists(spec) else spec
+    return spec
+
+
+def _matching_files(name: str) -> list[str]:
+    path = Path(name)
+    if is_url(name) or not (path.is_dir() or any(char in name for char in "*?[")):
+        return [name]
+    if path.is_dir():
+        if (path / "manifest.safe").exists() or path.suffix.upper() == ".SAFE":
+            return [name]
+        inside = sorted(entry.name for entry in os.scandir(path) if entry.is_file())
+        rasters = [str(path / one) for one in inside if one.lower().endswith(_ENDS) and _is_raster(path / one)]
+        if not rasters:
+            from barpc.sensor.terrasar import find_annotation
+
+            if find_annotation(path):
+                return [name]
+            raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
+        return rasters
+    if os.path.lexists(name):
+        return [name]
+    matching = sorted(glob.glob(name))  # noqa: PTH207  (a Path would take the ./ away)
+    if not matching:
+        raise InputError(f"{name}: no file has such a name")
+    return matching
+
+
+def _is_raster(path: Path) -> bool:
+    from barpc.rasters.raster import driver_of
+
+    with suppress(BarpcError):
+        return driver_of(read_head(path, IMAGE, 64)) is not None
+    return False

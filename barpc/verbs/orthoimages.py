@@ -1,0 +1,272 @@
+"""`ortho`: orthoimages by GDAL's RPC warper, on a DEM whose heights are above the ellipsoid, as COGs on one grid."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import rasterio
+import rasterio.shutil
+from rasterio import Affine
+from rasterio.crs import CRS
+from rasterio.enums import MaskFlags, Resampling
+from rasterio.warp import reproject, transform
+from rasterio.windows import Window
+
+from barpc import __version__
+from barpc.base.errors import InputError, Remark
+from barpc.base.frozen import Shown
+from barpc.base.geodesy import parts as chunks
+from barpc.base.geodesy import wrap_longitude
+from barpc.export.shots import Scene, read_scene
+from barpc.fit.points import terrain_range
+from barpc.pointio.names import unique_names
+from barpc.rasters.dem import Dem
+from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
+from barpc.scene import Camera
+from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
+from barpc.tie.tasks import Progress
+from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
+from barpc.verbs.points import Files, altitude_of, ground_at, terrain_of
+from barpc.verbs.runs import run_folder
+from barpc.workspace import Homes, Workspace
+
+_SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
+_MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
+_RELIEF = 50.0  # m around a DEM's heights at sampled places
+_NODES = 17
+_COG = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK_SIZE), "BIGTIFF": "IF_SAFER"}
+_WGS84 = CRS.from_epsg(4326)
+
+
+@dataclass(frozen=True)
+class OrthoChoices:
+    """Keywords of `ortho`, the flags of `barpc ortho`.
+
+    Parameters
+    ----------
+    dem : path or paths, optional, terrain heights; of several, the first with a height at a place counts
+    geoid : str, optional, of DEMs that do not state theirs: a name or a file
+    alt : float, optional, without a DEM: one altitude for all ground [m above the ellipsoid]
+    gsd : float, optional, side of a pixel [m]; else that of the finest image
+    crs : str, optional, map projection in metres; else the UTM zone of the first image
+    overwrite : bool, replace what an earlier call wrote
+    """
+
+    dem: Files | None = None
+    geoid: str | None = None
+    alt: float | None = None
+    gsd: float | None = None
+    crs: str | None = None
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.gsd is not None and not 0 < self.gsd < np.inf:
+            raise InputError(f"gsd {self.gsd}: a side in metres is expected")
+
+
+@dataclass(frozen=True)
+class Ortho(Shown):
+    """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with."""
+
+    path: Path
+    crs: str
+    gsd: float
+    size: tuple[int, int]
+    heights: str
+
+
+def ortho(
+    images: ImageLike | Iterable[ImageLike], out_dir: str | Path, *, progress: Progress | None = None, **keywords: Any
+) -> list[Ortho]:
+    """Make orthoimages of images with RPCs, by GDAL's warper, as Cloud-Optimised GeoTIFFs on one grid.
+
+    Parameters
+    ----------
+    images : path of a finished run, with its DEMs, or one or many images: paths, patterns, folders, open rasterio
+        datasets, Views, Cameras
+    out_dir : path, folder for the orthoimages, each with the name of its image
+    progress : callable, optional, `progress(stage, done, total)`
+    **keywords : fields of `barpc.verbs.orthoimages.OrthoChoices`: dem, geoid, alt, gsd, crs, overwrite
+
+    Returns
+    -------
+    list of Ortho, an image each: path, crs, gsd [m], size [px], heights
+
+    Raises
+    ------
+    InputError, FitError
+        A camera without an RPC, complex pixels, a DEM without heights under an image.
+    OutputError
+        A file that exists or cannot be written.
+
+    Warns
+    -----
+    Remark : an altitude was assumed, or a part of an image has no height and so no pixels
+
+    Examples
+    --------
+    >>> (done,) = barpc.ortho("data_samples/view_00.tif", "maps", alt=120, gsd=2)
+    >>> done.crs, done.gsd, done.path.name
+    ('EPSG:32631', 2.0, 'view_00.tif')
+    """
+    choices, (given, _) = OrthoChoices(**keywords), one_or_many(images)
+    alt, terrain = choices.alt, terrain_of(choices.dem, choices.geoid, choices.alt)
+    if (run := run_folder(given)) is None:
+        cameras, files = zip(*((camera_of(image), Path(place_of(image))) for image in every(given)), strict=True)
+    else:
+        cameras, heights = _of_run(scene := read_scene(run))
+        files = tuple(Path(camera.path) for camera in cameras)
+        terrain = heights if terrain is None and alt is None else terrain
+        alt = scene.summary.altitude_m if alt is None else alt
+    middles = [one.model.localize((np.array(one.extent) - 1) / 2, np.array(one.altitude)) for one in cameras]
+    sides = [float(ground_sample_distance(one.rpc, at)[1]) for one, at in zip(cameras, middles, strict=True)]
+    grid = map_crs(choices.crs, middles[0]), float(choices.gsd or 0.0) or float(f"{min(sides):.2g}")
+    names, done = [f"{name}.tif" for name in unique_names(files)], list[Ortho]()
+    with Workspace(out_dir, overwrite=choices.overwrite, keep=files, names=names, adds=True) as workspace:
+        for name, camera, file in zip(names, cameras, files, strict=True):
+            warp = _Warp.of(camera, file, terrain, alt, grid, workspace.partial)
+            warp.write(rough := workspace.partial / "rough.tif", file, progress)
+            with workspace.output(name) as partial, rasterio.Env(**GDAL_OPTIONS):
+                rasterio.shutil.copy(rough, partial, driver="COG", **_COG)
+            done.append(Ortho(workspace.folder / name, grid[0].to_string(), grid[1], warp.size, warp.words))
+    return done
+
+
+def _of_run(scene: Scene) -> tuple[tuple[Camera, ...], Dem | None]:
+    """Return the corrected cameras of a run, used at its altitudes, and the terrain that it was made with."""
+    given: Any = scene.summary.options or {}
+    at = Homes.of(scene.folder).located
+    dems = [given["dem"]] if isinstance(given.get("dem"), str) else given.get("dem") or ()
+    taken = [
+        name and (at(name) if Path(at(name)).exists() else Path(name).name)
+        for name in map(given.get, ("geoid", "heights"))
+    ]
+    cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
+    return cameras, Dem.open([at(name) for name in dems], *taken) if dems else None
+
+
+@dataclass(frozen=True)
+class _Warp:
+    """The map of one image: its camera, the altitudes of its ground [m], and GDAL's settings for the heights."""
+
+    camera: Camera
+    levels: tuple[float, float]
+    heights: dict[str, Any]
+    words: str
+    crs: CRS
+    place: Affine
+    size: tuple[int, int]
+
+    @classmethod
+    def of(
+        cls, camera: Camera, file: Path, terrain: Dem | None, alt: float | None, grid: tuple[CRS, float], room: Path
+    ) -> _Warp:
+        """Return the map that covers an image at an altitude, or on a terrain, which goes to a file."""
+        (crs, gsd), model = grid, camera.model
+        if terrain is None:
+            level = altitude_of(camera, file, alt)
+            levels, words = (level, level), f"all ground at {level:.5g} m"
+            heights: dict[str, Any] = {"RPC_HEIGHT": level}
+        else:
+            low, high = terrain_range(model, camera.extent, camera.alt_range, terrain, _RELIEF)
+            levels, words = (low, high), f"heights of {terrain.description}"
+            heights = {"RPC_DEM": str(_write_terrain(room / "terrain.tif", camera, terrain, levels))}
+            at = image_grid(camera.extent, (0.0, 0.0), (_NODES, 1))[0]
+            unknown = float(np.isnan(ground_at(camera, at, 0.0, terrain)[:, 2]).mean())
+            if unknown:
+                share = f"the DEM has no height under {unknown:.2g} of the image: no pixels there"
+                warnings.warn(f"{file}: {share}", Remark, stacklevel=3)
+        rings = np.concatenate([footprint(model, camera.extent, level) for level in levels])
+        east, north = transform(_WGS84, crs, *rings.T)
+        west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
+        west, north = float(np.floor(west)), float(np.ceil(north))
+        size = int(np.ceil(east - west)), int(np.ceil(north - south))
+        return cls(camera, levels, heights, words, crs, Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd), size)
+
+    def write(self, out: Path, image: Path, progress: Progress | None) -> None:
+        """Write the map of an image, a block at a time."""
+        blocks = [
+            Window(col, row, min(_SIDE, self.size[0] - col), min(_SIDE, self.size[1] - row))
+            for row in range(0, self.size[1], _SIDE)
+            for col in range(0, self.size[0], _SIDE)
+        ]
+        with open_raster(image) as source, rasterio.Env(**GDAL_OPTIONS):
+            kind = np.dtype(source.dtypes[0])
+            if kind.kind == "c":
+                raise InputError(f"{image}: complex pixels; an orthoimage needs their amplitude")
+            none = source.nodata if source.nodata is not None else 0 if kind.kind in "iu" else np.nan
+            layout = {"tiled": True, "blockxsize": BLOCK_SIZE, "blockysize": BLOCK_SIZE, "SPARSE_OK": True}
+            what = {"dtype": kind, "nodata": none, "crs": self.crs, "transform": self.place, "BIGTIFF": "IF_SAFER"}
+            with rasterio.open(out, "w", "GTiff", *self.size, source.count, **what, **layout) as file:
+                file.update_tags(BARPC=__version__, IMAGE=image.name, HEIGHTS=self.words)
+                for number, block in enumerate(blocks, start=1):
+                    if (part := self._pixels(block)) is not None:
+                        file.write(self._warped(source, part, block, none), window=block)
+                    if progress is not None:
+                        progress(f"ortho {image.stem}", number, len(blocks))
+
+    def _pixels(self, block: Window) -> Window | None:
+        """Return the part of the image that a block of the map shows; None where it shows none."""
+        nodes = np.linspace(0.0, 1.0, _NODES)
+        col, row = np.meshgrid(block.col_off + nodes * block.width, block.row_off + nodes * block.height)
+        lon, lat = transform(self.crs, _WGS84, *(self.place @ (col.ravel(), row.ravel())))
+        ground = np.array([(x, y, level) for level in self.levels for x, y in zip(lon, lat, strict=True)])
+        at = self.camera.model.project(ground)
+        at = at[np.isfinite(at).all(axis=1)]
+        if not len(at):
+            return None
+        low = np.maximum(np.floor(at.min(axis=0)) - _MARGIN, 0).astype(int)
+        high = np.minimum(np.ceil(at.max(axis=0)) + _MARGIN, self.camera.extent).astype(int)
+        return Window(*low, *(high - low)) if (high > low).all() else None
+
+    def _warped(self, source: Any, part: Window, block: Window, none: float) -> Any:
+        """Return the pixels (bands, rows, cols) of a block of the map."""
+        whole = MaskFlags.all_valid in source.mask_flag_enums[0]
+        pixels = source.read(window=part) if whole else source.read(window=part, masked=True).filled(none)
+        out = np.full((source.count, int(block.height), int(block.width)), none, pixels.dtype)
+        reproject(
+            pixels,
+            out,
+            rpcs=self.camera.rpc.crop(int(part.col_off), int(part.row_off)).to_rasterio(),
+            src_crs=_WGS84,
+            src_nodata=None if whole else none,
+            dst_transform=self.place * Affine.translation(block.col_off, block.row_off),
+            dst_crs=self.crs,
+            dst_nodata=none,
+            resampling=Resampling.cubic,
+            **self.heights,
+        )
+        return out
+
+
+def _write_terrain(path: Path, camera: Camera, terrain: Dem, levels: tuple[float, float]) -> Path:
+    """Write heights above the ellipsoid on the posts of a DEM, around the ground of an image, without a vertical datum.
+
+    GDAL adds no geoid to such a file.
+    """
+    grid, to_map = terrain.grid, ~terrain.grid.to_pixel
+    ring = np.concatenate([footprint(camera.model, camera.extent, level) for level in levels])
+    ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
+    row, col = grid.locate(*ring.T)
+    if grid.crs.is_geographic:  # columns run on where the DEM begins
+        col = col[0] + (ring[:, 0] - ring[0, 0]) * grid.to_pixel.a
+    (left, top), (right, bottom) = (np.floor([col.min(), row.min()]) - 1, np.ceil([col.max(), row.max()]) + 2)
+    place = to_map * Affine.translation(left, top)
+    if grid.crs.is_geographic:  # and lie where the image is, by whole turns
+        place = Affine.translation(360.0 * np.rint((ring[0, 0] - place.c) / 360.0), 0.0) * place
+    size, whole = (int(right - left), int(bottom - top)), pyproj.CRS(grid.crs.to_wkt())
+    flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d().to_wkt()
+    what = {"dtype": "float32", "nodata": -32768.0, "crs": flat, "transform": place, "tiled": True}
+    with rasterio.open(path, "w", "GTiff", *size, 1, **what) as file:
+        for rows in chunks(size[1], BLOCK_SIZE):
+            at = np.meshgrid(left + np.arange(size[0]), top + np.arange(rows.start, rows.stop))
+            heights = terrain(*grid.place(at[1].ravel(), at[0].ravel())).reshape(at[0].shape)
+            known = np.where(np.isfinite(heights), heights, -32768.0).astype(np.float32)
+            file.write(known, 1, window=Window(0, rows.start, size[0], len(known)))
+    return path

@@ -1,0 +1,285 @@
+"""Runs of the pipeline and commands on finished ones: `adjust`, `match`, `check`, `dsm`, `export`, `verify`."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from barpc import pipeline
+from barpc.base.errors import UsageError
+from barpc.base.options import DsmOptions, with_values
+from barpc.verbs.images import ImageLike, every, one_or_many
+from barpc.verbs.options import OptionsLike, run_options
+
+if TYPE_CHECKING:
+    from barpc.dsm import Surface
+    from barpc.pipeline import AdjustResult
+    from barpc.pipeline.outputs import Proved
+    from barpc.tie.tasks import Progress
+
+PathLike = str | Path
+
+
+def adjust(
+    images: ImageLike | Iterable[ImageLike],
+    out_dir: PathLike,
+    options: OptionsLike = None,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> AdjustResult:
+    """Correct the cameras of overlapping images and write fresh RPCs.
+
+    Parameters
+    ----------
+    images : one or many: paths, patterns, folders, open rasterio datasets, Views
+        In any order: the files written do not depend on it. They are opened read-only. Cameras are found as by
+        `barpc.open_camera`; a View brings its own model (a frozen dataclass, so that results can be cached).
+    out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``, ``report.html``
+    options : RunOptions, mapping as of a TOML file, or path of one; None: the defaults
+    executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
+    progress : callable, optional, `progress(stage, done, total)`
+    **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``
+
+    Returns
+    -------
+    AdjustResult, with `views`, `summary`, `tracks`, `adjustment`, `passed`
+
+    Raises
+    ------
+    BarpcError
+        See `barpc.base.errors`; nothing is written then.
+
+    Examples
+    --------
+    >>> result = barpc.adjust("data_samples/*.tif", "adjusted", points_per_image=500)
+    >>> result.passed, result.summary["headline"]
+    (True, 'All 3 images are adjusted.')
+    >>> result.views[0].sensor.project([5.4, 43.3, 120.0]).shape
+    (2,)
+    """
+    where: dict[str, Any] = {"out_dir": os.fspath(out_dir), "executor": executor, "progress": progress}
+    return pipeline.adjust(every(images), options=run_options(options, **keywords), **where)
+
+
+def match(
+    images: ImageLike | Iterable[ImageLike],
+    out_dir: PathLike,
+    options: OptionsLike = None,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> AdjustResult:
+    """Match tie points and stop, for ``adjust(..., matches=...)`` and other tools.
+
+    Parameters
+    ----------
+    images, out_dir, options, executor, progress, **keywords : as of `barpc.adjust`
+        matches.csv and matches.npz are written, and a text file for each pair as ASP reads them.
+
+    Returns
+    -------
+    AdjustResult, with `tracks` and without an adjustment
+
+    Raises
+    ------
+    BarpcError
+        As of `barpc.adjust`.
+
+    Examples
+    --------
+    >>> found = barpc.match("data_samples/view_0[01].tif", "ties", points_per_image=500)
+    >>> found.tracks.num_points > 100
+    True
+    """
+    chosen = replace(run_options(options, **keywords), stop_after="matching")
+    return adjust(images, out_dir, chosen, executor=executor, progress=progress)
+
+
+def check(
+    images: ImageLike | Iterable[ImageLike],
+    options: OptionsLike = None,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> AdjustResult:
+    """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
+
+    Parameters
+    ----------
+    images, options, executor, progress, **keywords : as of `barpc.adjust`
+
+    Returns
+    -------
+    AdjustResult, with `tracks` and `summary`, without an adjustment
+
+    Raises
+    ------
+    BarpcError
+        As of `barpc.adjust`.
+
+    Examples
+    --------
+    >>> found = barpc.check("data_samples/view_0[01].tif", points_per_image=500)
+    >>> found.passed, found.summary["pairs"][0]["num_matches"] > 100
+    (False, True)
+    """
+    chosen = run_options(options, **keywords)
+    return pipeline.check(every(images), options=chosen, executor=executor, progress=progress)
+
+
+def compared(images: Iterable[ImageLike], against: Path) -> list[tuple[str, str, float]]:
+    """Return each image, the RPC compared with (a file, or of a folder), and the largest difference over both [px]."""
+    from barpc.cameras import open_camera
+    from barpc.pipeline.verify_outputs import difference
+    from barpc.rpcio import find_rpc
+
+    found = []
+    for view in pipeline.load_views(every(images), min_views=1, distinct=False).views:
+        other = find_rpc(against, Path(view.path)) if against.is_dir() else against
+        far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
+        found.append((view.path, str(other), far))
+    return found
+
+
+def dsm(
+    source: ImageLike | Iterable[ImageLike],
+    out: PathLike,
+    options: DsmOptions | None = None,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> Surface:
+    """Make a first surface model of a finished run, or of images with their cameras.
+
+    Parameters
+    ----------
+    source : path of a run folder, or images: paths, patterns, open rasterio datasets
+    out : path of the GeoTIFF
+    options : DsmOptions, optional
+    executor, progress : as of `barpc.adjust`; the bytes written do not depend on them
+    **keywords : fields of `DsmOptions`: gsd, crs, alt, pairs, band, minus, overwrite
+
+    Returns
+    -------
+    Surface, the file, its cells and their medians
+
+    Raises
+    ------
+    NoSurfaceError
+        Images that cannot be matched in this way: radar, too large an angle, hardly a pixel that is found back.
+    InputError, OutputError
+        See `barpc.base.errors`; nothing is written then.
+
+    Examples
+    --------
+    >>> _ = barpc.adjust("data_samples/*.tif", "run", points_per_image=500)
+    >>> surface = barpc.dsm("run", "dsm.tif", gsd=2)
+    >>> surface.gsd, surface.known > 1000
+    (2.0, True)
+    """
+    from barpc.dsm import make_dsm
+
+    chosen = with_values(options or DsmOptions(), keywords, "dsm")
+    given, _ = one_or_many(source)
+    run = run_folder(given)
+    if run is None and chosen.minus is not None:
+        raise UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
+    return make_dsm(run or every(given), out, chosen, executor=executor, progress=progress)
+
+
+def run_folder(source: Sequence[Any]) -> Path | None:
+    """Return the finished run that is given in place of images, if any. UsageError for a run beside others."""
+    paths = [Path(one) for one in source if isinstance(one, (str, os.PathLike))]
+    runs = [path for path in paths if (path / "summary.json").is_file()]
+    if runs and len(source) > 1:
+        raise UsageError(f"{runs[0]} is a finished run: give it alone (--minus OTHER_RUN is for two dates)")
+    return runs[0] if runs else None
+
+
+def export(
+    run_dir: PathLike,
+    out_dir: PathLike,
+    to: str,
+    *,
+    alt: tuple[float, float] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
+
+    Parameters
+    ----------
+    run_dir : path of a finished adjustment
+    out_dir : path, a new folder; files in it point at images and run relative to it
+    to : str, the tool: satnerf, colmap, s2p, cars, asp, stac, points
+    alt : (low, high), optional, altitudes of the scene [m above the ellipsoid]; else by its tie points
+    overwrite : bool, replace what an earlier export wrote there
+
+    Returns
+    -------
+    list of Path, the files written
+
+    Raises
+    ------
+    InputError
+        No such tool, no finished adjustment, altitudes that are no interval.
+    OutputError
+        The folder is in use, not empty, or the run's own.
+
+    Examples
+    --------
+    >>> _ = barpc.adjust("data_samples/*.tif", "finished", points_per_image=500)
+    >>> [path.name for path in barpc.export("finished", "nerf", "satnerf")][:2]
+    ['view_00.json', 'view_01.json']
+    """
+    from barpc.export import export_run
+
+    return export_run(run_dir, to, out_dir, alt_range=alt, overwrite=overwrite)
+
+
+def verify(
+    run_dir: PathLike,
+    places: PathLike | Sequence[PathLike] = (),
+    *,
+    expect: str | None = None,
+    progress: Progress | None = None,
+) -> list[Proved]:
+    """Compare the files of a run or export with its SHA256SUMS, and its cameras with those certified.
+
+    Parameters
+    ----------
+    run_dir : path of a finished run, or of an export
+    places : path or paths, optional, folders in which missing inputs are searched by name
+    expect : str, optional, the root that was printed, or a later one (64 hexadecimal digits)
+    progress : callable, optional, `progress(stage, done, total)`
+
+    Returns
+    -------
+    list of Proved, a file each: `kind`, `file`, `now`, `note`, `passed`
+
+    Raises
+    ------
+    InputError
+        SHA256SUMS is missing or damaged.
+
+    Examples
+    --------
+    >>> _ = barpc.match("data_samples/view_0[01].tif", "tied", points_per_image=500)
+    >>> all(one.passed for one in barpc.verify("tied"))
+    True
+    """
+    from barpc.pipeline.outputs import prove
+
+    if expect is not None and not re.fullmatch("[0-9a-fA-F]{64}", expect):
+        raise UsageError(f"--expect {expect}: a root has 64 hexadecimal digits")
+    folders = [places] if isinstance(places, (str, os.PathLike)) else places
+    return prove(Path(run_dir), [Path(place) for place in folders], expect and expect.lower(), progress)

@@ -1,0 +1,277 @@
+"""barpc from Python: a function a verb, with the habits of rasterio and numpy."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+import rasterio
+from rasterio.io import MemoryFile
+
+import barpc
+from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
+from barpc.base.options import Options
+from barpc.cli import COMMANDS, cli
+from barpc.scene import Camera
+from barpc.verbs.images import camera_of, every
+from barpc.verbs.options import _tables, run_options
+from tests.rpcio.conftest import make_rpc
+
+SAMPLES = Path(__file__).parents[2] / "data_samples"
+VIEWS = sorted(SAMPLES.glob("view_*.tif"))
+GROUND = [5.4, 43.3, 120.0]
+PUBLIC = [name for name in barpc.__all__ if name != "__version__"]
+
+
+def public(name: str) -> Any:
+    """What stands behind a name: of a folder the verb that it is when called."""
+    found = getattr(barpc, name)
+    return found.__wrapped__ if inspect.ismodule(found) else found
+
+
+# --- a function a verb ------------------------------------------------------------------------------------
+
+
+def test_every_verb_is_a_function_with_its_flags_as_keywords():
+    assert set(COMMANDS) - {"report"} <= set(PUBLIC)  # of a report AdjustResult.report, and files
+    positional = {"images", "points", "numbers", "files", "run_dir", "places", "target"}
+    printed = {"jobs", "image_list", "options_file", "paper", "against", "out", "output", "outlines", "help_all", "at"}
+    for verb in set(COMMANDS) - {"report"}:
+        command = cli.get_command(click.Context(cli), verb)
+        assert command is not None
+        known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *_tables()}
+        for flag in command.params:
+            name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
+            assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)
+
+
+def test_folders_that_are_verbs_are_both():
+    code = (
+        "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); first = barpc.fit; "
+        "import barpc.fit.methods as m, barpc.dsm; from barpc.export import TARGETS; from barpc import fit; "
+        "assert first is fit is barpc.fit is sys.modules['barpc.fit']; assert barpc.fit.methods is m; "
+        "import inspect; assert 'alt_range' in inspect.getdoc(barpc.fit.__wrapped__); "
+        "print(*map(callable, (barpc.fit, barpc.dsm, barpc.export, barpc.ba, barpc.sensor)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-S", "-c", f"import site; site.main(); {code}"], capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["True"] * 3 + ["False"] * 2, done.stderr
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_public_name_says_what_it_returns_and_shows_how(name):
+    thing = public(name)
+    text = inspect.getdoc(thing) or ""
+    if inspect.isfunction(thing):
+        assert re.search(r"^Returns\n-------$", text, re.MULTILINE), name
+    if not (inspect.isclass(thing) and issubclass(thing, (Exception, Warning, Options))):  # (of options: `run_options`)
+        assert re.search(r"^Examples\n--------\n>>> ", text, re.MULTILINE), name
+
+
+# --- images -----------------------------------------------------------------------------------------------
+
+
+def test_a_path_a_dataset_a_view_and_a_camera_are_one_image():
+    camera = barpc.open_camera(VIEWS[0])
+    view = barpc.View("a", str(VIEWS[0]), camera.extent, camera.model, camera.alt_range)
+    with rasterio.open(VIEWS[0]) as dataset:
+        images = [VIEWS[0], str(VIEWS[0]), dataset, view, camera, camera.model]
+        found = np.array([barpc.project(image, GROUND) for image in images])
+        assert every(dataset) == [str(VIEWS[0])]
+        assert every((VIEWS[0], dataset)) == [str(VIEWS[0])] * 2
+        assert barpc.info(dataset, alt=120.0) == barpc.info(str(VIEWS[0]), alt=120.0)
+    np.testing.assert_array_equal(found, np.tile(camera.model.project(GROUND), (len(images), 1)))
+    assert every(f"{SAMPLES}/view_0[02].tif") == [str(VIEWS[0]), str(VIEWS[2])]
+    assert every(path for path in VIEWS) == list(map(str, VIEWS))
+    with pytest.raises(InputError, match="3 is no image: give a path"):
+        camera_of(3)
+
+
+def test_a_dataset_in_memory_has_no_file_that_can_be_read():
+    with MemoryFile(VIEWS[0].read_bytes()) as memory, memory.open() as dataset:
+        with pytest.raises(InputError, match=r"/vsimem/.*: a dataset without a file.*write it to disk"):
+            barpc.project(dataset, GROUND)
+
+
+# --- options ----------------------------------------------------------------------------------------------
+
+
+def test_options_are_a_record_a_mapping_a_file_or_keywords(tmp_path):
+    (tmp_path / "o.toml").write_text("[tie]\nband = 2\n")
+    expected = barpc.RunOptions(tie=barpc.TieOptions(band=2), gcp=("a.csv",))
+    for given in (
+        run_options(barpc.RunOptions(tie=barpc.TieOptions(band=2)), gcp="a.csv"),
+        run_options({"tie": {"band": 2}}, gcp=["a.csv"]),
+        run_options(tmp_path / "o.toml", gcp=Path("a.csv")),
+        run_options(str(tmp_path / "o.toml"), gcp=("a.csv",)),
+        run_options(band=2, gcp="a.csv"),
+        run_options(tie=barpc.TieOptions(band=2), gcp="a.csv"),
+        run_options(tie={"band": 2}, gcp="a.csv"),
+        run_options(tie={"band": 3}, band=2, gcp="a.csv"),
+    ):
+        assert given == expected
+    assert run_options(rpc_format=("txt", "rpb")) == run_options(rpc_formats=("txt", "rpb"))
+    with pytest.raises(InputError, match=r"unknown option 'gpc'; is 'gcp' meant\?"):
+        run_options(gpc="a.csv")
+    with pytest.raises(InputError, match="drift"):
+        run_options(drift=1e9)
+
+
+# --- points -----------------------------------------------------------------------------------------------
+
+
+def test_leading_axes_stay():
+    lon, lat = np.meshgrid(5.4 + 1e-4 * np.arange(4), 43.3 + 1e-4 * np.arange(3))
+    seen = barpc.project(VIEWS[0], np.stack([lon, lat], axis=-1), alt=120.0)
+    assert seen.shape == (3, 4, 2)
+    back = barpc.localize(VIEWS[0], seen, alt=np.full((3, 4), 120.0))
+    np.testing.assert_allclose(back, np.stack([lon, lat, np.full((3, 4), 120.0)], axis=-1), atol=1e-9)
+    at = np.stack([seen, barpc.project(VIEWS[2], back)], axis=-2)
+    ground, error = barpc.triangulate([VIEWS[0], VIEWS[2]], at)
+    assert (ground.shape, error.shape) == ((3, 4, 3), (3, 4))
+    np.testing.assert_allclose(ground, back, atol=1e-6)
+    assert error.max() < 1e-6
+    at[1, 2, 0] = np.nan
+    ground, error = barpc.triangulate([VIEWS[0], VIEWS[2]], at)
+    assert np.isnan(ground[1, 2]).all()
+    assert np.isfinite(error).sum() == 11
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda m: m.project([5.4, 43.3]), r"ground points of shape \(2,\): \(\.\.\., 3\) is expected, lon, lat"),
+        (lambda m: m.project(np.zeros((3, 5))), r"\(3, 5\).*altitude \[m\] on the last axis; transpose them"),
+        (lambda m: m.project("abc"), r"ground points: numbers are expected"),
+        (lambda m: m.project_jacobian(np.zeros((4, 2))), r"ground points of shape \(4, 2\)"),
+        (lambda m: m.localize(np.zeros((2, 5)), 0.0), r"image points of shape \(2, 5\): \(\.\.\., 2\).*transpose"),
+        (lambda m: m.localize(np.zeros((5, 2)), np.zeros(4)), r"altitudes of shape \(4,\).*broadcasts with \(5,\)"),
+        (lambda m: m.localize(7.0, 0.0), r"image points of shape \(\)"),
+    ],
+)
+def test_a_wrong_shape_names_the_axis_expected(call, words):
+    rpc = make_rpc()
+    correction = barpc.Correction(np.zeros(3), np.zeros(3), np.array([4.6e6, 4.4e5, 4.4e6]))
+    for model in (rpc, barpc.Corrected(rpc, correction)):
+        with pytest.raises(InputError, match=words):
+            call(model)
+        with pytest.raises(ValueError):  # what numpy's users catch
+            call(model)
+
+
+def test_longitude_and_latitude_exchanged_warn_and_right_ones_do_not():
+    assert np.isfinite(barpc.project(VIEWS[0], GROUND)).all()
+    with pytest.warns(BarpcWarning, match="give LON first, then LAT"):
+        barpc.project(VIEWS[0], [GROUND[1], GROUND[0], GROUND[2]])
+    far = barpc.project(VIEWS[0], [6.4, 44.3, 120.0])  # elsewhere, and not exchanged
+    assert far.shape == (2,)
+    with pytest.raises(InputError, match="exchanged"):
+        barpc.info(VIEWS[0], at=(43.3, 5.4, 120.0), alt=120.0)
+
+
+def test_an_altitude_that_is_assumed_is_said_and_two_contradict():
+    with pytest.warns(Remark, match="terrain height unknown, 250 m assumed"):
+        found = barpc.localize(VIEWS[0], [500, 500])
+    assert found[2] == 250.0
+    with pytest.raises(UsageError, match="either --alt or --dem"):
+        barpc.localize(VIEWS[0], [500, 500], 120.0, dem="a.tif")
+    with pytest.raises(UsageError, match="--geoid goes with --dem"):
+        barpc.project(VIEWS[0], GROUND, geoid="egm96")
+    with pytest.raises(InputError, match=r"image points of shape \(2, 2\) for 3 images: \(\.\.\., 3, 2\)"):
+        barpc.triangulate(VIEWS, np.zeros((2, 2)))
+    with pytest.raises(UsageError, match="one image"):
+        barpc.triangulate(VIEWS[0], np.zeros((1, 2)))
+
+
+def test_a_run_adjusted_again_has_its_new_altitude(tmp_path):
+    """The altitude beside an image is that of its run as it is now, not as it was."""
+    import json
+    import os
+
+    from tests.report.conftest import run_of_block, written
+
+    folder = tmp_path / "run"
+    written(run_of_block(3, 60, size=(900, 700)), folder)
+    summary = json.loads((folder / "summary.json").read_text())
+    (name,) = summary["views"][0]["outputs"]
+    camera = barpc.open_camera(f"{folder / name},size=900:700")
+    before = barpc.info(camera)["center_alt_m"]
+    assert before == summary["altitude_m"]
+    (folder / "summary.json").write_text(json.dumps({**summary, "altitude_m": before + 5.0}))
+    os.utime(folder / "summary.json", ns=(1, 1))
+    assert barpc.info(camera)["center_alt_m"] == before + 5.0
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+def test_a_fit_that_misses_writes_nothing_and_says_so(tmp_path):
+    options: dict[str, Any] = {"alt_range": (0, 400), "tolerance": 1e-13}
+    with pytest.raises(barpc.BarpcError, match="nothing written"):
+        barpc.fit(VIEWS[0], tmp_path / "a_RPC.TXT", **options)
+    assert not list(tmp_path.iterdir())
+    assert barpc.fit(VIEWS[0], **options).verdict(1e-13)
+    barpc.fit(VIEWS[0], tmp_path / "a_RPC.TXT", barpc.FitOptions(tolerance=1e-13), alt_range=(0, 400), keep_going=True)
+    assert barpc.read_rpc(tmp_path / "a_RPC.TXT").off(barpc.read_rpc(VIEWS[0])).max() < 1e-3
+    with pytest.raises(InputError, match="unknown option 'altrange'"):
+        barpc.fit(VIEWS[0], altrange=(0, 400))
+
+
+def test_what_is_converted_is_a_sentence_with_the_worst_reader(tmp_path):
+    done = barpc.convert(VIEWS, out_dir=tmp_path / "handoff", rpc_format="txt,rpb")
+    assert done.passed
+    assert len(done.paths) == 9
+    assert all(path.is_file() for path in done.paths)
+    number = re.fullmatch(r"3 images written, all readers agree to (\S+) px\.", str(done))
+    assert number is not None
+    assert 0 <= float(number[1]) < 1e-9
+    assert float(number[1]) == float(f"{max(one.max_error for one in done.readings):.1g}")
+    with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and -o DIR"):
+        barpc.convert(VIEWS, tmp_path / "a.RPB")
+    with pytest.raises(TypeError, match="windw"):
+        barpc.convert(VIEWS[0], tmp_path / "a.tif", windw=(0, 0, 9, 9))
+    assert barpc.convert(VIEWS[0], tmp_path / "a.tif", window=(10, 20, 30, 40)).window == (10, 20, 30, 40)
+
+
+def test_verbs_that_take_time_say_how_far_they_are(tmp_path):
+    told: dict[str, list[tuple[int, int]]] = {}
+
+    def progress(stage, done, total):
+        told.setdefault(stage, []).append((done, total))
+
+    barpc.convert(VIEWS, out_dir=tmp_path / "handoff", progress=progress)
+    barpc.ortho(VIEWS[0], tmp_path / "maps", alt=120, gsd=1, progress=progress)
+    run = tmp_path / "ties"
+    barpc.match(VIEWS[:2], run, points_per_image=300, progress=progress)
+    assert all(one.passed for one in barpc.verify(run, progress=progress))
+    assert {"convert", "ortho view_00", "verify outputs", "verify inputs", "match"} <= told.keys()
+    for stage, rows in told.items():
+        assert rows[-1][0] == rows[-1][1] > 0, stage
+        assert [done for done, _ in rows] == sorted(done for done, _ in rows), stage
+
+
+# --- notebooks --------------------------------------------------------------------------------------------
+
+
+def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path):
+    camera = barpc.open_camera(VIEWS[0])
+    shown = Camera(camera.model, Path("<script>.tif"), "tag", camera.size, camera.alt_range)._repr_html_()
+    assert "&lt;script&gt;.tif" in shown
+    assert "<script>" not in shown
+    assert "(1000, 1000)" in shown
+    for thing in (camera.model, barpc.fit(VIEWS[0], alt_range=(0, 400)), barpc.Corrected):
+        if not inspect.isclass(thing):
+            assert thing._repr_html_().count("<tr>") >= 5
+    found = barpc.check(VIEWS[:2], points_per_image=300)
+    shown = found._repr_html_()
+    assert shown.count("<tr>") == 3
+    assert found.record.headline.split(".")[0] in shown
+    assert "view_00" in shown
