@@ -56,7 +56,7 @@ class LineCurve:
         return LINE_SPLINES + len(self.edges)
 
     def local(self, col: Array) -> tuple[Array, IntArray]:
-        """Return what is not 0 of splines and detectors at columns (K,), values (K, 5), and their numbers (K, 5)."""
+        """Return the values (K, 5) of the splines and the detector at columns (K,), and their numbers (K, 5)."""
         first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
         detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
         return np.column_stack([pieces.T, np.ones(len(col))]), np.column_stack(
@@ -78,7 +78,7 @@ class LineCurve:
         return np.concatenate([bsplines(self.along(col), LINE_SPLINES).T, steps], axis=1)
 
     def prior(self, bend: float) -> Array:
-        """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
+        """Return the prior information (n, n) of the unknowns, by the size of third differences [px]."""
         rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
         smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
         return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / STEP_SIGMA**2)])
@@ -90,7 +90,7 @@ class LineCurve:
 
     @cached_property
     def bent(self) -> Array:
-        """(n, n) What takes a constant and a slope off the unknowns: splines make both exactly."""
+        """(n, n) Projection of the unknowns off a constant and a slope, which splines represent exactly."""
         lines = np.stack(
             [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
         )
@@ -127,9 +127,7 @@ class Calibration:
 
     @classmethod
     def prior(cls, sensor: str, width: int) -> Calibration:
-        """Return what is known of the sensor of images of `width` columns without a calibration: no distortion,
-        give or take that of the field's sensors.
-        """
+        """Return the prior of a sensor whose images have `width` columns: mean 0, the covariance of other sensors."""
         curve = LineCurve(width, np.zeros(0))
         knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
         kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)
@@ -151,7 +149,7 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class CommonErrors:
-    """Errors that images of a sensor have in common: those of its calibration, or of what is known without one."""
+    """Errors that images of a sensor have in common: those of its calibration, or of the prior without one."""
 
     of_view: tuple[Calibration | None, ...]
 
@@ -224,7 +222,7 @@ class CommonErrors:
         moved: tuple[Array, Array],
         index: IntArray,
     ) -> Array:
-        """Return the moves (n, 3, k) [m] of points, of unknowns (N q, k) and what errors of heights have in common."""
+        """Return the moves (n, 3, k) [m] of points `index`, by those of unknowns and of common errors of heights."""
         (problem, state, weight, reduced), (by_unknown, of_common) = known, moved
         structure = problem.structure
         place = np.full(structure.num_points, -1)
