@@ -179,11 +179,11 @@ class CommonErrors:
         """
         first = 0
         for one, of in self._groups:
-            curve, last = one.curve, first + one.root.shape[1]
-            values, place = curve.local(col)
-            rows = np.arange(0, values.size + 1, values.shape[1])
-            weighted = (values * (weight * of[view])[:, None]).ravel()
-            matrix = sp.csr_array((weighted, place.ravel(), rows), shape=(len(col), curve.size + 1))
+            curve, last, own = one.curve, first + one.root.shape[1], of[view]
+            values, place = curve.local(col[own])
+            bounds = np.concatenate([[0], np.cumsum(values.shape[1] * own)])
+            weighted = (values * weight[own][:, None]).ravel()
+            matrix = sp.csr_array((weighted, place.ravel(), bounds), shape=(len(col), curve.size + 1))
             for axis, part in enumerate(np.split(one.root, 2)):
                 by_error = np.zeros((curve.size + 1, self.count))
                 by_error[:, first:last] = curve.by_detector @ part
@@ -200,7 +200,10 @@ class CommonErrors:
         of_common = np.zeros((0 if common is None else len(common.half), self.count))
         for axis, matrix, by_error in self._displaced(structure.view, problem.xy[0], weight):
             of_points = _sums(whitened[axis], structure.by_point, np.diff(structure.point_bounds)) @ matrix
+            moved = np.diff(of_points.indptr)[: structure.num_points] > 0
             for v, rows in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
+                if not moved[structure.point[rows]].any():
+                    continue
                 at = (structure.point[rows, None] + axes).ravel()
                 found = matrix[rows].T @ (projected.by_unknown[axis, :, rows] * weight[rows]).T
                 found -= of_points[at].T @ reduced.cross[rows].reshape(-1, q)
