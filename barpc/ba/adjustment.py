@@ -89,6 +89,7 @@ def adjust_tracks(
     """
     start = time.process_time()
     options = AdjustOptions() if options is None else options
+    common = common if common is not None and common.count else None
     if centers is None and options.center != "line":
         centers = np.array([camera_center(v.sensor, v.size, v.alt_range, options.center).ecef for v in views])
     prior = None if prior is None else prior.marginal([view.name for view in views])

@@ -2,9 +2,9 @@
 
 The detector line of a pushbroom stands in the same columns of all its images: x = P(X) + c(col), where c is a spline
 of the column with steps where another detector begins. One block does not tell c along its epipolar lines; blocks of
-other directions do. Every view has nuisances, 1, col, row, col row and row^2 of either coordinate: what rotations,
-drifts and orbits do. So c is estimated beside a constant and a slope, which
-a camera's correction holds, and has neither.
+other directions do. Every view has nuisances, 1, col, row, col row and row^2 of either coordinate, the effects of
+rotations, drifts and orbits. c has no constant and no slope: a camera's correction absorbs them. A focal scale or a
+line rate that all images share scales the ground with them, and tie points alone do not determine it.
 
 Points are eliminated, then nuisances: every block leaves normal equations of c. Tests on blocks left out, or on those
 before and after a day, are sums of these.
@@ -37,7 +37,7 @@ _CANDIDATES = 128  # places of a step that are looked at first; each turn looks 
 _FINER = 12
 _MOST_STEPS = 40  # taken one by one; focal planes have up to some thirty detectors
 _NUISANCES = 5  # nuisances of a coordinate of a view
-_LOOSE = 100.0  # px: standard deviation of nuisances, of which a block leaves some open
+_LOOSE = 100.0  # px: standard deviation of nuisances, some of which a block does not determine
 _BEST_NOISE = 2e-3  # px: no tie points are better, whatever they say of each other
 # standard deviations up to which tie points count alike: were they weighted by size, what contradicts the curve so far
 # would count less, and a turn would keep a third of its error

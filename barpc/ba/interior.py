@@ -56,7 +56,7 @@ class LineCurve:
         return LINE_SPLINES + len(self.edges)
 
     def local(self, col: Array) -> tuple[Array, IntArray]:
-        """Return the splines and detectors that are not 0 at columns (K,): values (K, 5), and their numbers (K, 5)."""
+        """Return the values (K, 5) of the splines and the detector at columns (K,), and their numbers (K, 5)."""
         first, pieces = bspline_pieces(self.along(col), LINE_SPLINES)
         detector = LINE_SPLINES + np.searchsorted(self.edges, col, side="right")
         return np.column_stack([pieces.T, np.ones(len(col))]), np.column_stack(
@@ -78,7 +78,7 @@ class LineCurve:
         return np.concatenate([bsplines(self.along(col), LINE_SPLINES).T, steps], axis=1)
 
     def prior(self, bend: float) -> Array:
-        """Return the information of the unknowns before anything is seen, by the size of third differences [px]."""
+        """Return the prior information (n, n) of the unknowns, by the size of third differences [px]."""
         rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
         smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
         return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / STEP_SIGMA**2)])
@@ -90,7 +90,7 @@ class LineCurve:
 
     @cached_property
     def bent(self) -> Array:
-        """(n, n) Projector of the unknowns off a constant and a slope, both of which splines contain exactly."""
+        """(n, n) Projection of the unknowns off a constant and a slope, which splines represent exactly."""
         lines = np.stack(
             [np.ones(LINE_SPLINES), (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0], axis=1
         )
@@ -127,7 +127,7 @@ class Calibration:
 
     @classmethod
     def prior(cls, sensor: str, width: int) -> Calibration:
-        """Return the prior of a sensor of images of `width` columns: no distortion, of a usual size."""
+        """Return the prior of a sensor whose images have `width` columns: mean 0, the covariance of other sensors."""
         curve = LineCurve(width, np.zeros(0))
         knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
         kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)
@@ -179,11 +179,11 @@ class CommonErrors:
         """
         first = 0
         for one, of in self._groups:
-            curve, last = one.curve, first + one.root.shape[1]
-            values, place = curve.local(col)
-            rows = np.arange(0, values.size + 1, values.shape[1])
-            weighted = (values * (weight * of[view])[:, None]).ravel()
-            matrix = sp.csr_array((weighted, place.ravel(), rows), shape=(len(col), curve.size + 1))
+            curve, last, own = one.curve, first + one.root.shape[1], of[view]
+            values, place = curve.local(col[own])
+            bounds = np.concatenate([[0], np.cumsum(values.shape[1] * own)])
+            weighted = (values * weight[own][:, None]).ravel()
+            matrix = sp.csr_array((weighted, place.ravel(), bounds), shape=(len(col), curve.size + 1))
             for axis, part in enumerate(np.split(one.root, 2)):
                 by_error = np.zeros((curve.size + 1, self.count))
                 by_error[:, first:last] = curve.by_detector @ part
@@ -200,7 +200,10 @@ class CommonErrors:
         of_common = np.zeros((0 if common is None else len(common.half), self.count))
         for axis, matrix, by_error in self._displaced(structure.view, problem.xy[0], weight):
             of_points = _sums(whitened[axis], structure.by_point, np.diff(structure.point_bounds)) @ matrix
+            moved = np.diff(of_points.indptr)[: structure.num_points] > 0
             for v, rows in enumerate(map(slice, structure.bounds[:-1], structure.bounds[1:])):
+                if not moved[structure.point[rows]].any():
+                    continue
                 at = (structure.point[rows, None] + axes).ravel()
                 found = matrix[rows].T @ (projected.by_unknown[axis, :, rows] * weight[rows]).T
                 found -= of_points[at].T @ reduced.cross[rows].reshape(-1, q)
@@ -222,7 +225,7 @@ class CommonErrors:
         moved: tuple[Array, Array],
         index: IntArray,
     ) -> Array:
-        """Return the motions (n, 3, k) [m] of points, by unknowns (N q, k) and common errors of heights."""
+        """Return the moves (n, 3, k) [m] of points `index`, by those of unknowns and of common errors of heights."""
         (problem, state, weight, reduced), (by_unknown, of_common) = known, moved
         structure = problem.structure
         place = np.full(structure.num_points, -1)

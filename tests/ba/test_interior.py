@@ -126,6 +126,13 @@ def test_sensors_err_apart_and_images_of_one_together() -> None:
     np.testing.assert_allclose(covariance(apart, other, other), covariance(apart, one, one))
 
 
+def test_a_block_without_such_errors_has_none() -> None:
+    block = simulate_block(2, 60, seed=1, size=(WIDTH, 2000))
+    found = adjust_tracks(block.views, block.tracks, LINEAR, common=CommonErrors((None, None)), hold_out=False)
+    assert found.covariance.shared is None
+    assert np.isfinite(pair_heights(found, 0, 1).relative)
+
+
 def with_prior(made: Scene) -> Adjustment:
     prior = Calibration.prior("A", made.views[0].size[0])
     return adjust_tracks(made.views, made.tracks, common=CommonErrors((prior,) * len(made.views)))

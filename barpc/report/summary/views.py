@@ -462,7 +462,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
 
 
 def _shared_errors(adjustment: Adjustment, i: int, ground: Array) -> tuple[Array, Array] | None:
-    """Return the effect of common errors on the unknowns (q, k) of a view, and on an image point (2, k) [px]."""
+    """Return the response (q, k) of a view's unknowns to common errors, and their displacements (2, k) [px] there."""
     if adjustment.common is None or adjustment.covariance.shared is None:
         return None
     by_unknown = adjustment.covariance.shared.by_unknown.reshape(len(adjustment.names), adjustment.params.shape[1], -1)
