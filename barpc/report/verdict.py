@@ -226,8 +226,8 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
     # control, an earlier run and fixed views move it as far as they must, a DEM and altimetry in height
     used = found.control is not None and bool(found.control.used.any())
-    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or _option_value(run, "add_to"))
-    by_heights = _holds(found) or bool(_option_value(run, "dem"))
+    held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or run.known)
+    by_heights = _holds(found) or (found.terrain is not None and found.terrain.shows and found.terrain.held > 0)
     moved = moved[:2] if by_heights else moved
     if not held and (moved[np.isfinite(moved)] > SURELY).any():
         which = "check that the heights are of this place, or add GCPs" if by_heights else "add GCPs or a DEM"
@@ -235,10 +235,6 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
             f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times the standard deviation expected "
             f"from the stated accuracies: one of them is wrong; {which}."
         )
-
-
-def _option_value(run: Run, name: str) -> object:
-    return getattr(run.options, name, None)
 
 
 def _holds(found: Adjustment) -> bool:
@@ -359,8 +355,8 @@ def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    points = counted(run.tracks.num_points, "tie point")
-    yield f"{points} of {counted(len(views), 'image')}, {counted(len(run.tracks), 'observation')}."
+    counts = counted(len(views), "image"), counted(len(run.tracks), "observation")
+    yield f"{counted(run.tracks.num_points, 'tie point')} of {counts[0]}, {counts[1]}."
 
 
 # --- one screen: the worst first, one sentence for the images of one cause ----------------------------------

@@ -345,15 +345,19 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
     assert reasons(moved(6.0)) == []
     (line,) = reasons(moved(6.1))
     assert line.startswith("The scene moved by +0.00 m east, -6.10 m north, +0.10 m up, more than 3 times the")
-    (line,) = reasons(moved(6.1), options=SimpleNamespace(dem="x"))  # which may lift a scene, not carry it off
+    dem = TerrainTest(30, 30, 40, 0.0, 1.0, 5.0)  # which may lift a scene, not carry it off
+    (line,) = reasons(moved(6.1, terrain=dem))
     assert line.endswith("check that the heights are of this place, or add GCPs.")
-    lifted = moved(6.1)
-    lifted.gauge.shift = np.array([0.0, 0.1, 50.0])
-    assert len(reasons(lifted)) == 1
-    assert reasons(lifted, options=SimpleNamespace(dem="x")) == []
-    assert reasons(moved(6.1, reference_inlier=np.ones(2, bool)), options=SimpleNamespace(dem="x")) == []
-    assert reasons(moved(6.1), options=SimpleNamespace(add_to="x")) == []
-    assert len(reasons(moved(6.1), options=SimpleNamespace(dem=None, add_to=None))) == 1
+    for terrain, told in (
+        (None, 1),
+        (dem, 0),
+        (TerrainTest(0, 0, 40, 0.0, 1.0, 5.0), 1),
+    ):  # one that constrains nothing
+        lifted = moved(6.1, terrain=terrain)
+        lifted.gauge.shift = np.array([0.0, 0.1, 50.0])
+        assert len(reasons(lifted)) == told
+    assert reasons(moved(6.1, reference_inlier=np.ones(2, bool), terrain=dem)) == []
+    assert reasons(moved(6.1), known=frozenset("A")) == []
     fixed = SimpleNamespace(drift=None, fixed=("A",), min_convergence=1.0, dem_sigma=2.0)
     assert reasons(moved(6.1, options=fixed)) == []
     for used, num in ((True, 0), (False, 1)):
