@@ -25,7 +25,7 @@ from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select.anomalies import left_over
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver
-from barpc.ba.select.models import Model, select_model
+from barpc.ba.select.models import SelectedModel, select_model
 from barpc.ba.select.parts import Parts
 from barpc.ba.solution import Solution, solve_block
 from barpc.ba.solving.covariance import Covariance
@@ -178,7 +178,11 @@ def _with_apart(
     return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
 
 
-def _adjustment(model: Model, found: Solution, options: AdjustOptions, common: CommonErrors | None) -> Adjustment:
+def _adjustment(
+    model: SelectedModel, found: Solution, options: AdjustOptions, common: CommonErrors | None
+) -> Adjustment:
+    model: SelectedModel, found: Solution, options: AdjustOptions, common: CommonErrors | None
+) -> Adjustment:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     parts, outcome, final = model.parts, found.outcome, found.final
     block = parts.inner

@@ -1,1 +1,1 @@
-"""One function a verb: what the command line calls, and `barpc.<verb>` in Python, with the flags as keywords."""
+"""Functions of the verbs, one each: `barpc.<verb>` in Python, with the flags as keywords; the CLI calls them."""

@@ -11,7 +11,7 @@ from scipy import ndimage
 from barpc.ba.constraints.block import join
 from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
 from barpc.ba.parameters.unknowns import Unknowns
-from barpc.ba.robust.systematic_residuals import TERMS, Resemblance, Smooth
+from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth
 from barpc.ba.solving.structure import make_structure
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.options import AdjustOptions
@@ -147,7 +147,7 @@ def test_what_points_have_in_common_is_what_their_templates_cover_together(view)
     assert alike.overlap(np.array([0]), np.array([3]))[0] == pytest.approx(0.0, abs=1e-2)
     assert alike.correlation(np.array([0]), np.array([n - 1]))[0] == pytest.approx(1.0 / MAX_INDEPENDENT_ERRORS)
     # in the middle of a lattice three templates each way cover a place
-    assert 1.0 / alike.share[0] == pytest.approx(9.0 + n / (TERMS * MAX_INDEPENDENT_ERRORS), rel=0.25)
+    assert 1.0 / alike.share[0] == pytest.approx(9.0 + n / (NUM_TERMS * MAX_INDEPENDENT_ERRORS), rel=0.25)
     lonely = smooth_of(view, replace(reference, width=0.0)).alike
     assert lonely is not None
-    assert 1.0 / lonely.share[0] == pytest.approx(1.0 + n / (TERMS * MAX_INDEPENDENT_ERRORS))
+    assert 1.0 / lonely.share[0] == pytest.approx(1.0 + n / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))

@@ -11,7 +11,7 @@ from barpc.ba.constraints.block import Block
 from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.projected import Projected
-from barpc.ba.robust.systematic_residuals import TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
+from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
 from barpc.ba.solving.problem import Problem
@@ -215,7 +215,7 @@ class Rounds:
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
-            fitted = 2 * TERMS * len(fit)
+            fitted = 2 * NUM_TERMS * len(fit)
             self.scatter = self._scatter(fit)
             self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
             self.misfit = tested.rms

@@ -23,12 +23,12 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor.image_corrections import bsplines
 
 SmoothFit = dict[int, tuple[slice, Array]]
-"""View -> where its observations are, coefficients (2, TERMS) of their smooth part."""
+"""View -> where its observations are, coefficients (2, NUM_TERMS) of their smooth part."""
 
 SPLINES = 14
 """Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
 
-TERMS = SPLINES + 4  # and col, col^2, col^3, row col
+NUM_TERMS = SPLINES + 4  # and col, col^2, col^3, row col
 _PER_TERM = 10  # observations a term, or the view is left as it is
 _BEND = 1e-2  # of a spline's weight: rows without observations continue what their neighbours show
 _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
@@ -68,7 +68,7 @@ class Resemblance:
             ties = ~rows & (block.view == view)
             asked = own[:: -(-len(own) // MANY)]  # they lie on a grid
             alike = found.overlap(asked[:, None], own[None]).sum(axis=1).mean()
-            share[own] = 1.0 / (alike + len(own) / (TERMS * MAX_INDEPENDENT_ERRORS))
+            share[own] = 1.0 / (alike + len(own) / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
             precision[own] = share[own] * (usual / block.sigma[own]) ** 2
         return found
@@ -136,11 +136,11 @@ class Smooth:
         self._kept = self._all_terms() if len(col) <= KEPT else None
 
     def _basis(self, rows: slice) -> Array:
-        """Return the terms (TERMS, n) at some observations."""
+        """Return the terms (NUM_TERMS, n) at some observations."""
         return self._terms(rows) if self._kept is None else self._kept[:, rows]
 
     def _all_terms(self) -> Array:
-        out = np.empty((TERMS, len(self._col)))
+        out = np.empty((NUM_TERMS, len(self._col)))
         for part in parts(len(self._col)):
             out[:, part] = self._terms(part)
         return out
@@ -172,7 +172,7 @@ class Smooth:
         share, precision = (
             (weight, weight) if self.alike is None else (weight * self.alike.share, weight * self.alike.precision)
         )
-        terms = 2.0 * TERMS
+        terms = 2.0 * NUM_TERMS
         for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
             count, root = 2 * float(share[rows].sum()), np.sqrt(precision[rows])
             basis = self._basis(rows)
@@ -227,18 +227,18 @@ class Smooth:
         """Fit the smooth part of the residuals, of views with enough observations that count."""
         weight = weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
-        views = np.flatnonzero(counts >= _PER_TERM * TERMS)
+        views = np.flatnonzero(counts >= _PER_TERM * NUM_TERMS)
         counted = weight if self.alike is None else weight * self.alike.precision
         with np.errstate(invalid="ignore"):
             target = np.where(weight > 0, residual, 0.0)
         parts = [slice(*self.structure.bounds[v : v + 2].tolist()) for v in views]
-        matrix, right = np.empty((len(views), TERMS, TERMS)), np.empty((len(views), TERMS, 2))
+        matrix, right = np.empty((len(views), NUM_TERMS, NUM_TERMS)), np.empty((len(views), NUM_TERMS, 2))
         for n, rows in enumerate(parts):
             basis = self._basis(rows)
             weighted = basis * counted[rows]
             np.matmul(weighted, basis.T, out=matrix[n])
             np.matmul(weighted, target[:, rows].T, out=right[n])
-        every = np.arange(TERMS)
+        every = np.arange(NUM_TERMS)
         diagonal = matrix[:, every, every]
         matrix[:, every, every] += RIDGE * (diagonal + diagonal.mean(axis=1, keepdims=True))
         bend = _BEND * diagonal[:, :SPLINES].mean(axis=1)

@@ -28,7 +28,7 @@ from barpc.base.statistics import MUCH_NOISE, RIVALS
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SelectedModel:
     """A block solved by the model that the data choose."""
 
     found: Solution
@@ -37,7 +37,7 @@ class Model:
     foreign: ForeignCamera | None = None  # the view that it was solved without, or that may be wrong
 
 
-def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Model:
+def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the block by the model that the data choose.
 
     Raises
@@ -84,7 +84,7 @@ def _first(
     ) from failed
 
 
-def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Model:
+def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the model beside foreign cameras."""
     given = options.model != AUTO or options.drift is not None or first.goes_on
     found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
@@ -97,8 +97,8 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
     if searched:
         smooth = with_splines(found, parts, options)
         if affine is None or smooth.after.error < MUCH_BETTER * affine.after.error:
-            return Model(smooth, parts)
-    return Model(found, parts) if affine is None else Model(affine, parts, found.after.whole_rms)
+            return SelectedModel(smooth, parts)
+    return SelectedModel(found, parts) if affine is None else SelectedModel(affine, parts, found.after.whole_rms)
 
 
 def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:

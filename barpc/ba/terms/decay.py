@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.scan import Interval
-from barpc.ba.terms.step import Part, Step, open_ended
+from barpc.ba.terms.step import ImagePart, Step, open_ended
 from barpc.ba.terms.term import Residuals, Term
 from barpc.base.geodesy import Array
 
@@ -39,7 +39,7 @@ class Decaying(Term):
         return replace(self, where=(*place, rate * float(np.exp(step))))
 
 
-class Decay(Decaying, Part):
+class Decay(Decaying, ImagePart):
     """Rows of one image are displaced from an origin on, with an exponential decay upwards or downwards."""
 
     NAME: ClassVar[str] = "decay"

@@ -11,7 +11,7 @@ from barpc.ba.evidence.scan import BINS, Interval
 from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA, MIN_SPLINES, AdditionalParameters
 from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.terms.decay import LENGTHS, Decay
-from barpc.ba.terms.step import Part, Step, open_ended
+from barpc.ba.terms.step import ImagePart, Step, open_ended
 from barpc.ba.terms.term import SIZE_PRICE, Residuals, Term, in_both_coordinates
 from barpc.base.statistics import FEW
 from barpc.sensor.image_corrections import profile
@@ -48,7 +48,7 @@ class LowFrequency(Term):
         grid = np.meshgrid(np.arange(BINS) / BINS * size, LENGTHS * size, (-1.0, 1.0))
         origin, length, sign = (values.ravel() for values in grid)
         start, stop = np.where(sign > 0.0, origin, -size), np.where(sign > 0.0, 2.0 * size, origin)
-        kinds: tuple[tuple[type[Part], tuple[np.ndarray, ...]], ...] = (
+        kinds: tuple[tuple[type[ImagePart], tuple[np.ndarray, ...]], ...] = (
             (Step, (*ends, nothing, nothing)),
             (Decay, (start, stop, origin, sign / length)),
         )

@@ -15,7 +15,7 @@ from barpc.base.statistics import SURE
 from barpc.sensor.image_corrections import profile
 
 
-class Part(Term):
+class ImagePart(Term):
     """A displacement of a part of one image, (col, row), that may decay along it."""
 
     FOLLOWED: ClassVar[bool] = True
@@ -54,7 +54,7 @@ class Part(Term):
         return place, gain[rows]
 
 
-class Step(Part):
+class Step(ImagePart):
     """Rows or columns of one image are displaced as a whole."""
 
     NAME: ClassVar[str] = "step"
