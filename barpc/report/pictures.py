@@ -58,6 +58,10 @@ def _flagged_parts(files: RunFiles) -> dict[str, list[tuple[str, Limits]]]:
             found.setdefault(str(one.image), []).append((words, limits))
     for worse in () if files.summary.scene is None else files.summary.scene.held_out_places or ():
         found.setdefault(worse.image, []).append((worse.sentence, (worse.columns, worse.rows)))
+    for view in files.summary.views:
+        if view.gap:
+            columns, rows = ((min(ends), max(ends)) for ends in list(zip(*view.gap, strict=True))[2:])
+            found.setdefault(view.name, []).append(("few tie points here", (columns, rows)))
     return found
 
 
