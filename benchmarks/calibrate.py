@@ -235,7 +235,7 @@ def bent_as_said(made: Scene, found: Adjustment) -> tuple[float, float, float]:
     rows = bends @ np.einsum("ni,nik->nk", up, by_unknown)
     cameras = np.einsum("nk,kl,nl->n", rows, covariance.of_noise.full, rows).mean()
     assert covariance.shared is not None
-    shared = ((bends @ np.einsum("ni,nik->nk", up, covariance.shared.of_points(index))) ** 2).sum(axis=1).mean()
+    shared = ((bends @ np.einsum("ni,nik->nk", up, covariance.shared_moves(index))) ** 2).sum(axis=1).mean()
     return float(np.sqrt((height**2).mean())), float(np.sqrt(cameras)), float(np.sqrt(cameras + shared))
 
 

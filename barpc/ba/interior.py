@@ -215,18 +215,17 @@ class CommonErrors:
         if common is not None:
             of_common = la.solve_triangular(common.upper, of_common, trans="T")
             flat = flat - common.by_camera.T @ of_common
-        by_unknown = covariance.solve(flat)
         known = problem, state, weight, reduced
-        return SharedErrors(by_unknown, partial(self._point_moves, known, (by_unknown, of_common)))
+        return SharedErrors(covariance.solve(flat), partial(self._point_moves, known, of_common))
 
     def _point_moves(
         self,
         known: tuple[Problem, State, Array, Reduced],
-        moved: tuple[Array, Array],
+        of_common: Array,
         index: IntArray,
     ) -> Array:
-        """Return the moves (n, 3, k) [m] of points `index`, by those of unknowns and of common errors of heights."""
-        (problem, state, weight, reduced), (by_unknown, of_common) = known, moved
+        """Return the moves (n, 3, k) [m] of points `index`, the cameras held; `of_common`: of errors of heights."""
+        problem, state, weight, reduced = known
         structure = problem.structure
         place = np.full(structure.num_points, -1)
         place[index] = np.arange(len(index))
@@ -244,9 +243,7 @@ class CommonErrors:
         if (common := reduced.common) is not None:
             held = place[common.index] >= 0
             half[place[common.index[held]]] -= common.cross[held] @ la.solve_triangular(common.upper, of_common)
-        own = solve_transposed(reduced.lower[:, index, None], half.transpose(1, 0, 2))
-        with_cameras = reduced.carried(by_unknown.reshape(structure.num_views, -1, self.count), index)
-        return np.asarray(with_cameras + own.transpose(1, 0, 2))
+        return np.asarray(solve_transposed(reduced.lower[:, index, None], half.transpose(1, 0, 2)).transpose(1, 0, 2))
 
 
 def _sums(whitened: Array, order: IntArray, count: IntArray) -> sp.csr_array:

@@ -52,7 +52,7 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     shared = found.covariance.shared
     assert shared is not None
     index = np.flatnonzero(np.isfinite(plain.points).all(axis=1))
-    moves, moved = shared.of_points(index), common.moved(block.tracks.view, block.tracks.xy[:, 0])
+    moves, moved = found.covariance.shared_moves(index), common.moved(block.tracks.view, block.tracks.xy[:, 0])
     middle = block.truth.ground.mean(axis=0)
     known = _shared_errors(found, 0, middle)
     assert known is not None

@@ -22,9 +22,9 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import SAMPLE
-from barpc.scene import BoolArray
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, parts
+from barpc.base.statistics import MANY, SAMPLE
+from barpc.scene import BoolArray, IntArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
 """The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge; what heights do
@@ -85,12 +85,8 @@ def gauge_report(
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
     pick = _motion_of_points(local / radius) @ enu  # (10, n, 3) by ECEF moves
     by_unknown, own = _motion_by_unknowns(covariance.of_noise, pick, use, use.sum() / count)
-    shared = (
-        None
-        if covariance.shared is None
-        else np.einsum("mni,nik->mk", pick, covariance.shared.of_points(np.flatnonzero(use)))
-    )
-    found = _assembled_report(covariance, enu @ shift, (by_unknown, own, shared), radius)
+    motions = by_unknown, own, _motion_by_shared(covariance, pick, np.flatnonzero(use))
+    found = _assembled_report(covariance, enu @ shift, motions, radius)
     if prior is None:
         return found
     variance = np.where(np.isfinite(prior), prior, 0.0).ravel() ** 2
@@ -105,19 +101,28 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
     by_unknown = np.zeros((len(MOTIONS), params.size))
     by_unknown[:, prior.index] = scene.by_unknown
     moved = scene.by_unknown @ (params.ravel()[prior.index] - prior.mean)
-    shared = None if covariance.shared is None else by_unknown @ covariance.shared.by_unknown
-    return _assembled_report(covariance, moved[:3], (by_unknown, scene.own, shared), scene.radius)
+    return _assembled_report(covariance, moved[:3], (by_unknown, scene.own, 0.0), scene.radius)
 
 
 def _assembled_report(
-    covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | None], radius: float
+    covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | float], radius: float
 ) -> GaugeReport:
-    """`motions`: by unknowns, of their own where these are known, and by errors that images have in common (10, k)."""
-    by_unknown, own, shared = motions
+    """`motions`: by unknowns, their covariance where these are known, and by common errors then (10, k)."""
+    by_unknown, own, direct = motions
     motion_covariance = by_unknown @ covariance.of_noise.solve(by_unknown.T) + own
-    motion_covariance += 0.0 if shared is None else shared @ shared.T
+    if covariance.shared is not None:
+        moves = by_unknown @ covariance.shared.by_unknown + direct
+        motion_covariance += moves @ moves.T
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
+
+
+def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> Array | float:
+    """Return the motions (10, k) by errors that images have in common, with the cameras held."""
+    if covariance.shared is None:
+        return 0.0
+    chunks = ((pick[:, part], covariance.shared.of_points(index[part])) for part in parts(len(index), MANY))
+    return np.asarray(sum(np.einsum("mni,nik->mk", *chunk) for chunk in chunks))
 
 
 def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ class SharedErrors:
     """Response of an adjustment to k errors that images have in common, by one standard deviation of each."""
 
     by_unknown: Array  # (N q, k) moves of the unknowns
-    of_points: Callable[[IntArray], Array]  # of points (n,) their moves (n, 3, k) [m], ECEF
+    of_points: Callable[[IntArray], Array]  # of points (n,) their moves (n, 3, k) [m], ECEF, with the cameras held
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +142,16 @@ class Covariance:
             out[:, part] = self._columns(every[part], False)
         return 0.5 * (out + out.T)
 
+    def shared_moves(self, index: IntArray) -> Array:
+        """Return the moves (n, 3, k) [m], ECEF, of the points `index` (n,) by errors that images have in common."""
+        assert self.shared is not None
+        by_unknown = self.shared.by_unknown.reshape(-1, self.num_unknowns, self.shared.by_unknown.shape[1])
+        return np.asarray(self.reduced.carried(by_unknown, index) + self.shared.of_points(index))
+
     def points(self, index: IntArray) -> Array:
         """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
         if self.shared is not None:
-            moves = self.shared.of_points(index)
+            moves = self.shared_moves(index)
             return np.asarray(self.of_noise.points(index) + moves @ np.swapaxes(moves, 1, 2))
         structure = self.reduced.structure
         out = np.empty((len(index), 3, 3))
