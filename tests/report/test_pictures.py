@@ -68,6 +68,13 @@ def test_flagged_parts_are_outlined_on_their_image_and_on_no_other():
     assert Drawing(good).described.endswith("1 part with reservations.")
 
 
+def test_rows_with_few_tie_points_are_outlined_as_others_are():
+    gap = tuple((5.0, 43.0, col, row) for col in (-0.5, 999.5) for row in (199.5, 399.5))
+    ((svg, _), *_rest) = pictures.image_panels(pictured([a_view("A", gap=gap), a_view("B")]))
+    assert Drawing(svg).rects("flag") == [pytest.approx((0, 59.85, 299.85, 60), abs=0.01)]
+    assert Drawing(svg).titles("flag") == ["few tie points"]
+
+
 def test_images_without_a_picture_are_left_out_and_a_run_without_any_has_no_panels():
     views = [a_view("A"), a_view("B")]
     assert [caption.split(":")[0] for _, caption in pictures.image_panels(pictured(views, names=["B"]))] == ["B"]
