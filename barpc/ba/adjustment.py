@@ -181,8 +181,6 @@ def _with_apart(
 def _adjustment(
     model: SelectedModel, found: Solution, options: AdjustOptions, common: CommonErrors | None
 ) -> Adjustment:
-    model: SelectedModel, found: Solution, options: AdjustOptions, common: CommonErrors | None
-) -> Adjustment:
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     parts, outcome, final = model.parts, found.outcome, found.final
     block = parts.inner

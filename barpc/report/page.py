@@ -104,19 +104,11 @@ _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
     "images": ("Images: residuals (RMS) of the tie points in use", ViewEntry, ViewEntry.PAGE),
     "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
     "corrections": ("Corrections: shift at the image centre ± 1 sigma", ViewEntry, ViewEntry.CORRECTIONS),
-    "places": (
-        "Ground point at each image centre: 1 sigma error ellipse, CE90 and stated CE90",
-        ViewEntry,
-        ViewEntry.PLACES,
-    ),
+    "places": ("Ground point at each image centre: ellipse (1 sigma), CE90, stated CE90", ViewEntry, ViewEntry.PLACES),
     "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
     "control": ("Control in each image: the largest residual (Baarda's w)", ViewEntry, ViewEntry.CONTROL),
     "reference": ("Reference: offset of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
-    "decided": (
-        "Figures of each image: widening of its prior, rejected observations, systematic residuals",
-        ViewEntry,
-        ViewEntry.DECISIONS,
-    ),
+    "decided": ("Images: widened prior, rejected observations, systematic residuals", ViewEntry, ViewEntry.DECISIONS),
     "explained": ("Hypotheses selected to explain residuals", ExplanationEntry, ExplanationEntry.PAGE),
     "left": ("Rows and columns inconsistent with the rest", LeftEntry, LeftEntry.PAGE),
     "worse": ("Regions with larger residuals of check tie points", HeldOutEntry, HeldOutEntry.PAGE),
@@ -168,12 +160,8 @@ def _images_section(files: RunFiles) -> Section:
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    return _section(
-        "images",
-        {"views": views, "agree": adjusted and _num_in_use(files)},
-        tables=[shown],
-        **_panels(image_panels(files)),
-    )
+    facts = {"views": views, "agree": adjusted and _num_in_use(files)}
+    return _section("images", facts, tables=[shown], **_panels(image_panels(files)))
 
 
 def _num_in_use(files: RunFiles) -> int:
@@ -247,15 +235,9 @@ def _pairs_section(files: RunFiles) -> Section | None:
     worst = max(pairs, key=offset_of)
     sure = sure_pairs(files.summary.views, pairs)
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
-    facts = {
-        **{
-            "worst": worst,
-            "offset": offset_of(worst) if any(worst.offset_rms) else None,
-            "wanted": GOOD_RMSE,
-            "enough": MIN_PAIR_MATCHES,
-        },
-        "best": min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None),
-    }
+    facts: dict[str, object] = {"worst": worst, "wanted": GOOD_RMSE, "enough": MIN_PAIR_MATCHES}
+    facts["offset"] = None if set(worst.offset_rms) == {None} else offset_of(worst)
+    facts["best"] = min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None)
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
     return _section("pairs", facts, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
@@ -307,20 +289,15 @@ def decisions(summary: Summary) -> list[str]:
 
 
 def _gauge_section(files: RunFiles) -> Section | None:
-    scene, reference, gcps, views = (
-        files.summary.scene,
-        files.summary.reference,
-        files.summary.gcps,
-        files.summary.views,
-    )
+    summary, scene = files.summary, files.summary.scene
     if scene is None:
         return None
     points = [f"{mode.words[0].upper()}{mode.words[1:]}." for mode in scene.weakest_modes[:NAMED] if mode.sigma_m]
     columns = DatumEntry.columns(scene.datum)
     tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
-    tables += _tables_of("gcps", gcps)
-    tables += _tables_of("control", [view for view in views if view.control_w is not None])
-    tables += _tables_of("reference", () if reference is None else reference.views)
+    tables += _tables_of("gcps", summary.gcps)
+    tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
+    tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)
     held = _least_share(scene, "gcps", "reference") > 0.5
     facts = {"scene": scene, "held": held, "num": _num_in_use(files)}
     return _section("gauge", facts, points=points, tables=tables)

@@ -61,7 +61,7 @@ def _flagged_parts(files: RunFiles) -> dict[str, list[tuple[str, Limits]]]:
     for view in files.summary.views:
         if view.gap:
             columns, rows = ((min(ends), max(ends)) for ends in list(zip(*view.gap, strict=True))[2:])
-            found.setdefault(view.name, []).append(("few tie points here", (columns, rows)))
+            found.setdefault(view.name, []).append(("few tie points", (columns, rows)))
     return found
 
 
@@ -135,12 +135,10 @@ def _profile(files: RunFiles, image: str, axis: int, bands: Sequence[tuple[float
     for k, words in enumerate(("column", "row")):
         zero = 10.0 + high * (k + 0.5) + 14.0 * k
         marks = [(zero - t * high / (2 * reach), f"{t:g}") for t in round_ticks(-reach, reach, 4)]
+        y = {kind: zero - found[k] * high / (2 * reach) for kind, (_, found) in lines.items()}
         drawn = [
-            (
-                f"line {kind}",
-                np.column_stack([_PROFILE_LEFT + at * wide, zero - found[k] * high / (2 * reach)]).tolist(),
-            )
-            for kind, (at, found) in lines.items()
+            (f"line {kind}", np.column_stack([_PROFILE_LEFT + at * wide, y[kind]]).tolist())
+            for kind, (at, _) in lines.items()
             if len(at)
         ]
         rows.append((f"{words} residual [px]", marks, drawn))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from barpc import report
 from barpc.report import page
 from barpc.report.runfiles import Draped, ReliefWindow
 from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
@@ -13,6 +16,7 @@ from barpc.report.summary.block import DatumEntry, ModeEntry, SceneEntry
 from barpc.report.summary.ground_points import CheckPointEntry, ReferenceEntry, ReferenceViewEntry, SeenEntry
 from barpc.report.summary.pairs import OffsetEntry
 from barpc.report.summary.views import CenterEntry, EllipseEntry, FitEntry
+from barpc.report.summary.words import STATUS_WORDS
 
 from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
 
@@ -400,3 +404,17 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     (*_, (chart, words)) = page._surface_section(replace(files, reliefs=(before, after), draped=draped)).charts
     assert words.startswith("A (left) and C (right) draped over the surface from the corrected cameras: ")
     assert str(chart).count("QUJD") == 2
+
+
+@pytest.mark.parametrize(("after", "said"), [(0.0, "is 0.000 px (RMS)"), (None, "No epipolar offset is known")])
+def test_an_offset_of_nothing_is_not_one_that_is_unknown(after, said):
+    offset = None if after is None else OffsetEntry(0.0, 0.0, after, 50)
+    section = asked("pairs", pairs=(a_pair(epipolar_before=offset, epipolar_after=offset),))
+    assert said in section.answer
+    assert ("px (RMS)" in section.answer) == (after is not None)
+
+
+def test_no_rule_of_drawings_is_the_name_of_a_verdict():
+    """An outline has its verdict as a class: a rule of that name drew outlines of tied images as dots."""
+    css = Path(report.__file__).with_name("template.html.j2").read_text(encoding="utf-8")
+    assert not re.findall(rf"(?:^|[}}\s])\.({'|'.join(STATUS_WORDS)})\b", css)
