@@ -316,10 +316,10 @@ class AdjustOptions(Options):
         unit="px",
         least=0,
     )
-    loss: str = option(
+    loss: Literal["geman_mcclure", "linear"] = option(
         "geman_mcclure",
         "Robust loss of the first rounds; `linear` skips them.",
-        rows="barpc.ba.robust.weights.LOSSES",
+        removed=dict.fromkeys(("huber", "soft_l1", "cauchy"), "`geman_mcclure` is the loss that is kept"),
     )
     estimate_noise: bool = option(True, "Scale the observations' sigmas by the scatter of the residuals.")
     fixed: tuple[str, ...] = option((), "A view that keeps its delivered camera.", unit="name")

@@ -545,7 +545,7 @@ def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
 def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(monkeypatch):
     made = simulate_block(4, 150, seed=21, noise=0.1, outliers=0.4)
     scales, noises = [], []
-    loss, robust, squared = rounds.LOSSES["geman_mcclure"], rounds._robust, Observations.squared
+    loss, robust, squared = rounds.geman_mcclure, rounds._robust, Observations.squared
     last = {}
 
     def seen(self, residual, counted):
@@ -561,11 +561,11 @@ def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(mo
         found = robust(*given)
         noises.append(found[3])
         monkeypatch.setattr(rounds, "_robust", robust)  # of the first run of rounds
-        monkeypatch.setitem(rounds.LOSSES, "geman_mcclure", loss)
+        monkeypatch.setattr(rounds, "geman_mcclure", loss)
         return found
 
     monkeypatch.setattr(Observations, "squared", seen)
-    monkeypatch.setitem(rounds.LOSSES, "geman_mcclure", watched)
+    monkeypatch.setattr(rounds, "geman_mcclure", watched)
     monkeypatch.setattr(rounds, "_robust", ended)
     options = AdjustOptions(noise_floor=0.0, min_convergence=0.01, drift=0)
     adjust_tracks(made.views, made.tracks, options, centers=centers_of(made))

@@ -366,7 +366,7 @@ def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut
     assert passes(monkeypatch, cut, [1.0], [1.0], **options)[1] == revived
 
 
-@pytest.mark.parametrize("loss", ["linear", "huber"])
+@pytest.mark.parametrize("loss", ["linear", "geman_mcclure"])
 @pytest.mark.parametrize("same", [True, False])
 def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, same: bool, loss: str) -> None:
     """Cut, accuracies and misfit; with further unknowns what was cut may come back, but counts for nothing at first."""

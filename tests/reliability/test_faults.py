@@ -304,7 +304,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "an unknown loss": (
         given("--options", "o.toml", o__toml=b"[adjust]\nloss = 'magic'\n"),
         1,
-        ("magic", "cauchy"),
+        ("magic", "geman_mcclure, linear"),
     ),
     "an unknown model": (given("--model", "magic"), 2, ("magic", "rotation")),
     "an unknown matcher": (

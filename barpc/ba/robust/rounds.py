@@ -13,11 +13,10 @@ from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
-from barpc.ba.robust.weights import LOSSES, MEDIAN, Observations
+from barpc.ba.robust.weights import MEDIAN, Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
 from barpc.base.geodesy import Array
-from barpc.base.options import AdjustOptions
 from barpc.base.statistics import (
     BACKFITTING,
     BEST,
@@ -127,7 +126,7 @@ class Rounds:
         start = replace(self.problem, camera_prior=self.variances.for_search())
         given = self.state, self.residual, self.projected
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
-            start, self.observations, given, self.use, self.options, self.smooth
+            start, self.observations, given, self.use, self.smooth
         )
         self.misfit = self.smooth.test(self.residual, self.use).rms
 
@@ -264,7 +263,6 @@ def _robust(
     observations: Observations,
     start: tuple[State, Array, Projected | None],
     use: BoolArray,
-    options: AdjustOptions,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
     """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
@@ -274,7 +272,7 @@ def _robust(
     their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
     the stated noise, or a few that fit by chance would be left.
     """
-    loss, (state, residual, projected) = LOSSES[options.loss], start
+    state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
     s = observations.squared(residual, counted)
     for _ in range(ITERATIONS):
@@ -284,12 +282,12 @@ def _robust(
             break
         clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT
         scale = SURELY * noise if np.isinf(scale) or clean else max(SURELY * noise, SHRINK * scale)
-        counted = _observation_weights(observations, use, s, loss(s / scale**2)[1])
+        counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)
         near = scale <= SURELY / SHRINK * noise  # a step from the end
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
-        counted = _observation_weights(observations, use, s, loss(s / scale**2)[1])
+        counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
     return state, residual, counted, noise, projected
 
 

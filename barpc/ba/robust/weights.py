@@ -1,13 +1,11 @@
-"""How much observations count: robust losses, stated sigmas, the observed noise.
+"""How much observations count: the robust loss, stated sigmas, the observed noise.
 
-A loss rho(s) is of a squared, normalised residual s = (|r| / scale)^2. The adjustment minimises sum scale^2 rho(s) by
+The loss rho(s) is of a squared, normalised residual s = (|r| / scale)^2. The adjustment minimises sum scale^2 rho(s) by
 reweighting: an observation's squared weight is rho'(s), so that the gradient of the weighted problem is the gradient
-of the robust one. One loss a function, one row in `LOSSES`.
+of the robust one.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 
@@ -21,45 +19,10 @@ from barpc.scene import BoolArray
 MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
 _LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
 
-Loss = Callable[[Array], tuple[Array, Array]]
-"""s (...) -> rho(s), rho'(s); rho(0) = 0, rho'(0) = 1."""
-
-
-def linear(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = s and its derivative: least squares."""
-    return s, np.ones_like(s)
-
-
-def huber(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) and its derivative: squares up to 1, absolute values beyond."""
-    root = np.sqrt(np.maximum(s, 1.0))
-    return np.where(s <= 1.0, s, 2.0 * root - 1.0), 1.0 / root
-
-
-def soft_l1(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = 2 (sqrt(1 + s) - 1) and its derivative: a smooth absolute value."""
-    root = np.sqrt(1.0 + s)
-    return 2.0 * (root - 1.0), 1.0 / root
-
-
-def cauchy(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = log(1 + s) and its derivative."""
-    return np.log1p(s), 1.0 / (1.0 + s)
-
 
 def geman_mcclure(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = s / (1 + s) and its derivative: an outlier's pull vanishes."""
+    """Return rho(s) = s / (1 + s) and its derivative, 1 at 0: an outlier's pull vanishes."""
     return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
-
-
-LOSSES: dict[str, Loss] = {
-    "linear": linear,
-    "huber": huber,
-    "soft_l1": soft_l1,
-    "cauchy": cauchy,
-    "geman_mcclure": geman_mcclure,
-}
-"""Name -> loss."""
 
 
 class Observations:
