@@ -1,1 +1,1 @@
-"""One function a verb: what the command line calls, and `barpc.<verb>` in Python, with the flags as keywords."""
+"""One function a verb, called by the command line and as `barpc.<verb>` in Python, with the flags as keywords."""

@@ -37,6 +37,7 @@ from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
+_FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
 _MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
 _RELIEF = 50.0  # m around a DEM's heights at sampled places
 _NODES = 17
@@ -162,6 +163,7 @@ class _Warp:
     crs: CRS
     place: Affine
     size: tuple[int, int]
+    side: int  # of a block [px], which shows as many pixels of the image, however large its own
 
     @classmethod
     def of(
@@ -183,18 +185,25 @@ class _Warp:
                 share = f"the DEM has no height under {unknown:.2g} of the image: no pixels there"
                 warnings.warn(f"{file}: {share}", Remark, stacklevel=3)
         rings = np.concatenate([footprint(model, camera.extent, level) for level in levels])
+        pixel = float(ground_sample_distance(model, np.append(rings[0], levels[0]))[1])
+        if not (np.isfinite(rings).all() and np.isfinite(pixel)):
+            raise InputError(f"{file}: shows no ground at {levels[0]:.5g} m")
+        if not 1.0 / _FINEST <= gsd / pixel <= _COARSEST:
+            raise InputError(f"--gsd {gsd:g}: an image pixel of {pixel:.2g} m: give {pixel / _FINEST:.2g} m to "
+                             f"{pixel * _COARSEST:.2g} m")  # fmt: skip
         east, north = transform(_WGS84, crs, *rings.T)
         west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
         west, north = float(np.floor(west)), float(np.ceil(north))
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
-        return cls(camera, levels, heights, words, crs, Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd), size)
+        side = min(_SIDE, int(_SIDE * pixel / gsd))
+        return cls(camera, levels, heights, words, crs, Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd), size, side)
 
     def write(self, out: Path, image: Path, progress: Progress | None) -> None:
         """Write the map of an image, a block at a time."""
         blocks = [
-            Window(col, row, min(_SIDE, self.size[0] - col), min(_SIDE, self.size[1] - row))
-            for row in range(0, self.size[1], _SIDE)
-            for col in range(0, self.size[0], _SIDE)
+            Window(col, row, min(self.side, self.size[0] - col), min(self.side, self.size[1] - row))
+            for row in range(0, self.size[1], self.side)
+            for col in range(0, self.size[0], self.side)
         ]
         with open_raster(image) as source, rasterio.Env(**GDAL_OPTIONS):
             kind = np.dtype(source.dtypes[0])

@@ -198,7 +198,7 @@ def dsm(
 
 
 def run_folder(source: Sequence[Any]) -> Path | None:
-    """Return the finished run that is given in place of images, if any. UsageError for a run beside others."""
+    """Return the finished run given in place of images, if any. UsageError for a run beside others."""
     paths = [Path(one) for one in source if isinstance(one, (str, os.PathLike))]
     runs = [path for path in paths if (path / "summary.json").is_file()]
     if runs and len(source) > 1:
