@@ -26,13 +26,13 @@ from barpc.base.geodesy import wrap_longitude
 from barpc.export.shots import Scene, read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
-from barpc.rasters.dem import Dem
+from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
 from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
-from barpc.verbs.points import Files, altitude_of, ground_at, terrain_of
+from barpc.verbs.points import Files, altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
 
@@ -180,7 +180,7 @@ class _Warp:
             levels, words = (low, high), f"heights of {terrain.description}"
             heights = {"RPC_DEM": str(_write_terrain(room / "terrain.tif", camera, terrain, levels))}
             at = image_grid(camera.extent, (0.0, 0.0), (_NODES, 1))[0]
-            unknown = float(np.isnan(ground_at(camera, at, 0.0, terrain)[:, 2]).mean())
+            unknown = float(np.isnan(localize_on_terrain(model, at, terrain, levels)[:, 2]).mean())
             if unknown:
                 share = f"the DEM has no height under {unknown:.2g} of the image: no pixels there"
                 warnings.warn(f"{file}: {share}", Remark, stacklevel=3)
