@@ -1,1 +1,1 @@
-"""Functions of the verbs, one each: `barpc.<verb>` in Python, with the flags as keywords; the CLI calls them."""
+"""One function a verb, called by the command line and as `barpc.<verb>` in Python, with the flags as keywords."""

@@ -26,17 +26,18 @@ from barpc.base.geodesy import wrap_longitude
 from barpc.export.shots import Scene, read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
-from barpc.rasters.dem import Dem
+from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
 from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
-from barpc.verbs.points import Files, altitude_of, ground_at, terrain_of
+from barpc.verbs.points import Files, altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
+_FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
 _MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
 _RELIEF = 50.0  # m around a DEM's heights at sampled places
 _NODES = 17
@@ -162,6 +163,7 @@ class _Warp:
     crs: CRS
     place: Affine
     size: tuple[int, int]
+    side: int  # of a block [px], which shows as many pixels of the image, however large its own
 
     @classmethod
     def of(
@@ -178,23 +180,30 @@ class _Warp:
             levels, words = (low, high), f"heights of {terrain.description}"
             heights = {"RPC_DEM": str(_write_terrain(room / "terrain.tif", camera, terrain, levels))}
             at = image_grid(camera.extent, (0.0, 0.0), (_NODES, 1))[0]
-            unknown = float(np.isnan(ground_at(camera, at, 0.0, terrain)[:, 2]).mean())
+            unknown = float(np.isnan(localize_on_terrain(model, at, terrain, levels)[:, 2]).mean())
             if unknown:
                 share = f"the DEM has no height under {unknown:.2g} of the image: no pixels there"
                 warnings.warn(f"{file}: {share}", Remark, stacklevel=3)
         rings = np.concatenate([footprint(model, camera.extent, level) for level in levels])
+        pixel = float(ground_sample_distance(model, np.append(rings[0], levels[0]))[1])
+        if not (np.isfinite(rings).all() and np.isfinite(pixel)):
+            raise InputError(f"{file}: shows no ground at {levels[0]:.5g} m")
+        if not 1.0 / _FINEST <= gsd / pixel <= _COARSEST:
+            raise InputError(f"--gsd {gsd:g}: an image pixel of {pixel:.2g} m: give {pixel / _FINEST:.2g} m to "
+                             f"{pixel * _COARSEST:.2g} m")  # fmt: skip
         east, north = transform(_WGS84, crs, *rings.T)
         west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
         west, north = float(np.floor(west)), float(np.ceil(north))
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
-        return cls(camera, levels, heights, words, crs, Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd), size)
+        side = min(_SIDE, int(_SIDE * pixel / gsd))
+        return cls(camera, levels, heights, words, crs, Affine(gsd, 0, west * gsd, 0, -gsd, north * gsd), size, side)
 
     def write(self, out: Path, image: Path, progress: Progress | None) -> None:
         """Write the map of an image, a block at a time."""
         blocks = [
-            Window(col, row, min(_SIDE, self.size[0] - col), min(_SIDE, self.size[1] - row))
-            for row in range(0, self.size[1], _SIDE)
-            for col in range(0, self.size[0], _SIDE)
+            Window(col, row, min(self.side, self.size[0] - col), min(self.side, self.size[1] - row))
+            for row in range(0, self.size[1], self.side)
+            for col in range(0, self.size[0], self.side)
         ]
         with open_raster(image) as source, rasterio.Env(**GDAL_OPTIONS):
             kind = np.dtype(source.dtypes[0])
