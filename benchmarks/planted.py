@@ -65,7 +65,7 @@ _EDGE = 11.0  # px: half a patch that is registered, and the sampler's taps
 
 @dataclass(frozen=True)
 class Plant:
-    """An error in one image: from `start` on along `axis` (0 columns, 1 rows) content is moved by `by` (col, row) px.
+    """An error in one image: from `start` to `stop` along `axis` (0 columns, 1 rows) content is moved by `by` [px].
 
     `lost`: that many rows are missing, so that the image is shorter.
     """
@@ -75,24 +75,27 @@ class Plant:
     axis: int
     start: int
     by: tuple[float, float]
+    stop: int | None = None  # None: to the image's end
 
     def pixels(self, image: Array) -> Array:
         """Return the image as it is delivered."""
         if self.kind == "lost":
             return np.delete(image, np.s_[self.start : self.start - round(self.by[1])], axis=0)
         moved = shift(image, self.by[::-1], order=3, mode="nearest") if any(self.by) else image
-        part = (np.s_[:], np.s_[self.start :]) if self.axis == 0 else np.s_[self.start :]
+        ends = np.s_[self.start : self.stop]
+        part = (np.s_[:], ends) if self.axis == 0 else ends
         out = image.copy()
         out[part] = moved[part]
         return out
 
     def before(self, xy: Array) -> Array:
         """Return the places (N, 2) in the untouched image of what is shown at places (N, 2)."""
-        return xy - np.where(xy[:, self.axis, None] > self.start - 0.5, np.array(self.by), 0.0)
+        place, stop = xy[:, self.axis, None], np.inf if self.stop is None else self.stop - 0.5
+        return xy - np.where((place > self.start - 0.5) & (place < stop), np.array(self.by), 0.0)
 
     def __str__(self) -> str:
-        along = "rows" if self.axis else "columns"
-        return f"{self.kind} {self.by[0]:+.1f}, {self.by[1]:+.1f} px from {self.start} of the {along} on"
+        along, end = "rows" if self.axis else "columns", "on" if self.stop is None else f"to {self.stop}"
+        return f"{self.kind} {self.by[0]:+.1f}, {self.by[1]:+.1f} px from {self.start} of the {along} {end}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.scene import View
 from benchmarks.planted import FOLLOWED, GOOD, Clean, Plant, clean, planted, plants, run
+from tests.lanes import rest_slow
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,20 @@ def test_what_is_planted_is_followed_and_named(start, tmp_path, name, kind, size
     assert found.error <= FOLLOWED, found.line()
     assert found.worst <= GOOD, found.line()
     assert found.image in found.words[2], found.line()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("view", "px"), rest_slow([(1, 3.0), (1, -1.5), (0, 3.0), (2, -1.5)], keep=2, mark=pytest.mark.nightly)
+)
+def test_a_band_of_columns_displaced_along_the_rays_is_one_term_of_its_image(start, tmp_path, view, px) -> None:
+    """Terms in the other images explain a step of the middle one as well, but for the correlated noise of matches."""
+    untouched = start("triplet")
+    found = planted(untouched, Plant("band", view, 0, 600, (0.0, px), 760), abs(px), tmp_path)
+    (said,) = [text for text in found.words if "are displaced by" in text and text.startswith("Columns")]
+    assert f" of {found.image} " in said
+    assert float(said.split()[-2]) == pytest.approx(abs(px), abs=0.05)
+    assert found.error <= 0.3 * found.shown, found.line()  # its ends are where tie points tell them
 
 
 def moved(untouched: Clean, box: tuple[int, int, int, int], by: tuple[float, float], folder: Path) -> list[View]:

@@ -113,6 +113,23 @@ class _SearchState:
                 return _SearchState(row.before, row.before.base, self.taken[:n])
         return self
 
+    def replaces(self, best: _SearchState) -> bool:
+        """Return whether it explains as much as another with fewer terms, but for correlated noise, or with as many."""
+        more = len(best.taken) - len(self.taken)
+        if self.moves or best.moves or more < 0:
+            return False
+        return best.gain - self.gain <= (_by_neighbours(self.seen) if more else 0.0)
+
+    def other_views(self, states: list[_SearchState]) -> list[tuple[int, ...]]:
+        """Return the other views that each term may be of: in states that explain as much, alike but for it."""
+        found: list[set[int]] = [set(row.or_of) for row in self.taken]
+        for state in states:
+            differ = [n for n, (a, b) in enumerate(zip(self.taken, state.taken, strict=False)) if a.name != b.name]
+            same = len(state.taken) == len(self.taken) and len(differ) == 1 and state.gain > self.gain - SURE
+            if same and (other := state.taken[differ[0]].term).NAME == self.taken[differ[0]].term.NAME and other.LOCAL:
+                found[differ[0]].add(other.view)
+        return [tuple(sorted(views)) for views in found]
+
     def simplified(self) -> _SearchState:
         """Return the state with simpler terms where these explain as much beside all others."""
         state = self
@@ -129,16 +146,16 @@ class _SearchState:
                 state = replace(state, seen=replace(seen, base=found, extra=extra), followed=found, taken=taken)
         return state
 
-    def findings(self, margin: float) -> Iterator[Finding]:
+    def findings(self, margin: float, or_of: list[tuple[int, ...]]) -> Iterator[Finding]:
         """Yield the records of the terms; `margin` is by how much the combination gains over its rival."""
         stop = 0
-        for row in self.taken:
+        for row, views in zip(self.taken, or_of, strict=True):
             start, stop = stop, stop + len(row.term.sigma)
             unknowns = self.seen.base.extra[start:stop]
             # a term that was not the best by itself is beside the others: by what these gain together
             gap = row.gap if row.gap > 0.0 else margin
             yield from row.term.findings(
-                self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=row.or_of
+                self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=views
             )
 
 
@@ -190,11 +207,17 @@ class TermSearch:
             # the terms beside moving ground explain less than it does alone: all compete again without it
             states = first[:1]
         margin = states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
-        best = states[0].without_noise().simplified()
+        reduced = [state.without_noise() for state in states]
+        best = reduced[0]
+        for state in sorted(reduced[1:], key=lambda state: -state.gain):
+            if state.replaces(best):
+                best, margin = state, max(state.gain - best.gain, 0.0)
+        or_of = best.other_views(reduced)
+        best = best.simplified()
         if not best.taken:
             return Selection()
         base = best.seen.base if all(row.term.FOLLOWED for row in best.taken) else best.followed
-        return Selection(tuple(best.findings(margin)), base.step, base.right)
+        return Selection(tuple(best.findings(margin, or_of)), base.step, base.right)
 
     def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best combinations with one more term, and whether they are the last."""
