@@ -163,6 +163,37 @@ def test_bands_of_a_real_image_are_told_and_water_is_not(triplet, tmp_path, cont
         assert 30 < found.expected < 300
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("band", [None, slice(60, 120), slice(0, 50)])
+def test_a_scene_smaller_than_any_window_has_its_bands(triplet, tmp_path, band: slice | None) -> None:
+    """200 px of a real triplet: some six keypoints in three rows, of which the poorest three have one by chance."""
+    views, side = [], 200
+    for number, (view, (col, row)) in enumerate(zip(triplet, [(300, 180), (300, 150), (296, 118)], strict=True)):
+        with open_raster(view.path) as image:
+            pixels = image.read(1)[row : row + side, col : col + side]
+        if band is not None and number == 1:
+            pixels[band] = turned(pixels[band])
+        path = write_image(tmp_path / f"{number}.tif", pixels)
+        views.append(replace(view, path=str(path), size=(side, side), sensor=view.sensor.crop(col, row)))
+    without, found, other = lacking(views, find_tracks(views))
+    assert (without, other) == (None, None)
+    assert (found is None) is (band is None)
+    if found is not None:
+        assert found.axis == 1
+        assert band.start - 10 <= found.first <= band.start + 15
+        assert band.stop - 10 <= found.last <= band.stop + 10
+
+
+def test_few_keypoints_are_counted_in_fewer_parts() -> None:
+    """Four a part: the poorest of eight has one, and no gap could be told; in parts of four times that it is."""
+    share = np.full(PARTS_PER_SIDE, 0.9)
+    share[24:40] = 0.0
+    told = [gap(*counts(np.random.default_rng(seed), share, 4.0), SIZE) for seed in range(40)]
+    known = [one for one in told if one is not None]
+    assert len(known) >= 36
+    assert all(one.axis == 1 and one.first >= 440 and one.last <= 840 for one in known)
+
+
 def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
     scene = render(views=3, size=(300, 300))
     for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):
