@@ -337,9 +337,8 @@ def _forward(total: Told, curve: LineCurve, bend: float) -> tuple[list[int], flo
 
 def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) -> Learnt:
     """Return the curve with its tests between blocks."""
-    total = reduce(add, told)
     at, halves = _split(told, prior)
-    scatter = _between_blocks(told, [halves[int(i >= at)] for i in range(len(told))], total, prior)
+    scatter = _between_blocks(told, [halves[int(i >= at)] for i in range(len(told))], prior)
     told = [one.times(1.0 / scatter) for one in told]
     total = reduce(add, told)
     found, covariance, evidence = total.solved(prior)
@@ -353,20 +352,24 @@ def _judged(curve: LineCurve, told: Sequence[Told], prior: Array, noise: float) 
     return Learnt(curve, bent @ found, bent @ covariance @ bent.T, gain, (rms[0], rms[1]), noise, scatter, change)
 
 
-def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[Array, Array]]:
+_Solved = tuple[Array, Array]
+"""A curve (n,), and its covariance (n, n)."""
+
+
+def _split(told: Sequence[Told], prior: Array) -> tuple[int, tuple[_Solved, _Solved]]:
     """Return the split of the blocks by time with the largest evidence, and the curves of both parts."""
-    best = (-np.inf, 1, (np.zeros(0), np.zeros(0)))
-    total = reduce(add, told)
+    none, total = (np.zeros(0), np.zeros(0)), reduce(add, told)
+    best = -np.inf, 1, (none, none)
     for at, before in enumerate(accumulate(told[:-1], add), 1):
-        (first, _, one), (second, _, other) = (part.solved(prior) for part in (before, total.without(before)))
-        best = max(best, (one + other, at, (first, second)), key=lambda row: row[0])
+        (*first, one), (*second, other) = (part.solved(prior) for part in (before, total.without(before)))
+        best = max(best, (one + other, at, (tuple(first), tuple(second))), key=lambda row: row[0])
     return best[1:]
 
 
-def _between_blocks(told: Sequence[Told], curves: Sequence[Array], total: Told, prior: Array) -> float:
-    """Return the variance of blocks' gradients at a curve over that of their noise; what a view shares is in it."""
-    covariance, seen, expected = total.solved(prior)[1], 0.0, 0.0
-    for one, curve in zip(told, curves, strict=True):
+def _between_blocks(told: Sequence[Told], curves: Sequence[_Solved], prior: Array) -> float:
+    """Return the variance of blocks' gradients over that of their noise, each at the curve of its part of the time."""
+    seen = expected = 0.0
+    for one, (curve, covariance) in zip(told, curves, strict=True):
         factor = la.cho_factor(one.matrix + prior)
         pull = one.gradient + one.matrix @ curve
         seen += float(pull @ la.cho_solve(factor, pull))
