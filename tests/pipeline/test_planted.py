@@ -13,7 +13,6 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.scene import View
 from benchmarks.planted import FOLLOWED, GOOD, Clean, Plant, clean, planted, plants, run
-from tests.lanes import rest_slow
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +56,8 @@ def test_what_is_planted_is_followed_and_named(start, tmp_path, name, kind, size
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("view", "px"), rest_slow([(1, 3.0), (1, -1.5), (0, 3.0), (2, -1.5)], keep=2, mark=pytest.mark.nightly)
-)
+@pytest.mark.landing(2)
+@pytest.mark.parametrize(("view", "px"), [(1, 3.0), (0, 3.0), (2, -1.5), (1, -1.5)])
 def test_a_band_of_columns_displaced_along_the_rays_is_one_term_of_its_image(start, tmp_path, view, px) -> None:
     """Terms in the other images explain a step of the middle one as well, but for the correlated noise of matches."""
     untouched = start("triplet")
