@@ -1,11 +1,12 @@
 """Interior distortion of a sensor, the same in all its images: its curve by column, and its part in a covariance.
 
 Where no calibration is given, the distortion has a prior: mean 0, a standard deviation of `_PRIOR_SIGMA` a coordinate,
-and a correlation of exp(-d / `_PRIOR_LENGTH`) between columns d apart, that of steps at random columns. It has no
-constant and no slope, which a camera's correction absorbs.
+and a correlation of exp(-d / `_PRIOR_LENGTH`) between columns d apart, as of steps of chips at random columns. It has
+no constant and no slope, which a camera's correction absorbs.
 
 Every error of a curve displaces the observations of all images of the sensor. The response of an adjustment is one
-Gauss-Newton step with the observations displaced: unknowns move by S^-1 g, points with them and by their own.
+Gauss-Newton step with the observations displaced: unknowns move by S^-1 g, points with the cameras and by their own
+displaced observations.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ class Calibration:
 
     @classmethod
     def prior(cls, sensor: str, width: int) -> Calibration:
-        """Return the prior of a sensor whose images have `width` columns: mean 0, the covariance of other sensors."""
+        """Return the prior of a sensor whose images have `width` columns: mean 0, a covariance of published figures."""
         curve = LineCurve(width, np.zeros(0))
         knots = np.arange(LINE_SPLINES) * width / (LINE_SPLINES - 3)
         kernel = _PRIOR_SIGMA**2 * np.exp(-np.abs(knots[:, None] - knots) / _PRIOR_LENGTH)

@@ -25,8 +25,8 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_SEEN = 2.5  # floors: sinusoids and motions that are taken; sound crops show sinusoids of 1.8, by correlated noise
-_Tried = tuple[Term, MixtureFit, float]
+_LEAST_FLOORS = 2.5  # floors: least amplitude of sinusoids and motions; sound crops show 1.8, by correlated noise
+_Candidate = tuple[Term, MixtureFit, float]
 """A term, the fit with it, and the evidence that it gains [nats]."""
 
 
@@ -79,19 +79,19 @@ class _SearchState:
         return self.gain - (self.taken[-1].gain if self.moves else 0.0)
 
     def may_pass(self, best: _SearchState) -> bool:
-        """Return whether more terms, each gaining less than the last, may explain more than another that ended."""
+        """Return whether further terms, none gaining more than the last, may pass another that ended."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
-    def adds_to(self, best: _SearchState, beside: list[_Tried]) -> bool:
+    def adds_to(self, best: _SearchState, beside: list[_Candidate]) -> bool:
         """Return whether its last term gains as much beside the best: it is no rival then."""
         last, one = self.taken[-1], self.taken[-1].term
         same = [row.name for row in self.taken[:-1]] == [row.name for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].NAME == one.NAME and not row[0].differs(one)]
         return same and max(gains, default=0.0) > last.gain - SURE
 
-    def added(self, tried: list[_Tried]) -> _SearchState:
-        """Return the state with the first of the terms tried; the others are its rivals."""
+    def added(self, tried: list[_Candidate]) -> _SearchState:
+        """Return the state with the best of the terms tried, of nearly equal parts of an image the smaller."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
         one, made, gain = min(same, key=lambda row: row[0].share(self.seen))  # of two as good, the smaller part
@@ -109,7 +109,7 @@ class _SearchState:
     def without_noise(self) -> _SearchState:
         """Return the state with the first terms alone, where correlated noise explains as much as all after them."""
         for n, row in enumerate(self.taken):
-            if sum(one.gain for one in self.taken[n:]) <= _by_neighbours(row.before):
+            if sum(one.gain for one in self.taken[n:]) <= _noise_evidence(row.before):
                 return _SearchState(row.before, row.before.base, self.taken[:n])
         return self
 
@@ -118,7 +118,7 @@ class _SearchState:
         more = len(best.taken) - len(self.taken)
         if self.moves or best.moves or more < 0:
             return False
-        return best.gain - self.gain <= (_by_neighbours(self.seen) if more else 0.0)
+        return best.gain - self.gain <= (_noise_evidence(self.seen) if more else 0.0)
 
     def other_views(self, states: list[_SearchState]) -> list[tuple[int, ...]]:
         """Return the other views that each term may be of: in states that explain as much, alike but for it."""
@@ -169,7 +169,7 @@ def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
     return np.asarray(linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma)
 
 
-def _by_neighbours(seen: Residuals) -> float:
+def _noise_evidence(seen: Residuals) -> float:
     """Return the evidence for noise that neighbours share, beside the terms taken [nats]."""
     found, linear = seen.base, seen.linear
     off, _ = off_from_right(linear, _residuals(found, linear, seen.extra), found.right)
@@ -221,7 +221,7 @@ class TermSearch:
 
     def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best combinations with one more term, and whether they are the last."""
-        best, grown, beside = states[0], list[_SearchState](), list[_Tried]()
+        best, grown, beside = states[0], list[_SearchState](), list[_Candidate]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
@@ -243,8 +243,8 @@ class TermSearch:
         kept = kept[:RIVALS]
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
-    def _tried(self) -> list[_Tried]:
-        """Return the terms that gain beside those taken, with their gains; the best first."""
+    def _tried(self) -> list[_Candidate]:
+        """Return the candidates beside the terms taken, with their gains, the best first; some may gain nothing."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in a pair more wrong matches at an end explain those cut there as well, and nothing stands out beside them
@@ -253,7 +253,7 @@ class TermSearch:
         made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         if (out or self.group) and not self._leaves_nothing(made):
             made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
-        least = self.floor * _SEEN
+        least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)
 
     def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
@@ -267,22 +267,22 @@ class TermSearch:
         out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
         return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, told, off)[:RIVALS]
 
-    def _leaves_nothing(self, made: list[_Tried]) -> bool:
+    def _leaves_nothing(self, made: list[_Candidate]) -> bool:
         """Return whether no residuals are significant beside the best term: it needs no rival then."""
         if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
             return False
         one, found, _ = made[0]
         return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
 
-    def _moving(self, out: list[Interval], made: list[_Tried]) -> list[_Tried]:
-        """Return moving ground, searched for once, and parts of images that hold the same observations."""
+    def _moving(self, out: list[Interval], made: list[_Candidate]) -> list[_Candidate]:
+        """Return moving-group candidates, searched for once, and parts of images that contain the same observations."""
         self.group = self.group or list[Term](MovingObjects.propose(self.seen, out[0]))
         found = self._with([], self.group)
         rows = self.seen.linear.taking_part
         members = [one for row in found if row[2] > SURE for one in self._members(row[1], rows)]
         return self._refined(self._with(found, members))
 
-    def _refined(self, made: list[_Tried]) -> list[_Tried]:
+    def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
         """Return the terms, best first, with ends, periods and lengths refined where these may gain most."""
         kinds = [kind for kind in TERMS.values() if kind.LOCAL]
         local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
@@ -313,11 +313,11 @@ class TermSearch:
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
         return proposed(seen, intervals, [], (LowFrequency,))
 
-    def _with(self, made: list[_Tried], more: list[Term]) -> list[_Tried]:
+    def _with(self, made: list[_Candidate], more: list[Term]) -> list[_Candidate]:
         """Return the terms tried so far and more, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
-    def _sorted(self, made: Iterable[tuple[Term, MixtureFit]]) -> list[_Tried]:
+    def _sorted(self, made: Iterable[tuple[Term, MixtureFit]]) -> list[_Candidate]:
         base = self.seen.base.evidence
         return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
 
@@ -328,7 +328,7 @@ class TermSearch:
             for shape in one.shapes(self.seen, self._fit):
                 again = shape.refined(self.seen, found, others)
                 # a term that stays as it was gains no more than another did
-                if better.evidence < found.evidence + LIKELIHOOD_TOLERANCE or not _stands(again, one):
+                if better.evidence < found.evidence + LIKELIHOOD_TOLERANCE or not _unchanged(again, one):
                     fitted = self._fit(again, base=found)
                     better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
@@ -343,12 +343,12 @@ class TermSearch:
         return fit_mixture(linear or seen.linear, extra, sigma, base or seen.base, one.group)
 
 
-def _stands(one: Term, before: Term) -> bool:
+def _unchanged(one: Term, before: Term) -> bool:
     """Return whether a term is where it was, with a prior about as wide."""
     return one.where == before.where and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
 
 
-def _rivals(tried: list[_Tried]) -> list[int]:
+def _rivals(tried: list[_Candidate]) -> list[int]:
     """Return the best terms of other kinds or views that are followed, and may win with some beside."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):

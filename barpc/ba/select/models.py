@@ -1,8 +1,8 @@
 """The model of a block: the simplest, unless the data choose another.
 
-Proposed one after the other: without a foreign camera, without moving ground, with terms in the images, splines and
-detectors, an affine in every image. Evidence is that of all observations; check tracks, drawn before, have a veto, and
-decide alone where no evidence is at hand (`is_admitted`).
+Hypotheses in their order: an RPC of another image; moving ground; terms in the images; splines and detector steps; an
+affine in every image. Evidence is that of all observations; check tracks, drawn before, have a veto, and decide alone
+where no evidence is at hand (`is_admitted`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class SelectedModel:
     found: Solution
     parts: Parts
     in_space_rms: float | None = None  # [px] of check tracks with the model in space, where an affine was chosen
-    foreign: ForeignCamera | None = None  # the view that it was solved without, or that may be wrong
+    foreign: ForeignCamera | None = None  # the view that was left out (one), or that may be wrong (several)
 
 
 def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
@@ -85,7 +85,7 @@ def _first(
 
 
 def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the model beside foreign cameras."""
+    """Return the model of the other hypotheses, once foreign cameras are decided."""
     given = options.model != AUTO or options.drift is not None or first.goes_on
     found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
     searched = first.problem.cameras.unknowns.geometric and not first.goes_on

@@ -25,7 +25,7 @@ Where = tuple[int, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of a block, linear in its unknowns, beside a fit with the terms taken so far."""
+    """Residuals of a block, linear in its unknowns, after the fit with the terms taken so far."""
 
     linear: Linear
     few: Linear  # a sample of its tracks, for a first choice
@@ -69,7 +69,7 @@ class Term:
         raise NotImplementedError
 
     def first_cost(self, residuals: Residuals) -> float:
-        """Return by how much it changes the sum of distances of a sample of tracks, over the noise."""
+        """Return the change of the summed residual norms of a sample of tracks, over the noise; below 0: it helps."""
         precision = self.sigma**-2.0
         return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
@@ -78,7 +78,7 @@ class Term:
         return [self]
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the term with the ends that single tie points tell and a prior as wide as its size.
+        """Return the term with its ends from single tie points, and a prior as wide as its estimates.
 
         `found` is a fit with it, its unknowns the last; `others` (2, K) are the displacements by the terms before [px].
         """
@@ -90,7 +90,7 @@ class Term:
         return float(np.clip(np.sqrt((moved**2).mean()), FIRST_SIGMA / TIMES, FIRST_SIGMA * TIMES))
 
     def amplitude(self, found: MixtureFit) -> float:
-        """Return its size [px] where a floor holds for it; infinite otherwise."""
+        """Return its amplitude [px] where a minimum applies to it; else infinity."""
         return np.inf
 
     def alternatives(self, residuals: Residuals, found: MixtureFit) -> list[Term]:
@@ -102,7 +102,7 @@ class Term:
         return None
 
     def size(self, residuals: Residuals, unknowns: Array) -> Array:
-        """Return its size (2,) for the record, col and row [px]: the root mean square over the image."""
+        """Return its size (2,) for the record, col and row [px]: the root mean square if not overridden."""
         of_view = residuals.linear.view == self.view
         displaced = np.einsum("cek,e->ck", self.columns[:, :, of_view], unknowns)
         return np.asarray(np.sqrt((displaced**2).mean(axis=1)))
@@ -113,7 +113,7 @@ class Term:
         return float(self.columns[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
     def differs(self, other: Term) -> bool:
-        """Return whether another term says something else: overlapping parts of one view's rows say the same."""
+        """Return whether another term is another hypothesis: overlapping intervals of one axis of a view are one."""
         if (self.NAME, self.view) != (other.NAME, other.view):
             return True
         if self.where is None or other.where is None:
