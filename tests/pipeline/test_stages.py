@@ -421,7 +421,7 @@ def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_pat
     single = ("adjustment", "block", "summary", "report")
     assert [now for now in told if now[0] in single] == [(name, done, 1) for name in single for done in (0, 1)]
     took = [stage["stage"] for stage in result.summary["stages"]]
-    assert took[-6:] == ["tie points", "adjustment", "block", "summary", "tables", "report"]
+    assert took[-7:] == ["tie points", "adjustment", "block", "summary", "pictures", "tables", "report"]
     told.clear()
     stages._report_progress(None, "x", 0)
     space = SimpleNamespace(stage=nullcontext)

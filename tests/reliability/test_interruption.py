@@ -313,7 +313,7 @@ def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog, whole,
     spent = time.process_time() - start
     stages = json.loads((tmp_path / "out/.barpc/state.json").read_text())["stages"]
     names = [stage["stage"] for stage in stages]
-    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, tables, report"
+    told = "inputs, fingerprints, tie points, adjustment, fit, write, verify, block, summary, pictures, tables, report"
     assert names == told.split(", ")
     told = sum(stage["cpu_seconds"] for stage in stages)
     assert share * spent < told <= spent + 0.0005 * len(names)  # of rounding

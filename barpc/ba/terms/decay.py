@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from barpc.ba.evidence.mixture import MixtureFit
+from barpc.ba.evidence.mixture import MixtureFit, first_guess
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.terms.step import ImagePart, Step, open_ended
 from barpc.ba.terms.term import Residuals, Term
@@ -19,6 +19,11 @@ LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # of the decay, over an image
 
 class Decaying(Term):
     """A term whose displacement decays exponentially along the rows."""
+
+    def first_cost(self, residuals: Residuals) -> float:
+        """Return the change of the summed residual norms of a sample of tracks, over the noise; below 0: it helps."""
+        precision = self.sigma**-2.0
+        return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
         """Return the term with the rate that its derivative asks for, and itself."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from barpc.ba.evidence.linearised import Linear
-from barpc.ba.evidence.mixture import Group, MixtureFit, first_guess
+from barpc.ba.evidence.mixture import Group, MixtureFit
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
 from barpc.ba.terms.moving_ground import GroundMotion, Motion, MovingGroup
@@ -67,11 +67,6 @@ class Term:
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
         """Return such terms for a significant interval."""
         raise NotImplementedError
-
-    def first_cost(self, residuals: Residuals) -> float:
-        """Return the change of the summed residual norms of a sample of tracks, over the noise; below 0: it helps."""
-        precision = self.sigma**-2.0
-        return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
         """Return the shapes to refine: its own, and those that a fit with derivatives suggests."""
