@@ -84,7 +84,10 @@ ITERATIONS = 100
 """Most iterations of a convergent procedure."""
 
 STANDS = 0.05
-"""Relative change at convergence."""
+"""Relative change at convergence of an estimate that others are iterated with."""
+
+CONVERGED = 1e-3
+"""Relative change at convergence of a single estimate."""
 
 SLIGHT = 1e-3
 """Negligible share of the observations."""

@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dtrtri
 
 from barpc.ba.evidence.linearised import Linear, TrackGroup
 from barpc.base.geodesy import CHUNK, Array
-from barpc.base.statistics import BACKFITTING, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
+from barpc.base.statistics import BACKFITTING, CONVERGED, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.scene import BoolArray, IntArray
 
 NEAR_LIMIT = 4.5  # log(wrong area / 2 pi sigma^2), at least: while the noise is large wrong ones lie no nearer
@@ -370,7 +370,7 @@ class Mixture:
         self.eps = np.clip((wrong + WRONG_SHARE_PRIOR[0]) / (self.count + WRONG_SHARE_PRIOR[1]), SLIGHT, 1.0 - SLIGHT)
         if self.group is not None:
             self._group(seen, noise, noise <= found)
-        stands = abs(np.log(noise / self.noise)) < SLIGHT
+        stands = abs(np.log(noise / self.noise)) < CONVERGED
         self.noise = noise
         return bool(stands)
 

@@ -17,7 +17,7 @@ from scipy.special import expit
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.structure import Structure
 from barpc.base.geodesy import Array, parts
-from barpc.base.statistics import FEW, ITERATIONS, LEVEL, MANY, OUTLIER, SLIGHT, STEPS, SURE, TRIALS
+from barpc.base.statistics import CONVERGED, FEW, ITERATIONS, LEVEL, MANY, OUTLIER, STEPS, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.curve import cross
 
@@ -68,7 +68,7 @@ def _mixture(z: Array) -> tuple[float, float, float]:
         low = -high * (1.0 - part) / part
         rest = whole - part * low**2 - (1.0 - part) * high**2
         before, square = square, max(rest, np.finfo(float).eps * whole)  # below it is rounding
-        if abs(square - before) < SLIGHT**2 * whole:
+        if abs(square - before) < CONVERGED**2 * whole:
             break
     sigma, apart = np.sqrt(square), float(high - low)
     groups = ((part, low), (1.0 - part, high))

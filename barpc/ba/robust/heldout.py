@@ -20,7 +20,7 @@ from barpc.ba.robust.weights import Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.base.statistics import BEST, CRITICAL, FEWEST, ITERATIONS, MANY, SLIGHT, STEPS, SURE, SURELY
+from barpc.base.statistics import BEST, CONVERGED, CRITICAL, FEWEST, ITERATIONS, MANY, STEPS, SURE, SURELY
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
@@ -148,7 +148,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
         right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
         of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
         found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
-        stands = np.abs(found - variance) < SLIGHT * variance
+        stands = np.abs(found - variance) < CONVERGED * variance
         variance = np.where(moves, found, variance)
         wrong = np.where(moves, (WRONG_SHARE_PRIOR[0] + count - of_right) / (WRONG_SHARE_PRIOR[1] + count), wrong)
         moves &= ~stands

@@ -26,7 +26,7 @@ from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
-from barpc.base.statistics import ITERATIONS, ROUNDING, SLIGHT
+from barpc.base.statistics import CONVERGED, ITERATIONS, ROUNDING
 from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
@@ -188,7 +188,7 @@ def _levenberg_marquardt(
             continue
         reduced = problem.reduce(state.params, state.points, weight)
         # a cost does not fall any more where so little is promised, or what is tolerated and no damping makes it fall
-        if gain <= TOLERANCE * (SLIGHT if damping < 1e8 else 1.0) * state.cost:
+        if gain <= TOLERANCE * (CONVERGED if damping < 1e8 else 1.0) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
         if damping >= 1e8:
             raise AdjustError(f"no step lowers the cost {state.cost:.6g}: the solution is not usable")

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
-from barpc.base.statistics import FEW, MANY, RIVALS, SAMPLE, SURELY, robust_spread
+from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
@@ -391,7 +391,7 @@ class _PairSearch:
 
         From some row on, or column, an image may lie elsewhere.
         """
-        for _ in range(RIVALS if self._matcher.detects and len(tight) >= FEW else 0):
+        for _ in range(STEPS if self._matcher.detects and len(tight) >= FEW else 0):
             peak = self._beside(tight)
             more = NO_MATCHES if peak is None else self.trusted(peak.prediction, _LOOSE_FALSE_SHARE)[0]
             both = tight.and_others(more)
