@@ -245,7 +245,7 @@ class _Warp:
             rpcs=self.camera.rpc.crop(int(part.col_off), int(part.row_off)).to_rasterio(),
             src_crs=_WGS84,
             src_nodata=None if whole else none,
-            dst_transform=self.place * Affine.translation(block.col_off, block.row_off),
+            dst_transform=self.place @ Affine.translation(block.col_off, block.row_off),
             dst_crs=self.crs,
             dst_nodata=none,
             resampling=Resampling.cubic,
@@ -266,9 +266,9 @@ def _write_terrain(path: Path, camera: Camera, terrain: Dem, levels: tuple[float
     if grid.crs.is_geographic:  # columns run on where the DEM begins
         col = col[0] + (ring[:, 0] - ring[0, 0]) * grid.to_pixel.a
     (left, top), (right, bottom) = (np.floor([col.min(), row.min()]) - 1, np.ceil([col.max(), row.max()]) + 2)
-    place = to_map * Affine.translation(left, top)
+    place = to_map @ Affine.translation(left, top)
     if grid.crs.is_geographic:  # and lie where the image is, by whole turns
-        place = Affine.translation(360.0 * np.rint((ring[0, 0] - place.c) / 360.0), 0.0) * place
+        place = Affine.translation(360.0 * np.rint((ring[0, 0] - place.c) / 360.0), 0.0) @ place
     size, whole = (int(right - left), int(bottom - top)), pyproj.CRS(grid.crs.to_wkt())
     flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d().to_wkt()
     what = {"dtype": "float32", "nodata": -32768.0, "crs": flat, "transform": place, "tiled": True}
