@@ -116,7 +116,8 @@ class _SearchState:
     def replaces(self, best: _SearchState) -> bool:
         """Return whether it explains as much as another with fewer terms, but for correlated noise, or with as many."""
         more = len(best.taken) - len(self.taken)
-        if self.moves or best.moves or more < 0:
+        followed = all(row.term.FOLLOWED for row in self.taken)  # others leave their image as it is
+        if not followed or best.moves or more < 0:
             return False
         return best.gain - self.gain <= (_noise_evidence(self.seen) if more else 0.0)
 
