@@ -76,7 +76,7 @@ _NEVER: dict[str, Any] = {
     "transients": ("terms.transient.Transient.propose", lambda *_: []),
     "low frequencies": ("terms.low_frequency.LowFrequency.propose", lambda *_: []),
     "sinusoids": ("select.beam.find_periods select.anomalies.find_periods", lambda *_: []),
-    "moving objects": ("terms.moving_objects.MovingObjects.propose", lambda *_: []),
+    "moving objects": ("terms.moving_objects.MovingObjects.of", lambda *_: []),
 }
 """A mechanism -> the functions of `barpc.ba` that it stands in, and what they are replaced by."""
 _BEAM = "barpc.ba.select.beam"

@@ -34,13 +34,13 @@ _COEFFICIENT_SIGMA = (
 )
 STEP_SIGMA = 1.0  # px: the same of a step between detectors, which are aligned and measured before a launch
 CURVE_COLUMNS = 400  # at which a curve is looked at
-# px: interior orientation is calibrated in flight to 0.05-0.1 px RMS (SPOT 5 HRS and HRG, Gachet 2004, Int. Arch.
-# Photogramm. XXXV-B1, whose curves before it reach 0.4 px) or to "better than 0.3 px" (ZY-1 02C, Yang and Wang 2013,
-# J. Remote Sens. 17(5)): the upper one, as the sensor may be any. 0.42 leaves 0.3 of a line of 30,000 columns once a
-# constant and a slope are taken off
+# px: interior orientation is calibrated in flight to 0.05-0.1 px RMS (SPOT 5 HRS and HRG: Gachet 2004, "SPOT5 in-flight
+# commissioning: inner orientation of HRG and HRS instruments", Int. Arch. Photogramm. XXXV-B1; its curves before that
+# reach 0.4 px) or to "better than 0.3 px" (ZY-1 02C: Yang and Wang 2013, J. Remote Sens. 17(5)): the upper one, as the
+# sensor may be any. 0.42 leaves 0.3 of a line of 30,000 columns once a constant and a slope are taken off
 _PRIOR_SIGMA = 0.42
-# px: detectors of focal planes have 1,000 (WorldView) to 6,000 columns (Pleiades); the steps between them make most of
-# a distortion's differences between columns
+# px: half of the widest chips in use (Pleiades: five of 6,000 columns); steps between chips make most of a distortion's
+# differences between columns
 _PRIOR_LENGTH = 3000.0
 
 

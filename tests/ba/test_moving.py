@@ -15,7 +15,6 @@ from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence.linearised import linearise
 from barpc.ba.evidence.mixture import Group, Mixture, fit_mixture
 from barpc.ba.evidence.mixture import moving as moving_of
-from barpc.ba.evidence.scan import Interval
 from barpc.ba.select.parts import Parts
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
@@ -142,7 +141,7 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     seen: Any = SimpleNamespace(
         linear=linear, ground=ground, base=fit_mixture(linear), extra=nothing, sigma=np.zeros(0)
     )
-    (one,) = MovingObjects.propose(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True))
+    (one,) = MovingObjects.of(seen)
     group = one.group
     assert group is not None
     assert (one.NAME, one.view, one.columns.shape[1], len(one.sigma)) == (
@@ -204,7 +203,7 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
 def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("barpc.ba.terms.moving_ground.proposal", lambda *_: None)
     seen: Any = SimpleNamespace(linear=SimpleNamespace(view=np.zeros(3, dtype=int)), ground=0, base=0, extra=0, sigma=0)
-    assert MovingObjects.propose(seen, Interval(0, 0, 0.0, 1.0, 9.0, 0.5, 0.0, True)) == []
+    assert MovingObjects.of(seen) == []
 
 
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:

@@ -253,7 +253,7 @@ class TermSearch:
         made = self._with([], self._worth_more(list(proposed(seen, out, periods))))
         made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         if (out or self.group) and not self._leaves_nothing(made):
-            made = self._sorted([row[:2] for row in (*made, *self._moving(out, made))])
+            made = self._sorted([row[:2] for row in (*made, *self._moving())])
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)
 
@@ -275,9 +275,9 @@ class TermSearch:
         one, found, _ = made[0]
         return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
 
-    def _moving(self, out: list[Interval], made: list[_Candidate]) -> list[_Candidate]:
+    def _moving(self) -> list[_Candidate]:
         """Return moving-group candidates, searched for once, and parts of images that contain the same observations."""
-        self.group = self.group or list[Term](MovingObjects.propose(self.seen, out[0]))
+        self.group = self.group or list[Term](MovingObjects.of(self.seen))
         found = self._with([], self.group)
         rows = self.seen.linear.taking_part
         members = [one for row in found if row[2] > SURE for one in self._members(row[1], rows)]

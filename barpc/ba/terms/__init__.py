@@ -31,7 +31,7 @@ def proposed(
     """Yield the terms that intervals and periods propose; those of a whole image, or of the block, once."""
     for period in periods:
         yield Sinusoid.of(residuals, period)
-    kinds = [kind for kind in TERMS.values() if kind.BY_INTERVAL and kind not in without]
+    kinds = [kind for kind in TERMS.values() if kind not in without]
     known = set[tuple[object, ...]]()
     for interval in intervals:
         for kind in kinds:

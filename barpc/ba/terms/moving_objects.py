@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from barpc.ba.evidence.mixture import MixtureFit
-from barpc.ba.evidence.scan import Interval
 from barpc.ba.terms import moving_ground
 from barpc.ba.terms.term import Finding, Residuals, Term
 from barpc.base.geodesy import Array
@@ -23,11 +22,9 @@ class MovingObjects(Term):
         "{share:.0f} % of the tie points{side} move together ({cause}), by {metres:.2g} m from {between[0]} to "
         "{between[1]} apart from an effect of height, and were excluded{control}{larger}"
     )
-    OF_BLOCK: ClassVar[bool] = True
-    BY_INTERVAL: ClassVar[bool] = False
 
     @classmethod
-    def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
+    def of(cls, residuals: Residuals) -> list[Self]:
         """Return the most likely group."""
         linear = residuals.linear
         one = moving_ground.proposal(linear, residuals.ground, residuals.base, residuals.extra, residuals.sigma)

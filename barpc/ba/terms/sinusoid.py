@@ -23,7 +23,6 @@ class Sinusoid(Term):
         "rows of {image} have a sinusoidal displacement of {least}{size:.2f} px with a period of {period:.0f} rows"
     )
     FOLLOWED: ClassVar[bool] = True
-    BY_INTERVAL: ClassVar[bool] = False
 
     @classmethod
     def of(cls, residuals: Residuals, found: Period) -> Self:

@@ -56,7 +56,6 @@ class Term:
     FOLLOWED: ClassVar[bool] = False  # whether it is estimated with the cameras and corrected
     LOCAL: ClassVar[bool] = False  # whether it is of a part of an image
     OF_BLOCK: ClassVar[bool] = False  # whether it is of all images
-    BY_INTERVAL: ClassVar[bool] = True  # whether significant intervals of an image propose it
 
     @classmethod
     def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
@@ -65,8 +64,8 @@ class Term:
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return such terms for a significant interval."""
-        raise NotImplementedError
+        """Return such terms for a significant interval; none for a kind that others propose."""
+        return []
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
         """Return the shapes to refine: its own, and those that a fit with derivatives suggests."""
