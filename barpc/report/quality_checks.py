@@ -127,8 +127,7 @@ def _of_camera(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
         yield "odd", {"scale": prior.scale[i], "either": either}
     if is_smooth(i, adjustment):
         along = "along the rows" if smooth.by_row[i] > 0.5 else "over the image"
-        size = max(smooth.rms[i], smooth.shared[i])
-        yield "smooth", {"size": size, "along": along, "why": _why_smooth(adjustment)}
+        yield "smooth", {"size": smooth.of_cameras()[i], "along": along, "why": _why_smooth(adjustment)}
 
 
 def is_smooth(i: int, adjustment: Adjustment) -> bool:

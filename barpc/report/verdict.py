@@ -10,6 +10,7 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.apart import FOREIGN_CAMERA
+from barpc.ba.constraints.gauge import MOTIONS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import FEW, SURE, SURELY
@@ -41,6 +42,7 @@ from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, med
 TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras that are farther off than stated by more than this factor need a look
+_SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _LOOKED_AT = "The image was looked at"
@@ -116,14 +118,8 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
             f"The cameras are {common:.1f} times farther off than stated: their standard deviations were widened, and "
             "what is known of the scene's place with them."
         )
-    if found.in_space_rms is not None:
-        tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (slice(3, 5), slice(7, 10)))
-        yield (
-            f"Rotations and translations leave {found.in_space_rms:.3f} px of tie points that took no part; an affine "
-            f"in each image leaves {median(found.held_out_rms):.3f} px and was taken: images that were turned, "
-            "resampled or cropped otherwise than their RPCs say, or RPCs of other images. Its tilts are known to "
-            f"{tilts} (east, north) only, its twist and bending to {bends} (twist, east, north)."
-        )
+    if _is_bent(found):
+        yield from _of_image_model(found)
     if found.apart is not None and not found.apart.clear:
         what = "RPC, or most tie points of one image," if found.apart.look.as_stated else "RPC"
         yield (
@@ -131,6 +127,25 @@ def _of_cameras(found: Adjustment) -> Iterator[str]:
             "any one of these images the others agree, with all they do not. The tie points do not tell which: check "
             "the RPCs, or add an image."
         )
+
+
+def _is_bent(found: Adjustment) -> bool:
+    """Return whether heights at the scene's edge are known worse by its tilts, twist and bending than by its place."""
+    return bool(found.gauge.motion_sigma[_SHAPE].max() > found.gauge.sigma[2])
+
+
+def _of_image_model(found: Adjustment) -> Iterator[str]:
+    """Say that a model in the image was taken, and what it leaves open of the scene's shape."""
+    if found.in_space_rms is None:
+        return
+    tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (_SHAPE[:2], _SHAPE[2:]))
+    yield (
+        f"Rotations and translations leave {found.in_space_rms:.3f} px of tie points that took no part; an affine "
+        f"in each image leaves {median(found.held_out_rms):.3f} px and was taken: images that were turned, "
+        "resampled or cropped otherwise than their RPCs say, or RPCs of other images. At "
+        f"{metres(found.gauge.radius)} from the scene's middle its heights are known to {tilts} by its tilts (east, "
+        f"north), over the scene to {bends} by its twist and bending (twist, east, north)."
+    )
 
 
 def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
@@ -247,6 +262,8 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they moved it by {enu(heights.motion)}."
         )
+    if not _is_bent(run.adjustment):
+        yield from _of_image_model(run.adjustment)
     yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:

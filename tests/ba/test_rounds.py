@@ -276,6 +276,7 @@ def passes(
                 sigma=np.ones(10_000),
                 weight=lambda use, noise, misfit: use / (noise * (1.0 + misfit**2)),
                 told_by=lambda weight: weight,
+                mean_freedom=lambda use: 2.0,
             )
             self.misfit = misfit[0]
             self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.robust.systematic_residuals import SPLINES, Smooth, SmoothTest
+from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.structure import make_structure
 from barpc.sensor.image_corrections import bsplines
 from tests import distributions as stats
@@ -226,3 +231,21 @@ def test_terms_that_observations_hardly_tell_apart_stay_small() -> None:
             smooth._kept[SPLINES + power - 1] = smooth._kept[SPLINES] ** power  # type: ignore[index]
         found = smooth.part(noise(smooth, 0.1), np.ones(400))
         assert np.sqrt((found**2).mean()) < 0.03
+
+
+@pytest.mark.parametrize("views", [2, 3, 6])
+def test_of_an_error_of_a_camera_points_take_a_part_that_is_said_too(views: int) -> None:
+    """Observations of n views tell 2 n - 3 of 2 n numbers of their cameras' errors; the sign and size by hand."""
+    tracks = 50
+    view, point = np.repeat(np.arange(views), tracks), np.tile(np.arange(tracks), views)
+    structure = make_structure(view, point, views, tracks)
+    problem: Any = SimpleNamespace(
+        structure=structure, point_prior=None, cameras=SimpleNamespace(unknowns=SimpleNamespace(waves=None))
+    )
+    observations = Observations(problem, np.ones(len(view)), 0.02, np.ones(len(view), dtype=bool))
+    redundancy = 0.5 * observations.mean_freedom(np.ones(len(view), dtype=bool))
+    np.testing.assert_allclose(redundancy, (2 * views - 3) / (2 * views))
+    ones = np.ones(views)
+    tested = SmoothTest(0.1 * ones, ones, ones, 0.2 * ones, redundancy)
+    np.testing.assert_allclose(tested.of_cameras(), 0.2 / np.sqrt((2 * views - 3) / (2 * views)))
+    np.testing.assert_allclose(replace(tested, rms=0.3 * ones, redundancy=1.0).of_cameras(), 0.3)

@@ -378,23 +378,16 @@ def test_other_priors_of_single_views_are_an_update_of_what_is_known(n: int) -> 
     around = _Around(problem, minimise(problem, state, weight, "sparse", 1e-10))
     wider = problem.camera_prior.sigma * np.random.default_rng(0).uniform(1.0, 50.0, (n, 1))
     known, prior = around.posterior(problem.camera_prior), problem.camera_prior
-    first = known
-    for views in ([0], [1], [n // 2, n - 1]):
-        evidence, offset, blocks = known.alone(replace(prior, sigma=wider))
-        was, prior = prior, replace(prior, sigma=np.where(np.isin(np.arange(n), views)[:, None], wider, prior.sigma))
-        known, exact = known.under(prior), around.posterior(prior)
-        assert known.evidence - first.evidence == pytest.approx(exact.evidence - first.evidence, abs=1e-6)
-        np.testing.assert_allclose(known.offset, exact.offset, atol=1e-6)
-        np.testing.assert_allclose(known.blocks, exact.blocks, rtol=1e-6, atol=1e-9 * np.abs(exact.blocks).max())
-        if len(views) == 1:
-            assert evidence[views[0]] == pytest.approx(known.evidence, rel=1e-9)
-            np.testing.assert_allclose(offset[views], known.offset[views], atol=1e-6)
-            diagonals = (one[views].diagonal(axis1=1, axis2=2) for one in (blocks, exact.blocks))
-            np.testing.assert_allclose(*diagonals, rtol=1e-6)
-        if views == [1]:
-            assert known.evidence == pytest.approx(around.posterior(was).evidence, abs=1e-6)
-    assert len(known.updates) == 2
-    assert exact.evidence > first.evidence + 20.0
+    evidence, offset, blocks = known.alone(replace(prior, sigma=wider))
+    for view in (0, 1, n // 2, n - 1):
+        alone = replace(prior, sigma=np.where(np.arange(n)[:, None] == view, wider, prior.sigma))
+        exact = around.posterior(alone)
+        assert evidence[view] - known.evidence == pytest.approx(exact.evidence - known.evidence, abs=1e-6)
+        np.testing.assert_allclose(offset[view], exact.offset[view], atol=1e-6)
+        np.testing.assert_allclose(blocks[view], exact.blocks[view], rtol=1e-6, atol=1e-9 * np.abs(exact.blocks).max())
+        if view == 1:
+            assert evidence[view] == pytest.approx(known.evidence, abs=1e-6)
+    assert (evidence > known.evidence + 20.0).any()
 
 
 def adjusted(block: SimulatedBlock, **options: Any) -> Adjustment:

@@ -18,6 +18,7 @@ from barpc.report import verdict as verdicts
 from barpc.report.outcome import Run
 from barpc.report.quality_checks import control_reasons, enu
 from barpc.report.summary.views import FitEntry
+from barpc.report.summary.words import metres
 from barpc.report.verdict import block_verdict, view_status
 from barpc.scene import Tracks
 from barpc.tie.detail import Gap
@@ -42,7 +43,8 @@ def adjusted(**fields: Any) -> Any:
         "options": SimpleNamespace(drift=None, fixed=(), min_convergence=1.0, dem_sigma=2.0),
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
-                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1])),
+                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1]),
+                                 radius=800.0),
         "apart": None, "altimetry": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
@@ -299,17 +301,22 @@ def test_tie_points_that_scatter_are_said_to(noise, said_of):
 
 
 def test_an_affine_in_the_image_says_what_it_was_better_than():
-    gauge = adjusted().gauge
-    found = reasons(adjusted(in_space_rms=0.95, held_out_rms=np.array([0.1, 0.3, 0.2]), gauge=gauge))
-    (line,) = found
-    assert line.startswith(
-        "Rotations and translations leave 0.950 px of tie points that took no part; an affine in each"
-    )
-    assert "leaves 0.200 px and was taken" in line
-    assert line.endswith(
-        "Its tilts are known to 40.0 cm, 5.0 m (east, north) only, its twist and bending to 80.0 cm, 9.0 m, 10.0 cm "
-        "(twist, east, north)."
-    )
+    """A reservation where that leaves heights at the edge less known than the place, 5 m; else said only."""
+    known = {"in_space_rms": 0.95, "held_out_rms": np.array([0.1, 0.3, 0.2])}
+    for tilt, bend, is_reason in ((4.9, 4.9, False), (5.1, 0.1, True), (0.1, 5.1, True)):
+        gauge = SimpleNamespace(**vars(adjusted().gauge))
+        gauge.motion_sigma = np.array([1.0, 2.0, 5.0, 0.4, tilt, 6.0, 7.0, 0.8, bend, 0.1])
+        found = adjusted(**known, gauge=gauge)
+        (line,) = [one for one in said(run_of(found)) if "affine" in one]
+        assert reasons(found) == [line] * is_reason
+        assert line.startswith(
+            "Rotations and translations leave 0.950 px of tie points that took no part; an affine in each"
+        )
+        assert "leaves 0.200 px and was taken" in line
+        assert line.endswith(
+            f"At 800.0 m from the scene's middle its heights are known to 40.0 cm, {metres(tilt)} by its tilts (east, "
+            f"north), over the scene to 80.0 cm, {metres(bend)}, 10.0 cm by its twist and bending (twist, east, north)."
+        )
 
 
 def test_two_groups_are_not_said_again_of_an_odd_image():

@@ -41,6 +41,11 @@ class CameraPrior:
     sight: Array | None = None  # (N, 2, q) orthonormal: turn about and move along the line of sight; zeros: none
     wider: Array | float = 1.0  # (N, 1, 1) by how much their standard deviations are
 
+    @property
+    def along(self) -> Array:
+        """The same (N, 2, q), zeros where there is none."""
+        return np.zeros((len(self.sigma), 2, self.sigma.shape[1])) if self.sight is None else self.sight
+
     def residual(self, params: Array) -> Array:
         """Return the whitened residuals (N, q) of unknowns (N, q)."""
         return self.whitened(params - self.mean)
@@ -48,14 +53,13 @@ class CameraPrior:
     def whitened(self, values: Array) -> Array:
         """Return changes of unknowns (N, q) or (N, q, m) over their standard deviations."""
         flat = values.reshape(*self.sigma.shape, -1) / self.sigma[..., None]
-        if self.sight is not None and np.any(self.wider != 1.0):
-            flat -= (1.0 - 1.0 / self.wider) * (np.swapaxes(self.sight, 1, 2) @ (self.sight @ flat))
+        if np.any(self.wider != 1.0):
+            flat -= (1.0 - 1.0 / self.wider) * (np.swapaxes(self.along, 1, 2) @ (self.along @ flat))
         return flat.reshape(values.shape)
 
     def loosest(self) -> Array:
         """Return standard deviations (N, q) of independent unknowns that hold them in no direction more than these."""
-        along = np.zeros_like(self.sigma) if self.sight is None else self.sight.any(axis=1)
-        return np.where(along, np.reshape(self.wider, (-1, 1)), 1.0) * self.sigma
+        return np.where(self.along.any(axis=1), np.reshape(self.wider, (-1, 1)), 1.0) * self.sigma
 
     def precision(self) -> Array:
         """Return the information matrices (N, q, q)."""

@@ -156,7 +156,8 @@ class Rounds:
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes >= TRIED or (settled and (same or not self.robust)):
-            smooth = self.smooth.test_neighbours(smooth, self.residual, self.use)
+            redundancy = 0.5 * self.observations.mean_freedom(self.use)
+            smooth = self.smooth.test_neighbours(smooth, self.residual, self.use, redundancy)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, self.learnt, exact=True)[1]
             noise = self.noise if self.options.estimate_noise else 1.0

@@ -102,6 +102,12 @@ class SmoothTest:
     # [px]: waves and steps that are too fine for the smooth part are in it, too. 0 where it is not
     # significant
     shared: Array
+    # (N,) part of the square of a camera's error that its residuals show: points, and heights, take the rest
+    redundancy: Array | float = 1.0
+
+    def of_cameras(self) -> Array:
+        """Return the errors (N,) of the cameras themselves that residuals show in part: smooth, or shared [px]."""
+        return np.maximum(self.rms, self.shared) / np.sqrt(self.redundancy)
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
         """Return the views (N,) with a smooth part above `least` [px] that is significant."""
@@ -182,8 +188,10 @@ class Smooth:
             rms[v] = np.sqrt(max(explained - terms * scatter, 0.0) / float(precision[rows].sum()))
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
-    def test_neighbours(self, tested: SmoothTest, residual: Array, use: BoolArray) -> SmoothTest:
-        """Test the same with what neighbours share, in views in which something was fitted."""
+    def test_neighbours(
+        self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
+    ) -> SmoothTest:
+        """Test the same with what neighbours share, in views in which something was fitted, of a redundancy (N,)."""
         kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
         shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
         last = view[1:]
@@ -200,7 +208,7 @@ class Smooth:
             scatter = np.sqrt(self._sums(last, (product - mean[last]) ** 2 * pairs) / count)
             sure = mean > OUTLIER * scatter / np.sqrt(np.maximum(told, 1.0))
             shared = np.maximum(shared, np.sqrt(np.where(sure, mean, 0.0)))
-        return replace(tested, shared=shared)
+        return replace(tested, shared=shared, redundancy=redundancy)
 
     def _sums(self, view: IntArray, values: Array) -> Array:
         return np.asarray(np.bincount(view, values, self.structure.num_views))

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg as la
 from scipy.special import chdtrc, gammaincinv
 
 from barpc.ba.parameters.priors import NOISE_FLOOR, CameraPrior, states_accuracy
@@ -28,20 +27,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.statistics import (
-    CHANCE,
-    GROSS,
-    ITERATIONS,
-    KEPT,
-    LEVEL,
-    ROUNDING,
-    SMALL,
-    STANDS,
-    STATED_FREEDOM,
-    STEPS,
-    SURE,
-    TIMES,
-)
+from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
 from barpc.scene import BoolArray, IntArray, View
 
 logger = logging.getLogger(__name__)
@@ -107,14 +93,14 @@ class _Around:
     def posterior(self, prior: CameraPrior) -> _Posterior:
         """Return what is known of every view under other priors."""
         evidence, params, covariance = self.under(prior)
-        return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior, covariance)
+        return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior)
 
 
 def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
     """Return the logarithms (N,) of the determinants of proper priors on free unknowns; others add nothing."""
     sigma = prior.sigma
     use = free.reshape(sigma.shape) & np.isfinite(sigma)
-    along = 0.0 if prior.sight is None else ((prior.sight**2 * use[:, None]) * np.log(prior.wider)).sum(axis=(1, 2))
+    along = (prior.along**2 * use[:, None] * np.log(prior.wider)).sum(axis=(1, 2))
     return np.asarray(2.0 * (np.log(sigma, where=use, out=np.zeros(sigma.shape)).sum(axis=1) + along))
 
 
@@ -127,14 +113,6 @@ class _Posterior:
     offset: Array  # (N, q) unknowns minus their priors' means
     blocks: Array  # (N, q, q) covariance of every view's unknowns
     prior: CameraPrior
-    start: Covariance  # of all unknowns, before the updates
-    # of every update the covariance (N, q, m) with the m unknowns whose priors changed, and M (m, m)
-    updates: tuple[tuple[Array, Array], ...] = ()
-
-    def _more_volume(self, prior: CameraPrior) -> Array:
-        """Return what the logarithms of the priors' variances (N,) grow by."""
-        new, old = (_log_variance(one, self.around.problem.free) for one in (prior, self.prior))
-        return np.asarray(new - old)
 
     def alone(self, prior: CameraPrior) -> tuple[Array, Array, Array]:
         """Return evidence (N,), offset (N, q) and covariance (N, q, q) of every view if its prior alone were another.
@@ -148,43 +126,11 @@ class _Posterior:
         pulled = gain @ self.offset[:, :, None]
         cost = (self.offset[:, :, None] * pulled).sum(axis=(1, 2))
         sign, volume = np.linalg.slogdet(system)
-        volume += self._more_volume(prior)
+        new, old = (_log_variance(one, self.around.problem.free) for one in (prior, self.prior))
+        volume += new - old
         offset = self.offset - (self.blocks @ pulled)[:, :, 0]
         evidence = np.where(sign > 0, self.evidence - 0.5 * (cost + volume), -np.inf)
         return evidence, offset, self.blocks - self.blocks @ gain @ self.blocks
-
-    def under(self, prior: CameraPrior) -> _Posterior:
-        """Return the same under other priors, which differ in few views from those that it has."""
-        change = self.around.change(self.prior, prior)
-        views = np.flatnonzero(change.any(axis=(1, 2)))
-        if not len(views):
-            return replace(self, prior=prior)
-        rows = (views[:, None] * change.shape[1] + np.arange(change.shape[1])).ravel()
-        if (len(self.updates) + 1) * self.offset.size * len(rows) > 30 * KEPT:  # 240 MB
-            return self.around.posterior(prior)
-        columns, more = self._columns(rows), la.block_diag(*change[views])
-        own, offset = columns.reshape(-1, len(rows))[rows], self.offset[views].ravel()
-        system = np.eye(len(rows)) + more @ own
-        gain = np.linalg.solve(system, more)
-        pulled = gain @ offset
-        volume = np.linalg.slogdet(system)[1] + self._more_volume(prior).sum()
-        return replace(
-            self,
-            evidence=self.evidence - 0.5 * float(offset @ pulled + volume),
-            offset=self.offset - columns @ pulled,
-            blocks=self.blocks - columns @ gain @ columns.swapaxes(1, 2),
-            prior=prior,
-            updates=(*self.updates, (columns, gain)),
-        )
-
-    def _columns(self, rows: IntArray) -> Array:
-        """Return the covariance (N, q, m) of all unknowns with m of them."""
-        unit = np.zeros((self.offset.size, len(rows)))
-        unit[rows, np.arange(len(rows))] = 1.0
-        out = self.start.solve(unit).reshape(*self.offset.shape, -1)
-        for columns, gain in self.updates:
-            out -= columns @ (gain @ columns.reshape(-1, columns.shape[2])[rows].T)
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,11 +176,6 @@ class Variances:
     def learn_waves(self) -> bool:
         """Whether there are splines or steps, whose sizes are always learnt."""
         return self.unknowns.waves is not None
-
-    @cached_property
-    def _sight(self) -> Array:
-        n, q = self.given.sigma.shape
-        return np.zeros((n, 2, q)) if self.given.sight is None else self.given.sight
 
     @cached_property
     def _kinds(self) -> Array:
@@ -283,7 +224,7 @@ class Variances:
         covariance = minimum.covariance(problem.free)
         scale, wide, odd = np.ones(len(params)), np.ones(1 + self._degrees), np.zeros(len(params), dtype=bool)
         prior = self._prior(scale, wide)
-        if around.small and not same_prior(now, prior, ROUNDING):
+        if around.small and self.learns:
             _, params, covariance = around.under(prior)
         known = self._known(covariance, prior if around.small else now, exact)
         total, freedom = (float(x) for x in self._sums(params, known)[0])
@@ -393,7 +334,7 @@ class Variances:
         """Return the share (N, q + 2) that covariances (N, q, q) leave to the observations of what priors say."""
         use = free.reshape(prior.sigma.shape) & np.isfinite(prior.sigma)
         inverse = np.where(use, 1.0 / prior.sigma, 0.0)
-        sight = self._sight * use[:, None]
+        sight = prior.along * use[:, None]
         whitened = inverse[:, :, None] * blocks * inverse[:, None]
         along = ((sight @ whitened) * sight).sum(axis=2)
         rest = np.eye(whitened.shape[1]) - np.swapaxes(sight, 1, 2) @ sight
@@ -405,8 +346,8 @@ class Variances:
     def _by_view(self, params: Array, known: Array) -> Array:
         """Return the squared unknowns of every view and kind over the variances given, their freedom (2, N, 2 + D)."""
         off = (params - self.given.mean) / self.given.sigma
-        along = (self._sight @ off[..., None])[..., 0]
-        seen = np.hstack([off - (along[:, None] @ self._sight)[:, 0], along])
+        along = (self.given.along @ off[..., None])[..., 0]
+        seen = np.hstack([off - (along[:, None] @ self.given.along)[:, 0], along])
         return np.stack([np.where(known > 0, seen**2, 0.0), known]) @ self._kinds.T
 
     def _sums(self, params: Array, known: Array) -> Array:
@@ -428,11 +369,13 @@ class Variances:
         n, free = len(params), around.problem.free
         total, freedom = self._by_view(params, known)[..., 0]
         usual = np.full(n, self._common(total, freedom, False))
-        for _ in range(STEPS if around.small and n > 2 else 0):  # under wider priors corrections are larger
-            there = around.posterior(self._prior(usual, wide))
+        for _ in range(ITERATIONS if around.small and n > 2 else 0):  # under wider priors corrections are larger
+            last, there = usual[0], around.posterior(self._prior(usual, wide))
             shares = self._share(there.blocks, there.prior, free)
             total, freedom = self._by_view(there.offset + self.given.mean, shares)[..., 0]
             usual = np.full(n, self._common(total, freedom, False))
+            if abs(np.log(usual[0] / last)) < STANDS:
+                break
         if n <= 2:
             return np.full(n, self._common(total, freedom, self.cautious)), np.zeros(n, dtype=bool)
         both, beyond, together = self._odd(around, wide, usual)
@@ -453,7 +396,9 @@ class Variances:
         if one is `careful`, the largest that still makes so few squares likely enough.
         """
         likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
-        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))) if careful else likely)
+        if not careful or freedom <= _MIN_FREEDOM:
+            return float(likely)
+        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
 
     def _odd(
         self, around: _Around, wide: Array, usual: Array, rival: float | None = None
@@ -483,7 +428,7 @@ class Variances:
             as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
             odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
             chosen[tops] = size[tops]
-            known, count = known.under(self._prior(chosen, wide)), count + int(tops.sum())
+            known, count = around.posterior(self._prior(chosen, wide)), count + int(tops.sum())
         return scale, odd, known.evidence - count * price
 
     def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:

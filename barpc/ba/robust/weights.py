@@ -116,6 +116,12 @@ class Observations:
         freedom: Array = (2.0 * free / rows)[structure.point]
         return freedom
 
+    def mean_freedom(self, use: BoolArray) -> Array:
+        """Return the mean of that of the observations in use of each view (N,); 2 where there are none."""
+        counted = use.astype(np.float64)
+        total, count = self.structure.sum_views(np.stack([counted * self.freedom(counted), counted])).T
+        return np.where(count > 0, total / np.maximum(count, 1.0), 2.0)
+
     def squared(self, residual: Array, counted: Array) -> Array:
         """Return the squared residuals (K,) over their expectation under the stated sigmas."""
         s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
