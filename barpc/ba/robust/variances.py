@@ -376,9 +376,12 @@ class Variances:
             usual = np.full(n, self._common(total, freedom, False))
             if abs(np.log(usual[0] / last)) < STANDS:
                 break
+        careful = np.full(n, self._common(total, freedom, self.cautious))
         if n <= 2:
-            return np.full(n, self._common(total, freedom, self.cautious)), np.zeros(n, dtype=bool)
-        both, beyond, together = self._odd(around, wide, usual)
+            return careful, np.zeros(n, dtype=bool)
+        both, beyond, together = self._odd(around, wide, careful)
+        if self.cautious:
+            together = max(together, around.posterior(self._prior(usual, wide)).evidence)
         few, odd, alone = self._odd(around, wide, np.ones(n), together)
         if alone >= together + _LIKELIER:
             return few, odd
