@@ -128,7 +128,7 @@ def test_a_grown_block_is_read_as_it_was_written_and_a_damaged_one_is_refused(tm
         {"pair_view": pairs[::-1]}, {"pair_view": pairs[:, ::-1]}, {"pair_view": pairs + 1}, {"pair_view": pairs - 1},
         {"pair_view": pairs.astype(float)}, {"pair_view": pairs[:-1]}, {"pairs": arrays["pairs"][:-1]},
         {"pairs": arrays["pairs"] * np.nan}, {"diagonal": -arrays["diagonal"]}, {"diagonal": arrays["diagonal"][1:]},
-        {"told": -np.ones(40)}, {"told": np.ones(39)}, {"shown": np.ones((4, 2))}, {"shown": np.full((3, 2), np.nan)},
+        {"told": -np.ones(40)}, {"told": np.ones(39)}, {"shown": np.ones((5, 2))}, {"shown": np.full((4, 2), np.nan)},
     ]  # fmt: skip
     for damaged in wrong:
         np.savez(tmp_path / "block.npz", **{**arrays, **damaged})

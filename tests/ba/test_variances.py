@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,7 +30,15 @@ def variances(n: int, model: str = "rotation", drift: int = 0, cautious: bool = 
     constants = 3 * (unknowns.rotates + unknowns.translates)
     sigmas = np.full((n, unknowns.size), 2.0)
     sigmas[:, constants:] = 1.0
-    return Variances(CameraPrior(np.full(sigmas.shape, 0.5), sigmas), unknowns, True, True, cautious)
+    return Variances(CameraPrior(np.full(sigmas.shape, 0.5), sigmas), unknowns, True, cautious)
+
+
+def seen(known: np.ndarray) -> np.ndarray:
+    """Shares (N, q) by which unknowns are determined, with those along lines of sight that there are none of."""
+    return np.hstack([known, np.zeros((len(known), 2))])
+
+
+ANY: Any = SimpleNamespace(problem=SimpleNamespace(free=None), small=False)
 
 
 def params_of(v: Variances, totals: list[float]) -> np.ndarray:
@@ -42,14 +50,14 @@ def params_of(v: Variances, totals: list[float]) -> np.ndarray:
 
 def test_what_is_learnt_is_what_the_options_leave_open() -> None:
     for model, options, learns in (
-        ("rotation", {}, (True, True)),
-        ("rotation", {"learn_priors": False}, (False, False)),
-        ("affine", {}, (False, False)),
+        ("rotation", {}, True),
+        ("rotation", {"learn_priors": False}, False),
+        ("affine", {}, False),
     ):
         given = variances(2, model)
         for control in (False, True):
             found = Variances.of(given.given, given.unknowns, AdjustOptions(**options), control)
-            assert (found.learn_constant, found.learn_drift) == learns
+            assert found.learns == learns
             assert found.cautious == (not control)  # control holds the scene, and the priors need not
     assert [variances(1, model, 1).constants for model in ("rotation", "rotation+translation")] == [3, 6]
     assert variances(1, "affine").constants == 0
@@ -57,34 +65,33 @@ def test_what_is_learnt_is_what_the_options_leave_open() -> None:
 
 def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
     v = variances(2, "rotation+translation", 2)
-    found = v._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0]))
+    found = v._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 12.0]))
     np.testing.assert_array_equal(found.mean, v.given.mean)
     np.testing.assert_allclose(found.sigma[:, :6], [[2.0] * 6, [6.0] * 6])
     # a turn about a centre that flies on is a drift of a hundredth of it
     np.testing.assert_allclose(found.sigma[:, 6:9], np.hypot(2.0, [[0.02] * 3, [0.06] * 3]))
     np.testing.assert_allclose(found.sigma[:, 9:], 5.0)
-    told = replace(v, learn_drift=False)._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0]))
+    # a turn about the line of sight is as wide as it shows, and as the place at least
+    np.testing.assert_allclose(np.ravel(found.wider), [12.0, 4.0])
+    told = replace(v, learns=False)._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 1.0]))
     np.testing.assert_allclose(told.sigma[:, 6:9], 2.0)
     search = v.for_search()
     np.testing.assert_allclose(search.sigma[:, :6], 2.0)
     np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(30.0, 0.02))
     np.testing.assert_allclose(search.sigma[:, 9:], 30.0)
+    np.testing.assert_array_equal(search.wider, 1.0)
 
 
 def test_squares_and_freedom_are_those_of_the_unknowns_that_are_determined() -> None:
     v = variances(2, "rotation", 1)
     params = np.array([[2.5, 4.5, 0.5, 2.5, 0.5, 0.5], [0.5, 0.5, 0.5, 0.5, 3.5, 0.5]])
     known = np.array([[1.0, 0.5, 0.25, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.75, 0.0]])
-    total, freedom = v._squares(params, known)
-    np.testing.assert_allclose(total, [1.0 + 4.0, 0.0])
-    np.testing.assert_allclose(freedom, [1.75, 0.0])
-    np.testing.assert_allclose(v._squares(params, known, np.array([2.0, 1.0]))[0], [5.0 / 4, 0.0])
-    total, freedom = v._squares(params, known, part=v._drift_part(0))
-    np.testing.assert_allclose(total, [4.0, 9.0])
-    np.testing.assert_allclose(freedom, [1.5, 1.75])
+    total, freedom = v._by_view(params, seen(known))
+    np.testing.assert_allclose(total, [[1.0 + 4.0, 4.0, 0.0], [0.0, 9.0, 0.0]])
+    np.testing.assert_allclose(freedom, [[1.75, 1.5, 0.0], [0.0, 1.75, 0.0]])
     # one that is not determined at all does not count, wherever it stands
     params[1, 0] = 99.0
-    np.testing.assert_allclose(v._squares(params, known)[0], [5.0, 0.0])
+    np.testing.assert_allclose(v._by_view(params, seen(known))[0, :, 0], [5.0, 0.0])
 
 
 def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four() -> None:
@@ -92,7 +99,8 @@ def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four(
     params, known = v.given.mean.copy(), np.ones((2, 9))
     params[:, 3] += 3.0  # sigma 1: squares 9 and 9 of 6 degrees
     params[0, 6] += 2.0
-    np.testing.assert_allclose(v._drift(params, known), np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6)]))
+    expected = np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6), 1.0])
+    np.testing.assert_allclose(v._beside(params, seen(known)), expected)
 
 
 @pytest.mark.parametrize("cautious", [False, True])
@@ -106,14 +114,14 @@ def test_drifts_of_another_platform_are_let_be_as_large_as_they_may_be(cautious,
     likely, possible = (4 + total) / (4 + 6), total / chi2.ppf(0.1, 6)
     assert possible > likely
     expected = possible if cautious and unexpected else likely
-    np.testing.assert_allclose(v._drift(params, known), np.sqrt([expected]))
-    np.testing.assert_allclose(v._drift(params, 0.49 / 6 * known), np.sqrt([(4 + total) / (4 + 0.49)]))
+    np.testing.assert_allclose(v._beside(params, seen(known)), np.sqrt([expected, 1.0]))
+    np.testing.assert_allclose(v._beside(params, seen(0.49 / 6 * known))[0], np.sqrt((4 + total) / (4 + 0.49)))
 
 
 def test_without_control_priors_are_rather_too_wide_than_too_narrow() -> None:
     v = variances(2, cautious=True)
     for totals in ([18.0, 6.0], [1.5, 1.0], [0.5, 0.4]):
-        scale, odd = v._widened(cast(_Around, None), params_of(v, totals), np.ones((2, 3)), np.ones(0))
+        scale, odd = v._widened(ANY, params_of(v, totals), seen(np.ones((2, 3))), np.ones(1))
         expected = max((4 + sum(totals)) / (4 + 6), sum(totals) / chi2.ppf(0.1, 6), 1.0)
         np.testing.assert_allclose(scale, np.sqrt(expected))
         assert not odd.any()
@@ -124,18 +132,18 @@ def test_corrections_are_too_large_where_chance_has_five_percent(share: float, l
     v, n = variances(6), 6
     known = np.ones((n, 3))
     params = params_of(v, [share * chi2.isf(0.05, 18) / 6] * 6)
-    assert v._too_large(params, known, np.ones(n)) == large
-    assert not v._too_large(params, known, np.full(n, 1.1))
-    assert not v._too_large(params, 0.49 / 18 * known, np.ones(n))  # nothing is determined
-    assert v._too_large(params_of(v, [99.0] * 6), 0.51 / 18 * known, np.ones(n))
+    assert v._too_large(params, seen(known), np.ones(n)) == large
+    assert not v._too_large(params, seen(known), np.full(n, 1.1))
+    assert not v._too_large(params, seen(0.49 / 18 * known), np.ones(n))  # nothing is determined
+    assert v._too_large(params_of(v, [99.0] * 6), seen(0.51 / 18 * known), np.ones(n))
 
 
 def test_two_views_are_widened_together() -> None:
-    v, around = variances(2), cast(_Around, None)
-    scale, odd = v._widened(around, params_of(v, [18.0, 6.0]), np.ones((2, 3)), np.ones(0))
+    v = variances(2)
+    scale, odd = v._widened(ANY, params_of(v, [18.0, 6.0]), seen(np.ones((2, 3))), np.ones(1))
     np.testing.assert_allclose(scale, np.sqrt((4 + 24) / (4 + 6)))
     assert not odd.any()
-    scale, _ = v._widened(around, params_of(v, [1.0, 1.0]), np.ones((2, 3)), np.ones(0))
+    scale, _ = v._widened(ANY, params_of(v, [1.0, 1.0]), seen(np.ones((2, 3))), np.ones(1))
     np.testing.assert_array_equal(scale, 1.0)  # and never narrowed
 
 
@@ -186,7 +194,7 @@ def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple
         return np.array([9.0, 1.0, 1.0]), np.array([True, False, False]), alone
 
     monkeypatch.setattr(Variances, "_odd", odd)
-    return v._widened(cast(_Around, None), params_of(v, [600.0, 3.0, 3.0]), np.ones((3, 3)), np.ones(0))
+    return v._widened(ANY, params_of(v, [600.0, 3.0, 3.0]), seen(np.ones((3, 3))), np.ones(1))
 
 
 def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(monkeypatch) -> None:
@@ -226,7 +234,7 @@ def forward(
     around: Any = SimpleNamespace(
         posterior=posterior, problem=SimpleNamespace(structure=SimpleNamespace(pair_view=every))
     )
-    scale, odd, evidence = v._odd(around, np.ones(0), np.ones(n), rival)
+    scale, odd, evidence = v._odd(around, np.ones(1), np.ones(n), rival)
     return np.flatnonzero(odd).tolist(), scale, evidence
 
 
@@ -286,10 +294,11 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
     v = variances(2)
     full = np.diag([4.0, 2.0, 1.0, 0.0, 5.0, 4.0])
     free = np.array([1, 1, 1, 0, 1, 1], dtype=bool)
-    covariance: Any = SimpleNamespace(free=free, is_large=False, variances=lambda: full.diagonal().reshape(2, 3))
-    np.testing.assert_allclose(v._known(covariance, v.given), [[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]])
+    blocks = np.stack([full[:3, :3], full[3:, 3:]])
+    covariance: Any = SimpleNamespace(free=free, is_large=False, of_views=lambda: blocks)
+    np.testing.assert_allclose(v._known(covariance, v.given), seen([[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]]))
     loose = CameraPrior(v.given.mean, np.where(np.arange(3) == 1, np.inf, v.given.sigma))
-    np.testing.assert_allclose(v._known(covariance, loose), [[0.0, 0.0, 0.75], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(v._known(covariance, loose), seen([[0.0, 0.0, 0.75], [0.0, 0.0, 0.0]]))
 
 
 # --- on a block ---------------------------------------------------------------------------------------------------
@@ -314,14 +323,16 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     matrix = covariance.reduced.matrix.plain() - by_camera.T @ by_camera
     true = np.linalg.inv(matrix).diagonal().reshape(n, 9)
     np.testing.assert_allclose(covariance.variances(), true, rtol=1e-6)
-    off = covariance.probed_variances() / true - 1
+    off = covariance.probed_views().diagonal(axis1=1, axis2=2) / true - 1
     by_unknown = np.sqrt((off**2).mean(axis=0))
     assert (by_unknown > 0.05).all()  # they are probed, indeed
     assert (by_unknown < 0.3).all()
     assert (abs(off.mean(axis=0)) < 0.05).all()
     prior = prior_sigmas(block.views, found.options, 1, None)
     known = 1 - true[:, :6] / prior[:, :6] ** 2
-    np.testing.assert_allclose(found.prior.freedom, known.sum(), rtol=1e-6)
+    sight, blocks = found.cameras.unknowns.sight / prior[:, None], covariance.of_views()
+    along = 2 - ((sight @ blocks) * sight).sum(axis=(1, 2))
+    np.testing.assert_allclose(found.prior.freedom, known.sum() - along.sum(), rtol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -369,22 +380,16 @@ def test_other_priors_of_single_views_are_an_update_of_what_is_known(n: int) -> 
     around = _Around(problem, minimise(problem, state, weight, "sparse", 1e-10))
     wider = problem.camera_prior.sigma * np.random.default_rng(0).uniform(1.0, 50.0, (n, 1))
     known, prior = around.posterior(problem.camera_prior), problem.camera_prior
-    first = known
-    for views in ([0], [1], [n // 2, n - 1]):
-        evidence, offset, variance = known.alone(wider)
-        was, prior = prior, replace(prior, sigma=np.where(np.isin(np.arange(n), views)[:, None], wider, prior.sigma))
-        known, exact = known.under(prior, around), around.posterior(prior)
-        assert known.evidence - first.evidence == pytest.approx(exact.evidence - first.evidence, abs=1e-6)
-        np.testing.assert_allclose(known.offset, exact.offset, atol=1e-6)
-        np.testing.assert_allclose(known.blocks, exact.blocks, rtol=1e-6, atol=1e-9 * np.abs(exact.blocks).max())
-        if len(views) == 1:
-            assert evidence[views[0]] == pytest.approx(known.evidence, rel=1e-9)
-            np.testing.assert_allclose(offset[views], known.offset[views], atol=1e-6)
-            np.testing.assert_allclose(variance[views], exact.blocks[views].diagonal(axis1=1, axis2=2), rtol=1e-6)
-        if views == [1]:
-            assert known.evidence == pytest.approx(around.posterior(was).evidence, abs=1e-6)
-    assert len(known.updates) == 2
-    assert exact.evidence > first.evidence + 20.0
+    evidence, offset, blocks = known.alone(replace(prior, sigma=wider))
+    for view in (0, 1, n // 2, n - 1):
+        alone = replace(prior, sigma=np.where(np.arange(n)[:, None] == view, wider, prior.sigma))
+        exact = around.posterior(alone)
+        assert evidence[view] - known.evidence == pytest.approx(exact.evidence - known.evidence, abs=1e-6)
+        np.testing.assert_allclose(offset[view], exact.offset[view], atol=1e-6)
+        np.testing.assert_allclose(blocks[view], exact.blocks[view], rtol=1e-6, atol=1e-9 * np.abs(exact.blocks).max())
+        if view == 1:
+            assert evidence[view] == pytest.approx(known.evidence, abs=1e-6)
+    assert (evidence > known.evidence + 20.0).any()
 
 
 def adjusted(block: SimulatedBlock, **options: Any) -> Adjustment:
@@ -401,9 +406,10 @@ def test_priors_that_hold_have_a_ratio_of_one_and_stand(seeds: int) -> None:
         ratio.append(prior.ratio)
         freedom.append(prior.freedom)
         assert prior.scale.max() < 1.6
-    assert np.mean(ratio) == pytest.approx(1.0, abs=0.35)
-    # of 24 unknowns the scene's seven motions stay with the priors, of rotations and translations that look alike one
-    assert 6 < np.mean(freedom) < 14
+    # of 24 unknowns the scene's motions stay with the priors, of rotations and translations that look alike one, and
+    # what is along the lines of sight counts by itself
+    assert 4 < np.mean(freedom) < 8
+    assert np.mean(ratio) == pytest.approx(1.0, abs=2.0 * np.sqrt(2.0 / np.sum(freedom)))
 
 
 @pytest.mark.landing(2)
@@ -427,14 +433,21 @@ def test_priors_that_are_too_narrow_are_widened_by_as_much(wrong: float, seeds: 
 def test_one_view_that_is_far_off_is_named_and_the_others_keep_their_priors(
     wrong: int, by: tuple[float, float]
 ) -> None:
+    """Of three images two agree in one number only, which chance does once in 20 where all are 25 times worse than
+    stated: it may be open, and is covered, whether it is one, where that is off across the flight.
+    """
+    across = by[0] != 0.0
     for seed in range(3):
         block = simulate_block(3, 150, seed=seed, attitude=5e-6)
         views = list(block.views)
         views[wrong] = replace(views[wrong], sensor=views[wrong].sensor.crop(*by))
         prior = adjusted(replace(block, views=tuple(views)), sigma_attitude=3.47, sigma_position=1.0).prior
-        assert np.flatnonzero(prior.odd).tolist() == [wrong]
+        named = np.flatnonzero(prior.odd).tolist()
+        assert named == [wrong] or (not named and across)
         assert 20.0 < prior.scale[wrong] < 90.0  # 250 or 300 px of 0.7 m are 50 or 60 sigmas
-        np.testing.assert_array_equal(np.delete(prior.scale, wrong), 1.0)
+        assert prior.scale[wrong] == prior.scale.max()
+        if named:
+            np.testing.assert_array_equal(np.delete(prior.scale, wrong), 1.0)
         assert 50.0 < prior.ratio < 400.0
 
 
@@ -449,7 +462,7 @@ def waved(n: int = 3) -> Variances:
     )  # fmt: skip
     sigma = np.full((n, unknowns.size), 2.0)
     sigma[:, unknowns.in_waves] = 0.3
-    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, True, True, False)
+    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, True, False)
 
 
 def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
@@ -488,7 +501,7 @@ def test_where_waves_are_followed_a_drift_is_as_large_as_it_shows() -> None:
     v = replace(waved(2), cautious=True)
     params, known = np.zeros(v.given.sigma.shape), np.ones(v.given.sigma.shape)
     params[0, 3] = 30.0
-    np.testing.assert_allclose(v._drift(params, known), np.sqrt([(4 + 225) / (4 + 6)]))
+    np.testing.assert_allclose(v._beside(params, seen(known)), np.sqrt([(4 + 225) / (4 + 6), 1.0]))
 
 
 @pytest.fixture(scope="module")
@@ -497,6 +510,7 @@ def at_minimum() -> tuple[Any, Any]:
     made = simulate_block(4, 150, seed=2, attitude=5e-6, drift=2e-6)
     options = AdjustOptions(drift=1, sigma_attitude=3.5, sigma_position=1.0)
     problem = make_problem(join(made.views, made.tracks, None, options), options, centers_of(made), None)
+    problem = replace(problem, camera_prior=replace(problem.camera_prior, sight=None))  # all constants are of one kind
     weight = np.full(len(problem.structure.view), 10.0)
     state = State(problem.camera_prior.mean, ecef_from_ground(made.truth.ground))
     return problem, minimise(problem, state, weight, "sparse", 1e-14)
@@ -515,7 +529,7 @@ def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
-    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, True, False)
+    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, False)
     prior, tested = v.learnt(problem, minimum)
     total, freedom = squares[:, :6].sum(), known[:, :6].sum()
     assert tested.ratio == pytest.approx(total / freedom)
@@ -537,16 +551,16 @@ def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimu
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)
-    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False, False)
-    prior, tested = v.learnt(problem, minimum)
+    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False)
+    last = PriorTest(1.0, 2.0, np.full(4, 2.0), np.zeros(4, dtype=bool), ())  # widened before: the drift stands
+    prior, tested = v.learnt(problem, minimum, last)
     total, freedom = (minimum.state.params[:, :6] / narrow[:, :6]) ** 2, known[:, :6]
     factor = (4 + total.sum()) / (4 + freedom.sum())
     assert not tested.odd.any()  # whether one view or all are worse than stated is open: the priors cover both
     np.testing.assert_allclose(np.sort(tested.scale)[:3], np.sqrt(factor))
     assert tested.scale.max() > 3.0 * np.sqrt(factor) > 5.0
     np.testing.assert_allclose(prior.sigma[:, :6], narrow[:, :6] * tested.scale[:, None])
-    np.testing.assert_array_equal(prior.sigma[:, 6:], narrow[:, 6:])  # these are given
-    told = replace(v, learn_constant=False).learnt(problem, minimum)
+    told = replace(v, learns=False).learnt(problem, minimum)
     np.testing.assert_array_equal(told[0].sigma, narrow)
     np.testing.assert_array_equal(told[1].scale, 1.0)
     assert told[1].ratio == pytest.approx(tested.ratio) == pytest.approx(total.sum() / freedom.sum())
@@ -558,7 +572,7 @@ def test_constants_of_a_large_block_once_widened_stay(at_minimum, monkeypatch) -
     monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
     given = CameraPrior(problem.camera_prior.mean, problem.camera_prior.sigma.copy())
     given.sigma[:, :6] /= 30.0
-    v = Variances(given, problem.cameras.unknowns, True, True, False)
+    v = Variances(given, problem.cameras.unknowns, True, False)
     tested, priors, scales = None, [given], []
     for _ in range(12):
         now = replace(problem, camera_prior=priors[-1])
@@ -576,7 +590,7 @@ def test_a_small_block_learns_until_its_priors_stand(at_minimum) -> None:
     problem, minimum = at_minimum
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, 6:] = 0.05
-    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, True, False)
+    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False)
     prior, tested = v.learnt(problem, minimum)
 
     def solved(sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -602,7 +616,7 @@ def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minim
         raise np.linalg.LinAlgError("not positive definite")
 
     monkeypatch.setattr(Variances, "_known", fails)
-    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, True, False)
+    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, False)
     prior, tested = v.learnt(problem, minimum)
     assert prior is problem.camera_prior
     assert np.isnan(tested.ratio)
@@ -632,10 +646,10 @@ def test_views_that_state_an_accuracy_share_what_they_are_off_by(model: str, unk
     freedom = 0.5 * 2 * unknowns
     alone = min(size**2 / chi2.ppf(1e-3, freedom), 1.0)
     expected = np.sqrt(max(alone + (1 - alone) * 2 * 3 / unknowns, 1.0))
-    np.testing.assert_allclose(v._shared(params, known), [expected, 1.0, expected, expected])
-    np.testing.assert_array_equal(v._shared(params, 0.49 / freedom * known), 1.0)  # nothing is determined
-    np.testing.assert_array_equal(replace(v, learn_constant=False)._shared(params, known), 1.0)
-    np.testing.assert_array_equal(replace(v, stated=None)._shared(params, known), 1.0)
+    np.testing.assert_allclose(v._shared(params, seen(known)), [expected, 1.0, expected, expected])
+    np.testing.assert_array_equal(v._shared(params, seen(0.49 / freedom * known)), 1.0)  # nothing is determined
+    np.testing.assert_array_equal(replace(v, learns=False)._shared(params, seen(known)), 1.0)
+    np.testing.assert_array_equal(replace(v, stated=None)._shared(params, seen(known)), 1.0)
 
 
 def test_what_is_not_said_to_be_shared_is_not() -> None:

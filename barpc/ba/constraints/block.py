@@ -218,7 +218,7 @@ def make_problem(
     unknowns = make_unknowns(views, options.first_model, drift, centers, waves)
     off = None if block.reference is None else np.linalg.norm(block.reference.offset, axis=1)
     sigma = prior_sigmas(views, options, drift, off, 0 if waves is None else waves.size)
-    on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma), None
+    on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma, unknowns.sight), None
     if prior is not None:
         radars = [block.names[v] for v in unknowns.radars]
         on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras, radars)

@@ -201,7 +201,7 @@ def datum_shares(
     with np.errstate(divide="ignore", invalid="ignore"):
         unknowns = (moves / np.sqrt(variance)).reshape(problem.structure.num_views, -1, len(variance))
     paid = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
-    paid["cameras"] += np.einsum("nqm->m", (problem.camera_prior.jacobian()[..., None] * unknowns) ** 2)
+    paid["cameras"] += (problem.camera_prior.whitened(unknowns) ** 2).sum(axis=(0, 1))
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
         paid["earlier_run"] += (flat * (joint.information @ flat)).sum(axis=0)

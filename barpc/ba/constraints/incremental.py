@@ -70,7 +70,7 @@ class BlockPrior:
         Scene of the block, by its cameras' unknowns; None: written by an earlier release.
     told : (n,) or None
         What tie points tell of each view, before what all of a view share caps it [1/px^2].
-    shown : (3 + drift, 2) or None
+    shown : (4 + drift, 2) or None
         What the corrections of all views show of the priors given (`barpc.ba.robust.variances.Variances.shown`).
     rest : Rest or None
         The block that these views are only some of.
@@ -165,7 +165,12 @@ class BlockPrior:
             if "scene_radius" in file:
                 by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
                 scene = EarlierScene(by_unknown, own, float(radius))
-            learnt = file.get("told"), file.get("shown")
+            shown = file.get("shown")
+            if (
+                shown is not None and len(shown) == 3 + known[1]
+            ):  # of release 0.3: what is along lines of sight came later
+                shown = np.vstack([shown, np.zeros(shown.shape[1])])
+            learnt = file.get("told"), shown
             prior = cls(names, *known, splines, edges, radars, strips, periods, scene, *learnt)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
@@ -203,7 +208,7 @@ class BlockPrior:
             and (self.splines == 0 or 4 <= self.splines <= q)
             and (self.scene is None or _is_scene(self.scene, n * q))
             and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
-            and (self.shown is None or (self.shown.shape == (3 + self.drift, 2) and _is_counted(self.shown)))
+            and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_counted(self.shown)))
             and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_square_finite(self.less)))
         )
 

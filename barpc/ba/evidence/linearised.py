@@ -186,7 +186,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         sigma,
         tuple(tracks),
         (structure.num_views, by_unknown.shape[1]),
-        (1.0 / prior.sigma**2).ravel(),
+        prior.loosest().ravel() ** -2.0,
         (state.params - prior.mean).ravel(),
         2.0 * far * max(2.0 * far, parallax),
         image,

@@ -30,18 +30,41 @@ NOISE_FLOOR = AdjustOptions().noise_floor
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Independent priors: (p - mean) / sigma."""
+    """Independent priors (p - mean) / sigma, those along the lines of sight wider.
+
+    What is stated of a camera is where it sees a place. Its turn about its line of sight, and how far off it is, move
+    the scale and the azimuth of an image but not its middle.
+    """
 
     mean: Array  # (N, q) of every view's unknowns
     sigma: Array  # (N, q)
+    sight: Array | None = None  # (N, 2, q) orthonormal: turn about and move along the line of sight; zeros: none
+    wider: Array | float = 1.0  # (N, 1, 1) by how much their standard deviations are
+
+    @property
+    def along(self) -> Array:
+        """The same (N, 2, q), zeros where there is none."""
+        return np.zeros((len(self.sigma), 2, self.sigma.shape[1])) if self.sight is None else self.sight
 
     def residual(self, params: Array) -> Array:
         """Return the whitened residuals (N, q) of unknowns (N, q)."""
-        return (params - self.mean) / self.sigma
+        return self.whitened(params - self.mean)
 
-    def jacobian(self) -> Array:
-        """Return the diagonal of the derivative (N, q)."""
-        return 1.0 / self.sigma
+    def whitened(self, values: Array) -> Array:
+        """Return changes of unknowns (N, q) or (N, q, m) over their standard deviations."""
+        flat = values.reshape(*self.sigma.shape, -1) / self.sigma[..., None]
+        if np.any(self.wider != 1.0):
+            flat -= (1.0 - 1.0 / self.wider) * (np.swapaxes(self.along, 1, 2) @ (self.along @ flat))
+        return flat.reshape(values.shape)
+
+    def loosest(self) -> Array:
+        """Return standard deviations (N, q) of independent unknowns that hold them in no direction more than these."""
+        return np.where(self.along.any(axis=1), np.reshape(self.wider, (-1, 1)), 1.0) * self.sigma
+
+    def precision(self) -> Array:
+        """Return the information matrices (N, q, q)."""
+        root = self.whitened(np.broadcast_to(np.eye(self.sigma.shape[1]), (*self.sigma.shape, self.sigma.shape[1])))
+        return np.swapaxes(root, 1, 2) @ root
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,7 @@ class Unknowns:
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
     waves: AdditionalParameters | None = None  # what is left in the image
     radars: Mapping[int, Clocked] = field(default_factory=dict)  # views whose unknowns are those of clocks
+    direction: Array | None = None  # (N, 3) of the line of sight of every image's middle, ECEF
 
     @property
     def geometric(self) -> bool:
@@ -68,6 +69,17 @@ class Unknowns:
     def in_waves(self) -> slice:
         """Slice of a view's unknowns that act in the image."""
         return slice(self._in_space, self.size)
+
+    @property
+    def sight(self) -> Array | None:
+        """Unit vectors (N, 2, q): turn about, move along the line of sight; zeros for radars, None where not known."""
+        if self.direction is None or not self.geometric:
+            return None
+        out = np.zeros((len(self.direction), 2, self.size))
+        for row, at in enumerate(range(0, self.constants, 3)):
+            out[:, row, at : at + 3] = self.direction
+        out[list(self.radars)] = 0.0
+        return out
 
     @property
     def rotates(self) -> bool:
@@ -217,8 +229,10 @@ def make_unknowns(
     altitude, number = np.array([view.altitude for view in views]), np.arange(len(views) + 1)
     scene = ecef_from_ground(localize_stack([v.sensor for v in views], (size - 1.0) / 2.0, altitude, number))
     distance = np.linalg.norm(centers - scene, axis=1)
+    direction = (scene - centers) / distance[:, None]
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
     sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
     radars = {i: sensor for i, sensor in sensors if is_clocked(sensor)}
-    return Unknowns(model, drift, centers, distance, (size.T - 1.0) / 2.0, size.T / 2.0, place, waves, radars)
+    half = size.T / 2.0
+    return Unknowns(model, drift, centers, distance, half - 0.5, half, place, waves, radars, direction)

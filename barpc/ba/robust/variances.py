@@ -2,9 +2,12 @@
 
 A prior's standard deviation is a guess. What the observations say about it is the size of the corrections that they
 determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
-determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). Where the
-sum is larger than chance allows, some prior was too narrow: that of one view, if its correction alone explains it
-(every view that would is held possible: three in a row along the flight do not determine which), else that of all.
+determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). That holds
+for each kind of unknowns by itself: those that move an image's middle, of which an accuracy is stated; turns about the
+line of sight and moves along it, which ties see well and which say nothing of the place; drifts degree by degree.
+Where the sum of the first is larger than chance allows, some prior was too narrow: that of one view, if its correction
+alone explains it (every view that would is held possible: three in a row along the flight cannot tell which), else
+that of all.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtrc, gammaincinv
@@ -23,7 +27,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, KEPT, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
+from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
 from barpc.scene import BoolArray, IntArray, View
 
 logger = logging.getLogger(__name__)
@@ -51,6 +55,7 @@ class PriorTest:
     # what the corrections show, with those of an earlier block (see `Variances.shown`)
     shown: Array | None = None
     failed: bool = False  # the matrix could not be factorised: nothing was learnt
+    turned: float = 1.0  # by how much standard deviations along the lines of sight were widened beside that
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,102 +70,67 @@ class _Around:
         """Whether it can be solved many times."""
         return len(self.problem.free) <= SMALL
 
+    def change(self, now: CameraPrior, prior: CameraPrior) -> Array:
+        """Return what the information (N, q, q) of priors changes by from one to another; that of fixed views by 0."""
+        free = self.problem.free.reshape(now.sigma.shape)
+        return (prior.precision() - now.precision()) * free[..., None]
+
     def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
         """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
-        free = self.problem.free
-        change = np.where(free.reshape(start.shape), 1.0 / prior.sigma**2 - 1.0 / now.sigma**2, 0.0)
+        change, free = self.change(now, prior), self.problem.free
         other = reduced.with_diagonal(change)
         factor = other.factor(free)
         covariance = Covariance(other, factor, free)
         offset = start - now.mean
-        step = -covariance.solve((change * offset).ravel()).reshape(start.shape)
+        pulled = (change @ offset[..., None])[..., 0]
+        step = -covariance.solve(pulled.ravel()).reshape(start.shape)
         # the data's own cost rises by -step (change moved), as the new minimum is where both pull alike
-        cost = float((change * (offset + step) * offset).sum())
-        volume = factor.log_determinant + float(_log_variance(prior.sigma, free).sum())
+        cost = float(((offset + step) * pulled).sum())
+        volume = factor.log_determinant + float(_log_variance(prior, free).sum())
         return -0.5 * (cost + volume), start + step, covariance
 
     def posterior(self, prior: CameraPrior) -> _Posterior:
         """Return the information on every view under other priors."""
         evidence, params, covariance = self.under(prior)
-        free = self.problem.free.reshape(params.shape)
-        return _Posterior(evidence, params - prior.mean, covariance.of_views(), prior.sigma, free, covariance)
+        return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior)
 
 
-def _log_variance(sigma: Array, free: BoolArray) -> Array:
-    """Return the logarithms (N, q) of the variances of proper priors on free unknowns; 0 for all others."""
+def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
+    """Return the logarithms (N,) of the determinants of proper priors on free unknowns; others add nothing."""
+    sigma = prior.sigma
     use = free.reshape(sigma.shape) & np.isfinite(sigma)
-    return 2.0 * np.log(sigma, where=use, out=np.zeros(sigma.shape))
+    along = (prior.along**2 * use[:, None] * np.log(prior.wider)).sum(axis=(1, 2))
+    return np.asarray(2.0 * (np.log(sigma, where=use, out=np.zeros(sigma.shape)).sum(axis=1) + along))
 
 
 @dataclass(frozen=True, eq=False)
 class _Posterior:
     """The information on every view under some priors: other priors of a view are an update of rank q."""
 
+    around: _Around
     evidence: float  # logarithm, but for a constant
     offset: Array  # (N, q) unknowns minus their priors' means
     blocks: Array  # (N, q, q) covariance of every view's unknowns
-    sigma: Array  # (N, q) of the priors
-    free: BoolArray  # (N, q)
-    start: Covariance  # of all unknowns, before the updates
-    # of every update the covariance (N, q, m) with the m unknowns whose priors changed, and M (m, m)
-    updates: tuple[tuple[Array, Array], ...] = ()
+    prior: CameraPrior
 
-    def _change(self, sigma: Array) -> Array:
-        """Return the change (N, q) of the precisions of the priors to other standard deviations (N, q)."""
-        return np.where(self.free, 1.0 / sigma**2 - 1.0 / self.sigma**2, 0.0)
-
-    def alone(self, sigma: Array) -> tuple[Array, Array, Array]:
-        """Return evidence (N,), offset (N, q) and variances (N, q) of every view if its prior alone were another.
+    def alone(self, prior: CameraPrior) -> tuple[Array, Array, Array]:
+        """Return evidence (N,), offset (N, q) and covariance (N, q, q) of every view if its prior alone were another.
 
         With its change D of precision and its covariance C the determinant of all grows by |I + D C|, and the
         inverse changes by C_v M C_v^T, M = (I + D C)^-1 D (matrix determinant lemma, Woodbury).
         """
-        change = self._change(sigma)[:, :, None]
-        system = np.eye(sigma.shape[1]) + change * self.blocks
-        gain = np.linalg.solve(system, change * np.eye(sigma.shape[1]))
+        change = self.around.change(self.prior, prior)
+        system = np.eye(change.shape[1]) + change @ self.blocks
+        gain = np.linalg.solve(system, change)
         pulled = gain @ self.offset[:, :, None]
         cost = (self.offset[:, :, None] * pulled).sum(axis=(1, 2))
         sign, volume = np.linalg.slogdet(system)
-        volume += (_log_variance(sigma, self.free) - _log_variance(self.sigma, self.free)).sum(axis=1)
+        new, old = (_log_variance(one, self.around.problem.free) for one in (prior, self.prior))
+        volume += new - old
         offset = self.offset - (self.blocks @ pulled)[:, :, 0]
-        less = (self.blocks @ gain * self.blocks).sum(axis=2)
         evidence = np.where(sign > 0, self.evidence - 0.5 * (cost + volume), -np.inf)
-        return evidence, offset, self.blocks.diagonal(axis1=1, axis2=2) - less
-
-    def under(self, prior: CameraPrior, around: _Around) -> _Posterior:
-        """Return the same under other priors, which differ in few views from those that it has."""
-        change = self._change(prior.sigma)
-        views = np.flatnonzero(change.any(axis=1))
-        if not len(views):
-            return replace(self, sigma=prior.sigma)
-        rows = (views[:, None] * change.shape[1] + np.arange(change.shape[1])).ravel()
-        if (len(self.updates) + 1) * change.size * len(rows) > 30 * KEPT:  # 240 MB
-            return around.posterior(prior)
-        columns = self._columns(rows)
-        own, offset = columns.reshape(-1, len(rows))[rows], self.offset[views].ravel()
-        system = np.eye(len(rows)) + change[views].reshape(-1, 1) * own
-        gain = np.linalg.solve(system, np.diag(change[views].ravel()))
-        pulled = gain @ offset
-        volume = np.linalg.slogdet(system)[1]
-        volume += (_log_variance(prior.sigma, self.free) - _log_variance(self.sigma, self.free)).sum()
-        return replace(
-            self,
-            evidence=self.evidence - 0.5 * float(offset @ pulled + volume),
-            offset=self.offset - columns @ pulled,
-            blocks=self.blocks - columns @ gain @ columns.swapaxes(1, 2),
-            sigma=prior.sigma,
-            updates=(*self.updates, (columns, gain)),
-        )
-
-    def _columns(self, rows: IntArray) -> Array:
-        """Return the covariance (N, q, m) of all unknowns with m of them."""
-        unit = np.zeros((self.offset.size, len(rows)))
-        unit[rows, np.arange(len(rows))] = 1.0
-        out = self.start.solve(unit).reshape(*self.offset.shape, -1)
-        for columns, gain in self.updates:
-            out -= columns @ (gain @ columns.reshape(-1, columns.shape[2])[rows].T)
-        return out
+        return evidence, offset, self.blocks - self.blocks @ gain @ self.blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,13 +139,12 @@ class Variances:
 
     given: CameraPrior  # with the standard deviations as they were given
     unknowns: Unknowns  # which unknown is what
-    learn_constant: bool  # whether the constants' standard deviations may change
-    learn_drift: bool
+    learns: bool  # whether the standard deviations of constants and drifts may change
     cautious: bool  # rather too wide than too narrow: no control holds the scene
     stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
-    # (3 + D, 2) of an earlier block, whose views have no prior of their own here: squared corrections over the
-    # variances given, and their freedom, of constants, of those that are stated, and of the drift degree by degree; in
-    # the third row the number of views that state
+    # (4 + D, 2) of an earlier block, whose views have no prior of their own here: squared corrections over the
+    # variances given, and their freedom, of the place, of those that are stated, of the drift degree by degree, and
+    # along the lines of sight; in the third row the number of views that state
     shown: Array | None = None
 
     @classmethod
@@ -189,19 +158,43 @@ class Variances:
         shown: Array | None = None,
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
-        geometric = unknowns.geometric and options.learn_priors
+        learns = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
-        return cls(given, unknowns, geometric, geometric, not control, stated, shown)
+        return cls(given, unknowns, learns, not control, stated, shown)
 
     @property
     def constants(self) -> int:
         """Constant unknowns of a view."""
         return self.unknowns.constants if self.unknowns.geometric else 0
 
+    @property
+    def _degrees(self) -> int:
+        return self.unknowns.drift if self.unknowns.geometric else 0
+
+    @property
+    def learn_waves(self) -> bool:
+        """Whether there are splines or steps, whose sizes are always learnt."""
+        return self.unknowns.waves is not None
+
+    @cached_property
+    def _kinds(self) -> Array:
+        """(2 + D, q + 2) which unknowns are of which kind: the place, the drift by degree, along the lines of sight.
+
+        The last two are a turn about that line and a move along it, which the constants are without.
+        """
+        kinds = np.zeros((2 + self._degrees, self.given.sigma.shape[1] + 2))
+        kinds[0, : self.constants] = kinds[-1, -2:] = 1.0
+        for degree in range(self._degrees):
+            kinds[1 + degree, self._drift_part(degree)] = 1.0
+        return kinds
+
+    def _drift_part(self, degree: int) -> slice:
+        return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
+
     def for_search(self) -> CameraPrior:
         """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
-        return self._prior(np.ones(len(self.given.sigma)), np.full(self._degrees, TIMES))
+        return self._prior(np.ones(len(self.given.sigma)), np.append(np.full(self._degrees, TIMES), 1.0))
 
     def learnt(
         self, problem: Problem, minimum: Minimum, last: PriorTest | None = None, exact: bool = False
@@ -229,26 +222,26 @@ class Variances:
         around = _Around(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
-        scale, wide, odd = np.ones(len(params)), np.ones(self._degrees), np.zeros(len(params), dtype=bool)
+        scale, wide, odd = np.ones(len(params)), np.ones(1 + self._degrees), np.zeros(len(params), dtype=bool)
         prior = self._prior(scale, wide)
-        if around.small and (now.sigma != prior.sigma).any():
+        if around.small and self.learns:
             _, params, covariance = around.under(prior)
         known = self._known(covariance, prior if around.small else now, exact)
-        total, freedom = (float(part.sum()) for part in self._squares(params, known))
+        total, freedom = (float(x) for x in self._sums(params, known)[0])
         ratio = total / freedom if freedom > _MIN_FREEDOM else float("nan")
         shared = self._shared(params, known)
         # constants of a large block that were widened take from the drift, which need not stand again
-        stands = not self.learn_drift or (not around.small and widened)
-        for _ in range(ITERATIONS):
+        stands = not around.small and widened
+        for _ in range(ITERATIONS if self.learns or self.learn_waves else 0):
             before = prior
             if self.learn_waves:
                 self = self._going_on(self._waves(params, known, prior.sigma))
-            wide = self._drift(params, known) if self.learn_drift else wide
+            wide = self._beside(params, known) if self.learns else wide
             prior = self._prior(scale, wide)
-            # a drift that is larger than thought looks like constants that are: it is learnt before they are asked
+            # a drift or a turn larger than thought looks like a place that is: it is learnt before that is asked
             last, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
-            stands |= same_prior(prior, last, least, self._of_drift)
-            if stands and self.learn_constant and self._too_large(params, known, scale):
+            stands |= same_prior(prior, last, least, slice(self.constants, self.constants + 3 * self._degrees))
+            if stands and self.learns and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
                 prior = self._prior(scale, wide)
             if not around.small or same_prior(prior, before, STANDS):
@@ -258,9 +251,10 @@ class Variances:
         drift = tuple(float(np.median(prior.sigma[:, self._drift_part(d).start])) for d in range(self._degrees))
         sigma = prior.sigma.copy()
         sigma[:, : self.constants] *= shared[:, None]
-        shown = self._showing(params, known)
-        tested = PriorTest(ratio, freedom, scale, odd, drift, float(shared.max()), shown)
-        return CameraPrior(prior.mean, sigma), tested
+        tested = PriorTest(
+            ratio, freedom, scale, odd, drift, float(shared.max()), self._showing(params, known), turned=float(wide[-1])
+        )
+        return replace(prior, sigma=sigma), tested
 
     def _shared(self, params: Array, known: Array) -> Array:
         """Return the factors (N,) by which views that state an accuracy are widened, as they share the error
@@ -271,7 +265,7 @@ class Variances:
         n views of two unknowns (rotation, translation) a direction would tell the place sqrt(n / 2) times too well.
         """
         wider = np.ones(len(params))
-        if self.stated is None or not self.learn_constant:
+        if self.stated is None or not self.learns:
             return wider
         (squares, freedom), (count, _) = self._of_stated(params, known)
         if freedom > _MIN_FREEDOM:
@@ -282,34 +276,25 @@ class Variances:
     def _of_stated(self, params: Array, known: Array) -> Array:
         """Return the second and third row of `shown` (2, 2), of an earlier block and of this."""
         assert self.stated is not None
-        squares, freedom = (part[self.stated].sum() for part in self._squares(params, known))
+        of_place = self._by_view(params, known)[:, self.stated, 0].sum(axis=1)
         count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
-        return np.asarray(self._before(slice(1, 3)) + np.array([[squares, freedom], [count, 0.0]]))
+        return np.asarray(self._before[1:3] + np.array([of_place, [count, 0.0]]))
 
-    def _before(self, rows: int | slice) -> Array:
-        """Return the rows of an earlier block; zeros without one."""
-        return np.asarray((np.zeros((3 + self._degrees, 2)) if self.shown is None else self.shown)[rows])
+    @property
+    def _before(self) -> Array:
+        """What an earlier block showed (4 + D, 2); zeros without one."""
+        return np.zeros((4 + self._degrees, 2)) if self.shown is None else self.shown
 
     def _showing(self, params: Array, known: Array) -> Array:
         """Return `shown` for a later run: by this block and those before it."""
-        out = self._before(slice(None)).copy()
-        out[0] += [part.sum() for part in self._squares(params, known)]
-        if self.stated is not None:
-            out[1:3] = self._of_stated(params, known)
-        for degree in range(self._degrees):
-            out[3 + degree] += [x.sum() for x in self._squares(params, known, part=self._drift_part(degree))]
-        return out
-
-    @property
-    def learn_waves(self) -> bool:
-        """Whether there are splines or steps, whose sizes are always learnt."""
-        return self.unknowns.waves is not None
+        rest = self._before[1:3] if self.stated is None else self._of_stated(params, known)
+        return np.insert(self._sums(params, known), [1, 1], rest, axis=0)
 
     def _going_on(self, sigma: Array) -> Variances:
         """Return the priors with splines and steps as large as in the standard deviations (N, q)."""
         part, given = self.unknowns.in_waves, self.given.sigma.copy()
         given[:, part] = sigma[:, part]
-        return replace(self, given=CameraPrior(self.given.mean, given))
+        return replace(self, given=replace(self.given, sigma=given))
 
     def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
         """Return the standard deviations (N, q), splines and steps as large as each view's show."""
@@ -325,75 +310,98 @@ class Variances:
             out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
 
-    @property
-    def _degrees(self) -> int:
-        return self.unknowns.drift if self.unknowns.geometric else 0
-
-    @property
-    def _of_drift(self) -> slice:
-        return slice(self.constants, self.constants + 3 * self._degrees)
-
-    def _drift_part(self, degree: int) -> slice:
-        return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
-
     def _prior(self, scale: Array, wide: Array) -> CameraPrior:
-        """Return the priors given, constants wider by `scale` (N,), drifts by `wide` (D,)."""
+        """Return the priors given, constants wider by `scale` (N,), drifts and what is along the lines of sight by
+        `wide` (D + 1,).
+        """
         sigma = self.given.sigma.copy()
         sigma[:, : self.constants] *= scale[:, None]
-        for degree, factor in enumerate(wide):
+        for degree, factor in enumerate(wide[:-1]):
             part = self._drift_part(degree)
             sigma[:, part] *= factor
-            if degree == 0 and self.learn_drift:
+            if degree == 0 and self.learns:
                 sigma[:, part] = np.hypot(sigma[:, part], _CENTRE_MOTION_SHARE * sigma[:, :3])
-        return CameraPrior(self.given.mean, sigma)
+        # where a place is less known than stated, a turn is not known better
+        return replace(self.given, sigma=sigma, wider=np.maximum(wide[-1] / scale, 1.0)[:, None, None])
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
-        """Return the share (N, q), 0 to 1, by which the observations determine each unknown."""
-        shape = prior.sigma.shape
-        use = covariance.free.reshape(shape) & np.isfinite(prior.sigma)
+        """Return the share (N, q + 2), 0 to 1, by which the observations determine each unknown."""
         probed = covariance.is_large and not exact
-        variance = covariance.probed_variances() if probed else covariance.variances()
-        known = 1.0 - variance / prior.sigma**2
-        return np.where(use, known.clip(0.0, 1.0), 0.0)
+        blocks = covariance.probed_views() if probed else covariance.of_views()
+        return self._share(blocks, prior, covariance.free)
 
-    def _squares(
-        self, params: Array, known: Array, scale: Array | float = 1.0, part: slice | None = None
-    ) -> tuple[Array, Array]:
-        """Return the squared unknowns (constants, or a part) of every view over their variances, their freedom (N,)."""
-        part = slice(self.constants) if part is None else part
-        sigma = self.given.sigma[:, part] * np.reshape(scale, (-1, 1))
-        squared = ((params - self.given.mean)[:, part] / sigma) ** 2
-        return np.where(known[:, part] > 0, squared, 0.0).sum(axis=1), known[:, part].sum(axis=1)
+    def _share(self, blocks: Array, prior: CameraPrior, free: BoolArray) -> Array:
+        """Return the share (N, q + 2) that covariances (N, q, q) leave to the observations of what priors say."""
+        use = free.reshape(prior.sigma.shape) & np.isfinite(prior.sigma)
+        inverse = np.where(use, 1.0 / prior.sigma, 0.0)
+        sight = prior.along * use[:, None]
+        whitened = inverse[:, :, None] * blocks * inverse[:, None]
+        along = ((sight @ whitened) * sight).sum(axis=2)
+        rest = np.eye(whitened.shape[1]) - np.swapaxes(sight, 1, 2) @ sight
+        across = use - ((rest @ whitened) * rest).sum(axis=2) - (sight**2).sum(axis=1)
+        return np.hstack([across, (sight**2).sum(axis=2) - along / np.reshape(prior.wider, (-1, 1)) ** 2]).clip(
+            0.0, 1.0
+        )
+
+    def _by_view(self, params: Array, known: Array) -> Array:
+        """Return the squared unknowns of every view and kind over the variances given, their freedom (2, N, 2 + D)."""
+        off = (params - self.given.mean) / self.given.sigma
+        along = (self.given.along @ off[..., None])[..., 0]
+        seen = np.hstack([off - (along[:, None] @ self.given.along)[:, 0], along])
+        return np.stack([np.where(known > 0, seen**2, 0.0), known]) @ self._kinds.T
+
+    def _sums(self, params: Array, known: Array) -> Array:
+        """Return the same of all views and those of an earlier block (2 + D, 2)."""
+        return np.asarray(self._by_view(params, known).sum(axis=1).T + np.delete(self._before, [1, 2], axis=0))
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
         """Return whether the corrections are larger than chance allows."""
-        squares, free = self._before(0)
-        total, freedom = (float(part.sum()) for part in self._squares(params, known, scale))
-        total, freedom = total + squares / float(np.min(scale)) ** 2, freedom + free
+        squares, free = self._before[0]
+        total, freedom = self._by_view(params, known)[..., 0]
+        total, freedom = (total / scale**2).sum() + squares / float(np.min(scale)) ** 2, freedom.sum() + free
         return freedom > _MIN_FREEDOM and float(chdtrc(freedom, total)) < LEVEL
 
     def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
-        """Return the factors (N,) by which each view's prior is widened, and the views that are odd."""
-        n = len(params)
-        total, freedom = self._squares(params, known)
-        common = np.full(n, self._common(total, freedom))
+        """Return the factors (N,) by which each view's prior is widened, and the views that are odd.
+
+        Explanations are compared where each is likeliest, and priors are then as wide as they may be.
+        """
+        n, free = len(params), around.problem.free
+        total, freedom = self._by_view(params, known)[..., 0]
+        usual = np.full(n, self._common(total, freedom, False))
+        for _ in range(ITERATIONS if around.small and n > 2 else 0):  # under wider priors corrections are larger
+            last, there = usual[0], around.posterior(self._prior(usual, wide))
+            shares = self._share(there.blocks, there.prior, free)
+            total, freedom = self._by_view(there.offset + self.given.mean, shares)[..., 0]
+            usual = np.full(n, self._common(total, freedom, False))
+            if abs(np.log(usual[0] / last)) < STANDS:
+                break
+        careful = np.full(n, self._common(total, freedom, self.cautious))
         if n <= 2:
-            return common, np.zeros(n, dtype=bool)
-        both, beyond, together = self._odd(around, wide, common)
+            return careful, np.zeros(n, dtype=bool)
+        both, beyond, together = self._odd(around, wide, careful)
+        if self.cautious:
+            together = max(together, around.posterior(self._prior(usual, wide)).evidence)
         few, odd, alone = self._odd(around, wide, np.ones(n), together)
         if alone >= together + _LIKELIER:
             return few, odd
-        if beyond.any():  # which the others need not be as wide for
-            both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond]))
+        # which the others need not be as wide for
+        both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond], self.cautious))
         return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # priors that cover either
 
-    def _common(self, total: Array, freedom: Array) -> float:
+    def _common(self, total: Array, freedom: Array, careful: bool) -> float:
         """Return the factor by which the priors of views are widened together, by their squares and freedoms (n,)."""
-        squares, free = self._before(0) + np.array([total.sum(), freedom.sum()])
-        factor = max((STATED_FREEDOM + squares) / (STATED_FREEDOM + free), 1.0)
-        if self.cautious:
-            factor = max(factor, _possible(squares, free))
-        return float(np.sqrt(factor))
+        squares, free = self._before[0] + np.array([total.sum(), freedom.sum()])
+        return float(np.sqrt(max(self._likely(squares, free, careful), 1.0)))
+
+    def _likely(self, total: float, freedom: float, careful: bool) -> float:
+        """Return a variance, in units of the one given, by squares and their freedom, that given counting for a few;
+        if one is `careful`, the largest that still makes so few squares likely enough.
+        """
+        likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
+        if not careful or freedom <= _MIN_FREEDOM:
+            return float(likely)
+        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
 
     def _odd(
         self, around: _Around, wide: Array, usual: Array, rival: float | None = None
@@ -423,30 +431,29 @@ class Variances:
             as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
             odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
             chosen[tops] = size[tops]
-            known, count = known.under(self._prior(chosen, wide), around), count + int(tops.sum())
+            known, count = around.posterior(self._prior(chosen, wide)), count + int(tops.sum())
         return scale, odd, known.evidence - count * price
 
     def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:
         """Return the evidence (N,) for each view being odd as well, and the factor that its prior then needs."""
         prior = self._prior(np.maximum(scale, GROSS), wide)
-        _, offset, variance = known.alone(prior.sigma)
-        seen = 1.0 - variance / prior.sigma**2
-        seen = np.where(known.free & np.isfinite(prior.sigma), seen.clip(0.0, 1.0), 0.0)
-        total, freedom = self._squares(offset + self.given.mean, seen)
+        _, offset, blocks = known.alone(prior)
+        seen = self._share(blocks, prior, known.around.problem.free)
+        total, freedom = self._by_view(offset + self.given.mean, seen)[..., 0]
         size = np.maximum(np.sqrt((STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)), scale)
-        return known.alone(self._prior(size, wide).sigma)[0], size
+        return known.alone(self._prior(size, wide))[0], size
 
-    def _drift(self, params: Array, known: Array) -> Array:
-        """Return the factors (D,) on the drift's standard deviations, the given ones counting for a few."""
+    def _beside(self, params: Array, known: Array) -> Array:
+        """Return the factors (D + 1,) on the standard deviations of the drift, the given ones counting for a few, and
+        of what is along the lines of sight, where that is larger than chance allows.
+        """
         waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
-        factors = np.ones(self._degrees)
-        for degree in range(self._degrees):
-            own = self._squares(params, known, part=self._drift_part(degree))
-            total, freedom = self._before(3 + degree) + np.array([x.sum() for x in own])
-            factors[degree] = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
-            if careful and freedom > _MIN_FREEDOM and chdtrc(freedom, total) < CHANCE:
-                factors[degree] = max(factors[degree], _possible(total, freedom))
+        factors = np.ones(1 + self._degrees)
+        for kind, (total, freedom) in enumerate(self._sums(params, known)[1:]):
+            chance = float(chdtrc(freedom, total)) if freedom > _MIN_FREEDOM else 1.0
+            if kind < self._degrees or chance < LEVEL:
+                factors[kind] = self._likely(total, freedom, careful and chance < CHANCE)
         return np.sqrt(factors)
 
 
@@ -467,17 +474,13 @@ def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
     return tops
 
 
-def _possible(total: float, freedom: float) -> float:
-    """Return a variance, in units of the one given, that still makes such a sum of squares likely enough."""
-    return float(total / (2.0 * gammaincinv(0.5 * freedom, _LOW)))
-
-
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
     """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
     infinite in both.
 
-    Of all unknowns, or a part.
+    Of all unknowns, or a part; those along the lines of sight among them.
     """
     one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
     finite = np.isfinite(one) & np.isfinite(other)
-    return bool((np.abs(np.log(one[finite] / other[finite])) < share).all())
+    apart = np.append(np.log(one[finite] / other[finite]), np.log(np.divide(a.wider, b.wider)))
+    return bool((np.abs(apart) < share).all())

@@ -69,9 +69,9 @@ class Covariance:
         q, every = self.num_unknowns, np.arange(len(self.free) // self.num_unknowns)
         return np.asarray(self.full.reshape(-1, q, len(every), q)[every, :, every])
 
-    def probed_variances(self) -> Array:
-        """Estimate the variances (N, q) by random probes (Hutchinson 1990) at the cost of a few solutions:
-        each within a quarter (RMS).
+    def probed_views(self) -> Array:
+        """Estimate the covariances (N, q, q) of every view's unknowns by random probes (Hutchinson 1990) at the cost of
+        a few solutions: each variance within a quarter (RMS).
 
         Unknowns count in units of their standard deviation where all other views stood still: a variance would
         drown in those of others that are a hundred times as large.
@@ -81,8 +81,9 @@ class Covariance:
         unit[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
         random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, FEW))
         probes = np.where(random > 0, 1.0, -1.0)
-        found = (probes * self.solve(probes / unit.reshape(-1, 1))).mean(axis=1)
-        return np.asarray(found.reshape(-1, q) * unit)
+        solved = self.solve(probes / unit.reshape(-1, 1)).reshape(*unit.shape, FEW)
+        found = solved @ np.swapaxes(probes.reshape(*unit.shape, FEW), 1, 2) / FEW * unit[:, None]
+        return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
 
     def view(self, i: int, j: int | None = None) -> Array:
         """Return the covariance (q, q) of the unknowns of view i (with those of view j)."""

@@ -80,11 +80,10 @@ class Reduced:
         return factorize_blocks(self.matrix, order, damping, less)
 
     def with_diagonal(self, more: Array) -> Reduced:
-        """Return the same with the precisions (N, q) of priors on single unknowns added to S's diagonal."""
+        """Return the same with (N, q, q) added to S's diagonal blocks: what priors on single views know."""
         if isinstance(self.matrix, np.ndarray):
-            return replace(self, matrix=self.matrix + np.diag(more.ravel()))
-        diagonal = self.matrix.diagonal + more[:, :, None] * np.eye(more.shape[1])
-        return replace(self, matrix=replace(self.matrix, diagonal=diagonal))
+            return replace(self, matrix=self.matrix + la.block_diag(*more))
+        return replace(self, matrix=replace(self.matrix, diagonal=self.matrix.diagonal + more))
 
     def with_joint(self, index: IntArray, information: Array) -> Matrix:
         """Return S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
@@ -138,24 +137,23 @@ def reduce_normal(
     by_unknown: Array,
     point_matrix: Array,
     point_gradient: Array,
-    camera_diagonal: Array,
+    camera_matrix: Array,
     camera_gradient: Array,
     point_prior: PointPrior | None = None,
 ) -> Reduced:
     """Eliminate the points of a linearised problem; the cost is without the priors' part.
 
     Of whitened residuals (2, K) and their derivatives (2, 3, K) and (2, q, K). Priors add `point_matrix` (6, P,
-    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_diagonal` and
-    `camera_gradient` (N, q) to the diagonal of S and to g; the common errors of `point_prior` are eliminated too.
+    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_matrix` (N, q, q) and
+    `camera_gradient` (N, q) to S's diagonal blocks and to g; the common errors of `point_prior` are eliminated too.
     """
-    q = by_unknown.shape[1]
     sums = structure.sum_points(point_products(by_point, residual))
     lower = cholesky3(sums[:6] + point_matrix)
     half = solve_lower(lower, sums[6:] + point_gradient)
     cross = _eliminate(structure, by_point, by_unknown, lower)
     diagonal, gradient = _of_views(structure, residual, by_unknown, cross, half)
     gradient += camera_gradient
-    diagonal[:, np.arange(q), np.arange(q)] += camera_diagonal
+    diagonal += camera_matrix
     matrix, slope_all = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
     gain = float((half**2).sum())
     common = None

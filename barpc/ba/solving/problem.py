@@ -84,15 +84,15 @@ class Problem:
         by_point, by_unknown = projected.by_point, projected.by_unknown
         by_point *= weight
         by_unknown *= weight
-        jacobian = self.camera_prior.jacobian()
+        precision = self.camera_prior.precision()
         reduced = reduce_normal(
             structure,
             residual,
             by_point,
             by_unknown,
             *self.point_terms(points),
-            jacobian**2,
-            jacobian * self.camera_prior.residual(params),
+            precision,
+            (precision @ (params - self.camera_prior.mean)[..., None])[..., 0],
             self.point_prior,
         )
         reduced = replace(reduced, cost=reduced.cost + self.prior_cost(params, points))
