@@ -7,10 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.optimize
 
+from barpc.ba import AdjustOptions
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.solving import solve
 from barpc.ba.solving.solve import Minimum, State, _has_converged
 from barpc.base.errors import AdjustError
+from barpc.simulate import simulate_block
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
 FACTOR = object()
@@ -187,3 +191,24 @@ def test_auto_asks_scipy_for_the_minimum_of_up_to_200_unknowns(
     problem: Any = SimpleNamespace(free=np.arange(300) < free)
     found: Any = solve.minimise(problem, STATE, np.ones(1), asked, tolerance, "projected")  # type: ignore[arg-type]
     assert found.said == (taken, tolerance, "projected")
+
+
+def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(monkeypatch) -> None:
+    """Far off, points are nowhere: going back from there by their linearisation would not bring them back."""
+    options, made = AdjustOptions(), simulate_block(3, 60, attitude=1e-6, position=0.2)
+    block = join(made.views, made.tracks, None, options)
+    problem = make_problem(block, options, None, None)
+    state, _ = first_state(problem, block, options, None)
+
+    def astray(residual: Any, start: Any, jacobian: Any, **_: Any) -> Any:
+        least = float((residual(start) ** 2).sum())
+        for size in (1e6, 1e9):
+            assert float((residual(start + size) ** 2).sum()) > 1e3 * least
+        assert float((residual(start) ** 2).sum()) == pytest.approx(least, rel=1e-12)
+        return SimpleNamespace(x=start, nfev=4, message="ended.", success=True)
+
+    monkeypatch.setattr(scipy.optimize, "least_squares", astray)
+    found = solve.minimise(problem, state, block.use / block.sigma, "scipy")
+    np.testing.assert_array_equal(found.state.points, state.points)
+    np.testing.assert_array_equal(found.state.params, state.params)
+    assert found.state.cost == found.reduced.cost == min(found.state.history)

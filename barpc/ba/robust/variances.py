@@ -446,6 +446,8 @@ class Variances:
     def _beside(self, params: Array, known: Array) -> Array:
         """Return the factors (D + 1,) on the standard deviations of the drift, the given ones counting for a few, and
         of what is along the lines of sight, where that is larger than chance allows.
+
+        A mode that hardly anything determines would grow without end, beyond where it is linear.
         """
         waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
@@ -454,7 +456,7 @@ class Variances:
             chance = float(chdtrc(freedom, total)) if freedom > _MIN_FREEDOM else 1.0
             if kind < self._degrees or chance < LEVEL:
                 factors[kind] = self._likely(total, freedom, careful and chance < CHANCE)
-        return np.sqrt(factors)
+        return np.minimum(np.sqrt(factors), TIMES)
 
 
 def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:

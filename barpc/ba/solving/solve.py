@@ -215,6 +215,7 @@ class _WhitenedProblem:
         self.upper0 = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
         self.key = np.zeros(len(self.upper0)).tobytes()
         self._compress(self.upper0)
+        self.lowest = self.key, self.state, self.reduced
 
     def _compress(self, upper: Array) -> None:
         gradient = self.reduced.gradient[self.problem.free]
@@ -224,17 +225,23 @@ class _WhitenedProblem:
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
     def at(self, x: Array) -> None:
-        """Linearise at whitened unknowns, unless that was the last thing done."""
-        if x.tobytes() == self.key:
+        """Linearise at whitened unknowns, unless that was the last thing done.
+
+        Points are moved from the lowest cost so far: those of a step that failed may be anywhere.
+        """
+        key = x.tobytes()
+        if key == self.key:
             return
-        step = np.zeros(self.start.size)
-        step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
-        params = self.start + step.reshape(self.start.shape)
-        state = self.state.moved(params - self.state.params, self.reduced, np.inf)
-        self.reduced = self.problem.reduce(state.params, state.points, self.weight)
-        cost = self.reduced.cost
-        self.state = replace(state, cost=cost, history=(*self.state.history, cost))
-        self.key = x.tobytes()
+        self.key, (known, state, reduced) = key, self.lowest
+        if key != known:
+            step = np.zeros(self.start.size)
+            step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
+            state = state.moved(self.start + step.reshape(self.start.shape) - state.params, reduced, np.inf)
+            reduced = self.problem.reduce(state.params, state.points, self.weight)
+            state = replace(state, cost=reduced.cost, history=(*self.state.history, reduced.cost))
+        if reduced.cost <= self.lowest[1].cost:
+            self.lowest = key, state, reduced
+        self.state, self.reduced = state, reduced
         self._compress(la.cholesky(self.reduced.plain(self.problem.free), check_finite=False))
 
     def residual(self, x: Array) -> Array:
