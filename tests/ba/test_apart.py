@@ -70,15 +70,7 @@ def met(found: Adjustment, block: SimulatedBlock, view: int) -> float:
     [
         pytest.param(shifted, "offset", id="another tile"),
         pytest.param(swapped, "axes", id="axes swapped", marks=pytest.mark.slow),  # before a commit: test_placing
-        pytest.param(
-            raised,
-            "height",
-            id="another datum",
-            marks=[
-                pytest.mark.slow,
-                pytest.mark.xfail(reason="of a triplet it is within what moves along a sight hide"),
-            ],
-        ),
+        pytest.param(raised, "height", id="another datum", marks=pytest.mark.slow),
     ],
 )
 def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, change: Change, look: str) -> None:
@@ -304,7 +296,6 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="0.24 px are left since turns along the sight are learnt; 0.15 px before")
 def test_detectors_that_lie_off_make_a_camera_no_other_images() -> None:
     """Eight of a pixel each: more than half of its ties contradict the others wherever it is, but its columns do it."""
     world = make("plane", 6)

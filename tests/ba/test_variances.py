@@ -35,7 +35,7 @@ def variances(n: int, model: str = "rotation", drift: int = 0, cautious: bool = 
 
 def seen(known: np.ndarray) -> np.ndarray:
     """Shares (N, q) by which unknowns are determined, with those along lines of sight that there are none of."""
-    return np.hstack([known, np.zeros((len(known), 2))])
+    return np.hstack([known, np.zeros((len(known), 1))])
 
 
 ANY: Any = SimpleNamespace(problem=SimpleNamespace(free=None), small=False)
@@ -100,7 +100,17 @@ def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four(
     params[:, 3] += 3.0  # sigma 1: squares 9 and 9 of 6 degrees
     params[0, 6] += 2.0
     expected = np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6), 1.0])
-    np.testing.assert_allclose(v._beside(params, seen(known)), expected)
+    np.testing.assert_allclose(v._beside(params, seen(known), None), expected)
+
+
+def test_a_drift_grows_thirtyfold_at_most_from_one_linearisation_to_the_next() -> None:
+    """One that the observations hardly determine is anywhere in what is linear."""
+    v = variances(2, "rotation", 1)
+    params, known = v.given.mean.copy(), np.ones((2, 6))
+    params[:, 3] += 1e6
+    assert v._beside(params, seen(known), None)[0] == 30.0
+    last = PriorTest(1.0, 2.0, np.ones(2), np.zeros(2, dtype=bool), (), wide=(30.0, 1.0))
+    assert v._beside(params, seen(known), last)[0] == 900.0
 
 
 @pytest.mark.parametrize("cautious", [False, True])
@@ -114,8 +124,8 @@ def test_drifts_of_another_platform_are_let_be_as_large_as_they_may_be(cautious,
     likely, possible = (4 + total) / (4 + 6), total / chi2.ppf(0.1, 6)
     assert possible > likely
     expected = possible if cautious and unexpected else likely
-    np.testing.assert_allclose(v._beside(params, seen(known)), np.sqrt([expected, 1.0]))
-    np.testing.assert_allclose(v._beside(params, seen(0.49 / 6 * known))[0], np.sqrt((4 + total) / (4 + 0.49)))
+    np.testing.assert_allclose(v._beside(params, seen(known), None), np.sqrt([expected, 1.0]))
+    np.testing.assert_allclose(v._beside(params, seen(0.49 / 6 * known), None)[0], np.sqrt((4 + total) / (4 + 0.49)))
 
 
 def test_without_control_priors_are_rather_too_wide_than_too_narrow() -> None:
@@ -330,8 +340,8 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     assert (abs(off.mean(axis=0)) < 0.05).all()
     prior = prior_sigmas(block.views, found.options, 1, None)
     known = 1 - true[:, :6] / prior[:, :6] ** 2
-    sight, blocks = found.cameras.unknowns.sight / prior[:, None], covariance.of_views()
-    along = 2 - ((sight @ blocks) * sight).sum(axis=(1, 2))
+    turn, blocks = found.cameras.unknowns.sight / prior, covariance.of_views()
+    along = 1 - ((turn[:, None] @ blocks)[:, 0] * turn).sum(axis=1)
     np.testing.assert_allclose(found.prior.freedom, known.sum() - along.sum(), rtol=1e-6)
 
 
@@ -501,7 +511,7 @@ def test_where_waves_are_followed_a_drift_is_as_large_as_it_shows() -> None:
     v = replace(waved(2), cautious=True)
     params, known = np.zeros(v.given.sigma.shape), np.ones(v.given.sigma.shape)
     params[0, 3] = 30.0
-    np.testing.assert_allclose(v._beside(params, seen(known)), np.sqrt([(4 + 225) / (4 + 6), 1.0]))
+    np.testing.assert_allclose(v._beside(params, seen(known), None), np.sqrt([(4 + 225) / (4 + 6), 1.0]))
 
 
 @pytest.fixture(scope="module")

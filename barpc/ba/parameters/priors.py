@@ -30,21 +30,21 @@ NOISE_FLOOR = AdjustOptions().noise_floor
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Independent priors (p - mean) / sigma, those along the lines of sight wider.
+    """Independent priors (p - mean) / sigma; those of turns about the lines of sight are wider.
 
-    What is stated of a camera is where it sees a place. Its turn about its line of sight, and how far off it is, move
-    the scale and the azimuth of an image but not its middle.
+    An accuracy is stated of the place that a camera sees. A turn about its line of sight moves all of the image but its
+    middle.
     """
 
     mean: Array  # (N, q) of every view's unknowns
     sigma: Array  # (N, q)
-    sight: Array | None = None  # (N, 2, q) orthonormal: turn about and move along the line of sight; zeros: none
-    wider: Array | float = 1.0  # (N, 1, 1) by how much their standard deviations are
+    sight: Array | None = None  # (N, q) unit vectors of a turn about the line of sight; zeros: none
+    wider: Array | float = 1.0  # (N, 1) by how much its standard deviation is
 
     @property
-    def along(self) -> Array:
-        """The same (N, 2, q), zeros where there is none."""
-        return np.zeros((len(self.sigma), 2, self.sigma.shape[1])) if self.sight is None else self.sight
+    def turn(self) -> Array:
+        """The unit vectors (N, q) of turns about the lines of sight, zeros where there are none."""
+        return np.zeros_like(self.sigma) if self.sight is None else self.sight
 
     def residual(self, params: Array) -> Array:
         """Return the whitened residuals (N, q) of unknowns (N, q)."""
@@ -54,12 +54,12 @@ class CameraPrior:
         """Return changes of unknowns (N, q) or (N, q, m) over their standard deviations."""
         flat = values.reshape(*self.sigma.shape, -1) / self.sigma[..., None]
         if np.any(self.wider != 1.0):
-            flat -= (1.0 - 1.0 / self.wider) * (np.swapaxes(self.along, 1, 2) @ (self.along @ flat))
+            flat -= ((1.0 - 1.0 / self.wider) * self.turn)[..., None] * (self.turn[:, None] @ flat)
         return flat.reshape(values.shape)
 
     def loosest(self) -> Array:
         """Return standard deviations (N, q) of independent unknowns that hold them in no direction more than these."""
-        return np.where(self.along.any(axis=1), np.reshape(self.wider, (-1, 1)), 1.0) * self.sigma
+        return np.where(self.turn != 0.0, self.wider, 1.0) * self.sigma
 
     def precision(self) -> Array:
         """Return the information matrices (N, q, q)."""

@@ -72,12 +72,11 @@ class Unknowns:
 
     @property
     def sight(self) -> Array | None:
-        """Unit vectors (N, 2, q): turn about, move along the line of sight; zeros for radars, None where not known."""
-        if self.direction is None or not self.geometric:
+        """Unit vectors (N, q) of a turn about the line of sight; zeros for radars, None where there is none."""
+        if self.direction is None or not self.geometric or not self.rotates:
             return None
-        out = np.zeros((len(self.direction), 2, self.size))
-        for row, at in enumerate(range(0, self.constants, 3)):
-            out[:, row, at : at + 3] = self.direction
+        out = np.zeros((len(self.direction), self.size))
+        out[:, :3] = self.direction
         out[list(self.radars)] = 0.0
         return out
 

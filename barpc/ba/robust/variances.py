@@ -4,7 +4,7 @@ A prior's standard deviation is a guess. What the observations say about it is t
 determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
 determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). That holds
 for each kind of unknowns by itself: those that move an image's middle, of which an accuracy is stated; turns about the
-line of sight and moves along it, which ties see well and which say nothing of the place; drifts degree by degree.
+line of sight, which tie points determine well and which say nothing of the place; drifts degree by degree.
 Where the sum of the first is larger than chance allows, some prior was too narrow: that of one view, if its correction
 alone explains it (every view that would is held possible: three in a row along the flight cannot tell which), else
 that of all.
@@ -55,7 +55,13 @@ class PriorTest:
     # what the corrections show, with those of an earlier block (see `Variances.shown`)
     shown: Array | None = None
     failed: bool = False  # the matrix could not be factorised: nothing was learnt
-    turned: float = 1.0  # by how much standard deviations along the lines of sight were widened beside that
+    # by how much those of the drift's degrees, and of turns about the lines of sight, were widened
+    wide: tuple[float, ...] = (1.0,)
+
+    @property
+    def turned(self) -> float:
+        """By how much the standard deviations of turns about the lines of sight were widened."""
+        return self.wide[-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +106,7 @@ def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
     """Return the logarithms (N,) of the determinants of proper priors on free unknowns; others add nothing."""
     sigma = prior.sigma
     use = free.reshape(sigma.shape) & np.isfinite(sigma)
-    along = (prior.along**2 * use[:, None] * np.log(prior.wider)).sum(axis=(1, 2))
+    along = (prior.turn**2 * use * np.log(prior.wider)).sum(axis=1)
     return np.asarray(2.0 * (np.log(sigma, where=use, out=np.zeros(sigma.shape)).sum(axis=1) + along))
 
 
@@ -179,12 +185,12 @@ class Variances:
 
     @cached_property
     def _kinds(self) -> Array:
-        """(2 + D, q + 2) which unknowns are of which kind: the place, the drift by degree, along the lines of sight.
+        """(2 + D, q + 1) which unknowns are of which kind: the place, the drift by degree, the turns.
 
-        The last two are a turn about that line and a move along it, which the constants are without.
+        The last is a turn about the line of sight, which the constants are without.
         """
-        kinds = np.zeros((2 + self._degrees, self.given.sigma.shape[1] + 2))
-        kinds[0, : self.constants] = kinds[-1, -2:] = 1.0
+        kinds = np.zeros((2 + self._degrees, self.given.sigma.shape[1] + 1))
+        kinds[0, : self.constants] = kinds[-1, -1] = 1.0
         for degree in range(self._degrees):
             kinds[1 + degree, self._drift_part(degree)] = 1.0
         return kinds
@@ -204,19 +210,19 @@ class Variances:
         `last` is what the priors of the problem were learnt with, where they were. A large block's variances are
         probed unless they are to be `exact`.
         """
-        widened = last is not None and bool((last.scale > 1.0).any())
         try:
-            return self._learnt(problem, minimum, widened, exact)
+            return self._learnt(problem, minimum, last, exact)
         except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
             logger.info("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
-            nothing = PriorTest(
-                float("nan"), 0.0, np.ones(n), np.zeros(n, dtype=bool), (), shown=self.shown, failed=True
-            )
+            ones, none = (1.0,) * (1 + self._degrees), np.zeros(n, dtype=bool)
+            nothing = PriorTest(float("nan"), 0.0, np.ones(n), none, (), shown=self.shown, failed=True, wide=ones)
             return problem.camera_prior, nothing
 
-    def _learnt(self, problem: Problem, minimum: Minimum, widened: bool, exact: bool) -> tuple[CameraPrior, PriorTest]:
-        """Return the result of `learnt` for a problem whose constants' priors were `widened` or not."""
+    def _learnt(
+        self, problem: Problem, minimum: Minimum, last: PriorTest | None, exact: bool
+    ) -> tuple[CameraPrior, PriorTest]:
+        """Return the result of `learnt`, where the matrix can be factorised."""
         if self.learn_waves:
             self = self._going_on(problem.camera_prior.sigma)
         around = _Around(problem, minimum)
@@ -231,16 +237,16 @@ class Variances:
         ratio = total / freedom if freedom > _MIN_FREEDOM else float("nan")
         shared = self._shared(params, known)
         # constants of a large block that were widened take from the drift, which need not stand again
-        stands = not around.small and widened
+        stands = not around.small and last is not None and bool((last.scale > 1.0).any())
         for _ in range(ITERATIONS if self.learns or self.learn_waves else 0):
             before = prior
             if self.learn_waves:
                 self = self._going_on(self._waves(params, known, prior.sigma))
-            wide = self._beside(params, known) if self.learns else wide
+            wide = self._beside(params, known, last) if self.learns else wide
             prior = self._prior(scale, wide)
             # a drift or a turn larger than thought looks like a place that is: it is learnt before that is asked
-            last, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
-            stands |= same_prior(prior, last, least, slice(self.constants, self.constants + 3 * self._degrees))
+            other, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
+            stands |= same_prior(prior, other, least, slice(self.constants, self.constants + 3 * self._degrees))
             if stands and self.learns and self._too_large(params, known, scale):
                 scale, odd = self._widened(around, params, known, wide)
                 prior = self._prior(scale, wide)
@@ -252,7 +258,14 @@ class Variances:
         sigma = prior.sigma.copy()
         sigma[:, : self.constants] *= shared[:, None]
         tested = PriorTest(
-            ratio, freedom, scale, odd, drift, float(shared.max()), self._showing(params, known), turned=float(wide[-1])
+            ratio,
+            freedom,
+            scale,
+            odd,
+            drift,
+            float(shared.max()),
+            self._showing(params, known),
+            wide=tuple(wide.tolist()),
         )
         return replace(prior, sigma=sigma), tested
 
@@ -322,32 +335,30 @@ class Variances:
             if degree == 0 and self.learns:
                 sigma[:, part] = np.hypot(sigma[:, part], _CENTRE_MOTION_SHARE * sigma[:, :3])
         # where a place is less known than stated, a turn is not known better
-        return replace(self.given, sigma=sigma, wider=np.maximum(wide[-1] / scale, 1.0)[:, None, None])
+        return replace(self.given, sigma=sigma, wider=np.maximum(wide[-1] / scale, 1.0)[:, None])
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
-        """Return the share (N, q + 2), 0 to 1, by which the observations determine each unknown."""
+        """Return the share (N, q + 1), 0 to 1, by which the observations determine each unknown."""
         probed = covariance.is_large and not exact
         blocks = covariance.probed_views() if probed else covariance.of_views()
         return self._share(blocks, prior, covariance.free)
 
     def _share(self, blocks: Array, prior: CameraPrior, free: BoolArray) -> Array:
-        """Return the share (N, q + 2) that covariances (N, q, q) leave to the observations of what priors say."""
+        """Return the share (N, q + 1) that covariances (N, q, q) leave to the observations of what priors say."""
         use = free.reshape(prior.sigma.shape) & np.isfinite(prior.sigma)
         inverse = np.where(use, 1.0 / prior.sigma, 0.0)
-        sight = prior.along * use[:, None]
+        turn = prior.turn * use
         whitened = inverse[:, :, None] * blocks * inverse[:, None]
-        along = ((sight @ whitened) * sight).sum(axis=2)
-        rest = np.eye(whitened.shape[1]) - np.swapaxes(sight, 1, 2) @ sight
-        across = use - ((rest @ whitened) * rest).sum(axis=2) - (sight**2).sum(axis=1)
-        return np.hstack([across, (sight**2).sum(axis=2) - along / np.reshape(prior.wider, (-1, 1)) ** 2]).clip(
-            0.0, 1.0
-        )
+        along = ((whitened @ turn[..., None])[..., 0] * turn).sum(axis=1, keepdims=True)
+        rest = np.eye(whitened.shape[1]) - turn[:, :, None] * turn[:, None]
+        across = use - ((rest @ whitened) * rest).sum(axis=2) - turn**2
+        return np.hstack([across, (turn**2).sum(axis=1, keepdims=True) - along / prior.wider**2]).clip(0.0, 1.0)
 
     def _by_view(self, params: Array, known: Array) -> Array:
         """Return the squared unknowns of every view and kind over the variances given, their freedom (2, N, 2 + D)."""
         off = (params - self.given.mean) / self.given.sigma
-        along = (self.given.along @ off[..., None])[..., 0]
-        seen = np.hstack([off - (along[:, None] @ self.given.along)[:, 0], along])
+        along = (self.given.turn * off).sum(axis=1, keepdims=True)
+        seen = np.hstack([off - along * self.given.turn, along])
         return np.stack([np.where(known > 0, seen**2, 0.0), known]) @ self._kinds.T
 
     def _sums(self, params: Array, known: Array) -> Array:
@@ -382,7 +393,8 @@ class Variances:
         both, beyond, together = self._odd(around, wide, careful)
         if self.cautious:
             together = max(together, around.posterior(self._prior(usual, wide)).evidence)
-        few, odd, alone = self._odd(around, wide, np.ones(n), together)
+        # turns of all views explain what a wrong one shows: it is looked for without
+        few, odd, alone = self._odd(around, np.append(wide[:-1], 1.0), np.ones(n), together)
         if alone >= together + _LIKELIER:
             return few, odd
         # which the others need not be as wide for
@@ -443,20 +455,20 @@ class Variances:
         size = np.maximum(np.sqrt((STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)), scale)
         return known.alone(self._prior(size, wide))[0], size
 
-    def _beside(self, params: Array, known: Array) -> Array:
-        """Return the factors (D + 1,) on the standard deviations of the drift, the given ones counting for a few, and
-        of what is along the lines of sight, where that is larger than chance allows.
+    def _beside(self, params: Array, known: Array, last: PriorTest | None) -> Array:
+        """Return the factors (D + 1,) on the standard deviations of the drift and of turns about the lines of sight,
+        the given ones counting for a few.
 
-        A mode that hardly anything determines would grow without end, beyond where it is linear.
+        No more than so many times those of the `last` linearisation, which holds no further: a mode that hardly
+        anything determines would grow without end.
         """
         waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
-        factors = np.ones(1 + self._degrees)
-        for kind, (total, freedom) in enumerate(self._sums(params, known)[1:]):
-            chance = float(chdtrc(freedom, total)) if freedom > _MIN_FREEDOM else 1.0
-            if kind < self._degrees or chance < LEVEL:
-                factors[kind] = self._likely(total, freedom, careful and chance < CHANCE)
-        return np.minimum(np.sqrt(factors), TIMES)
+        factors = [
+            self._likely(total, freedom, careful and float(chdtrc(freedom, total)) < CHANCE)
+            for total, freedom in self._sums(params, known)[1:]
+        ]
+        return np.minimum(np.sqrt(factors), TIMES * (1.0 if last is None else np.array(last.wide)))
 
 
 def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:
