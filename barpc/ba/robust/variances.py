@@ -6,7 +6,7 @@ determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesia
 for each kind of unknowns by itself: those that move an image's middle, of which an accuracy is stated; turns about the
 line of sight, which tie points determine well and which say nothing of the place; drifts degree by degree.
 Where the sum of the first is larger than chance allows, some prior was too narrow: that of one view, if its correction
-alone explains it (every view that would is held possible: three in a row along the flight cannot tell which), else
+alone explains it (every view that would is held possible: three in a row along the flight do not determine it), else
 that of all.
 """
 
@@ -77,7 +77,7 @@ class _Around:
         return len(self.problem.free) <= SMALL
 
     def change(self, now: CameraPrior, prior: CameraPrior) -> Array:
-        """Return what the information (N, q, q) of priors changes by from one to another; that of fixed views by 0."""
+        """Return the change of the information (N, q, q) from one prior to another; that of fixed views is 0."""
         free = self.problem.free.reshape(now.sigma.shape)
         return (prior.precision() - now.precision()) * free[..., None]
 
@@ -295,7 +295,7 @@ class Variances:
 
     @property
     def _before(self) -> Array:
-        """What an earlier block showed (4 + D, 2); zeros without one."""
+        """The sums of an earlier block (4 + D, 2), see `shown`; zeros without one."""
         return np.zeros((4 + self._degrees, 2)) if self.shown is None else self.shown
 
     def _showing(self, params: Array, known: Array) -> Array:
@@ -324,7 +324,7 @@ class Variances:
         return out
 
     def _prior(self, scale: Array, wide: Array) -> CameraPrior:
-        """Return the priors given, constants wider by `scale` (N,), drifts and what is along the lines of sight by
+        """Return the priors given, constants wider by `scale` (N,), drifts and turns about the lines of sight by
         `wide` (D + 1,).
         """
         sigma = self.given.sigma.copy()
@@ -344,7 +344,7 @@ class Variances:
         return self._share(blocks, prior, covariance.free)
 
     def _share(self, blocks: Array, prior: CameraPrior, free: BoolArray) -> Array:
-        """Return the share (N, q + 1) that covariances (N, q, q) leave to the observations of what priors say."""
+        """Return the share (N, q + 1) by which observations determine each unknown, from covariances (N, q, q)."""
         use = free.reshape(prior.sigma.shape) & np.isfinite(prior.sigma)
         inverse = np.where(use, 1.0 / prior.sigma, 0.0)
         turn = prior.turn * use

@@ -80,7 +80,7 @@ class Reduced:
         return factorize_blocks(self.matrix, order, damping, less)
 
     def with_diagonal(self, more: Array) -> Reduced:
-        """Return the same with (N, q, q) added to S's diagonal blocks: what priors on single views know."""
+        """Return the same with the information (N, q, q) of priors on single views added to S's diagonal blocks."""
         if isinstance(self.matrix, np.ndarray):
             return replace(self, matrix=self.matrix + la.block_diag(*more))
         return replace(self, matrix=replace(self.matrix, diagonal=self.matrix.diagonal + more))
