@@ -30,7 +30,6 @@ _TYPES = {
     ".vrt": "application/xml",
     ".xml": "application/xml",
     ".json": "application/json",
-    ".ntf": "application/vnd.nitf",
 }
 _COVARIANCE_ENTRIES = [(i, j) for i in range(3) for j in range(i, 3)]
 _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _COVARIANCE_ENTRIES)
@@ -202,7 +201,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 
 def _asset(path: Path, out: Path) -> dict[str, Any]:
-    of_pixels = path.suffix.lower() in (".vrt", ".tif", ".ntf")
+    of_pixels = path.suffix.lower() in (".vrt", ".tif")
     kind = _TYPES.get(path.suffix.lower(), "text/plain")
     return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 

@@ -126,7 +126,7 @@ def _tiff() -> bytes:
 
 def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
-    from barpc.rpcio.images import nitf_record
+    from tests.rpcio.conftest import nitf_record
 
     fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
     return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50
