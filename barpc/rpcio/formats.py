@@ -31,9 +31,7 @@ class Format:
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[..., str] | None = None  # of an RPC; `sized`: and of the width and height of its image, or None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
-    consumers: tuple[
-        str, ...
-    ] = ()  # that read what is written (`barpc.pipeline.verify_outputs.CONSUMERS`), besides barpc
+    consumers: tuple[str, ...] = ()  # besides barpc, of what is written: rows of `verify_outputs.CONSUMERS`
     sized: bool = False  # whether it states the size of its image
 
 
