@@ -41,7 +41,7 @@ from barpc.pipeline import adjust  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.geometry import altitude_range, epipolar_offset  # noqa: E402
-from barpc.tie import common_tracks, find_tracks, match_pairs, select_pairs  # noqa: E402
+from barpc.tie import find_tracks, match_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine  # noqa: E402
 from barpc.tie.patches.oriented import TEMPLATE_REACH, register_oriented  # noqa: E402
@@ -50,6 +50,7 @@ from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
 from tests.scenes.season import SEASONS, _part, disguised  # noqa: E402
 from tests.tie.conftest import Rendered, write_image  # noqa: E402
+from tests.tie.stages import common_tracks, select_pairs  # noqa: E402
 
 warnings.simplefilter("ignore")
 TRIPLET = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]

@@ -36,9 +36,10 @@ from scipy import ndimage  # noqa: E402
 
 from barpc.base.options import TieOptions  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
-from barpc.tie import common_tracks, find_tracks  # noqa: E402
+from barpc.tie import find_tracks  # noqa: E402
 from barpc.tie.pairing.epipolar import epipolar_segments, linear_map  # noqa: E402
 from barpc.tie.patches.register import MIN_CORRELATION, PATCH, register_patches  # noqa: E402
+from tests.tie.stages import common_tracks  # noqa: E402
 
 warnings.simplefilter("ignore")
 PAIRS = (

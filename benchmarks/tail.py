@@ -33,13 +33,14 @@ from rasterio.errors import NotGeoreferencedWarning
 from scipy.interpolate import RectBivariateSpline
 
 from barpc.base.geodesy import metres_per_unit
-from barpc.pointio.matches import read_matches, write_matches
+from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import simulate_block
+from tests.pointio.stages import read_matches
 
 SIDE, GSD = 512, 20.0  # px, m: images of ten kilometres
 LAYOUT = {"size": (SIDE, SIDE), "gsd": GSD, "attitude": 5e-5, "overlap": 0.1}

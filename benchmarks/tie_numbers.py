@@ -36,9 +36,10 @@ import barpc.tie  # noqa: E402
 from barpc.base.errors import BarpcError  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
-from barpc.tie import TieOptions, common_tracks, find_tracks  # noqa: E402
+from barpc.tie import TieOptions, find_tracks  # noqa: E402
 from benchmarks.seasons import CASES, write  # noqa: E402
 from benchmarks.ties import spread  # noqa: E402
+from tests.tie.stages import common_tracks  # noqa: E402
 
 warnings.simplefilter("ignore")
 MODULES = [importlib.import_module(found.name) for found in pkgutil.walk_packages(barpc.tie.__path__, "barpc.tie.")]

@@ -38,22 +38,11 @@ from barpc.pipeline.executor import CachingExecutor  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
-from barpc.tie import (  # noqa: E402
-    Area,
-    Scope,
-    TieOptions,
-    common_tracks,
-    detect,
-    find_tracks,
-    link,
-    match_pairs,
-    read_area,
-    refine,
-    select_pairs,
-)
+from barpc.tie import Area, Scope, TieOptions, find_tracks, link, match_pairs, read_area, refine  # noqa: E402
 from barpc.tie.pairing.epipolar import coherent, epipolar_segments  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
+from tests.tie.stages import common_tracks, detect, select_pairs  # noqa: E402
 
 
 def stages(views: list[View]) -> float:

@@ -94,9 +94,7 @@ class Remark(BarpcWarning):
     """An assumption that a result is based on, or a side effect: a command prints it and ends with exit code 0."""
 
 
-_MEMORY_ALLOWANCE = (
-    256 << 20
-)  # bytes: more than any library or block of work maps at once that fails while others still do not
+_MEMORY_ALLOWANCE = 256 << 20  # bytes: more than is mapped at once where that fails and others still do not
 _MEMORY = re.compile(
     r"failed to map segment|annot (?:allocate|map)|[Oo]ut of memory|[Ii]nsufficient memory|emory allocation failed|"
     r"nable to allocate|ot enough memory|can't start new thread"

@@ -30,7 +30,6 @@ _TYPES = {
     ".vrt": "application/xml",
     ".xml": "application/xml",
     ".json": "application/json",
-    ".ntf": "application/vnd.nitf",
 }
 _COVARIANCE_ENTRIES = [(i, j) for i in range(3) for j in range(i, 3)]
 _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _COVARIANCE_ENTRIES)
@@ -39,14 +38,6 @@ _VARIANCES = tuple(f"var_{'enu'[i]}{'enu'[j]}" for i, j in _COVARIANCE_ENTRIES)
 def as_json(value: Any) -> bytes:
     """Return a JSON text; what is not finite is null."""
     return (json.dumps(json_form(value), indent=1, ensure_ascii=False) + "\n").encode()
-
-
-def rpc_of(shot: Shot) -> dict[str, Any]:
-    """Return the corrected RPC in the names of rpcm."""
-    write = WRITABLE["json"].write
-    assert write is not None
-    found: dict[str, Any] = json.loads(write(shot.rpc))["rpc"]
-    return found
 
 
 # --- Sat-NeRF ---------------------------------------------------------------------------------------------
@@ -69,7 +60,7 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
         "geojson": {**(polygon(ring) or {}), "center": [float(wrap_longitude(middle[0])), float(middle[1])]},
         "min_alt": low,
         "max_alt": high,
-        "rpc": rpc_of(shot),
+        "rpc": shot.rpc.to_rpcm_dict(),
         "keypoints": {"2d_coordinates": shot.xy, "pts3d_indices": shot.index, "depths": depth},
     }
 
@@ -102,7 +93,7 @@ def _rpc_text(shot: Shot, name: str) -> bytes:
 
 def s2p(scene: Scene, out: Path) -> Files:
     """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
-    images = [{"img": _image(shot, out), "rpc": rpc_of(shot)} for shot in scene.shots]
+    images = [{"img": _image(shot, out), "rpc": shot.rpc.to_rpcm_dict()} for shot in scene.shots]
     return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
 
 
@@ -189,7 +180,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
             "proj:code": None,
             "proj:shape": [shot.size[1], shot.size[0]],
             "processing:software": {"barpc": scene.summary.barpc},
-            "rpc": rpc_of(shot),
+            "rpc": shot.rpc.to_rpcm_dict(),
         },
         "collection": scene.folder.resolve().name or "barpc",
         "links": [
@@ -202,7 +193,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
 
 
 def _asset(path: Path, out: Path) -> dict[str, Any]:
-    of_pixels = path.suffix.lower() in (".vrt", ".tif", ".ntf")
+    of_pixels = path.suffix.lower() in (".vrt", ".tif")
     kind = _TYPES.get(path.suffix.lower(), "text/plain")
     return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 

@@ -153,7 +153,7 @@ def colmap(scene: Scene, out: Path) -> Files:
         center = pinhole.center + _CORNER
         numbers = [*shot.size, *pinhole.focal.tolist(), *center.tolist()]
         cameras.append(_text_line(number, "PINHOLE", *numbers))
-        turn = _quaternion(pinhole.rotation).tolist()
+        turn = Rotation.from_matrix(pinhole.rotation).as_quat(canonical=True, scalar_first=True).tolist()
         images.append(_text_line(number, *turn, *pinhole.translation.tolist(), number, name))
         places = zip((shot.xy + _CORNER).tolist(), (shot.index + 1).tolist(), strict=True)
         images.append(" ".join(_text_line(*xy, point) for xy, point in places))
@@ -190,9 +190,3 @@ def image_links(scene: Scene) -> dict[str, str]:
 
 def _text_line(*values: float | str) -> str:
     return " ".join(value if isinstance(value, str) else repr(value) for value in values)
-
-
-def _quaternion(rotation: Array) -> Array:
-    """Return the w, x, y, z of a rotation (3, 3), w not negative."""
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])

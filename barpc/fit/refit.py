@@ -416,9 +416,7 @@ _POINT, _PLANE = 100.0, 1e4
 """Times that another reading is better before it is accepted. Errors of a model are common to all its readings: of 160
 honest models none was better by more than 2.2 in a wrong one; one over a flat Earth may be by tens, its planes by 2000.
 Of models with axes exchanged or upside down physical ones were better by 320 and more, the planes of radars by 5e6."""
-_FLAT_CONVERGENCE = (
-    2.0 / WGS84_A
-)  # 1/m: of the distance of a camera; verticals meet at the Earth's centre, -1 / WGS84_A
+_FLAT_CONVERGENCE = 2.0 / WGS84_A  # 1/m: of a camera's distance; verticals meet at the Earth's centre, -1 / WGS84_A
 _ECEF_ROUNDING = 1e-8  # m: of places in ECEF, and of what iterations leave
 _MIN_NODES = 5  # nodes along a line: of few lines of sight any two or three meet
 _LINE_POSITIONS, _POINT_POSITIONS = np.linspace(0.1, 0.9, 5), np.linspace(0.02, 0.98, 9)  # of the image's sides

@@ -168,9 +168,7 @@ def _geolocated(place: Array, table: GcpTable, frame: ControlReference) -> tuple
 
 
 _MAX_CRS_LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
-_NOTEWORTHY_ACCURACY = (
-    1.0  # m: transformations that are better known than this need no word; ensembles as WGS84 are no better
-)
+_NOTEWORTHY_ACCURACY = 1.0  # m: better known transformations need no word; ensembles as WGS84 are no better
 
 
 @contextmanager

@@ -119,16 +119,8 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
     return links
 
 
-def read_matches(path: Path | str, names: Sequence[str]) -> Tracks:
-    """Read the tie points that a file states; tracks of fewer than two views, or two points in one, are left out.
-
-    As `read_links`; points that are linked, by way of others too, are one track.
-    """
-    return tracks_of(read_links(path, names), path)
-
-
 def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> None:
-    """Write tie points as ``.csv`` or ``.npz``; `read_matches` reads them back to the bit."""
+    """Write tie points as ``.csv`` or ``.npz``; `read_links` reads them back to the bit."""
     path = Path(path)
     if path.suffix.lower() == ".npz":
         with path.open("wb") as file:

@@ -7,7 +7,7 @@ precedence. See ``docs/formats.md``.
 from __future__ import annotations
 
 from barpc.rpcio.formats import CARRIERS, FORMATS, WRITABLE, Carrier, find_rpc, format_for, write_camera, write_rpc
-from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.sources import hidden_by, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
@@ -27,6 +27,5 @@ __all__ = [
     "write_crop",
     "write_rpc",
     "write_rpc_copy",
-    "write_rpc_nitf",
     "write_rpc_vrt",
 ]

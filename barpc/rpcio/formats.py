@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 from barpc.base import remote
 from barpc.base.atomic import write_text
@@ -17,7 +16,7 @@ from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import RPC_FILE
 from barpc.rpcio import text, xml
-from barpc.rpcio.images import NITF_NAMES, write_rpc_copy, write_rpc_nitf, write_rpc_vrt
+from barpc.rpcio.images import write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.text import ReadOptions, Size
 from barpc.sensor.rpc import RPC
 
@@ -32,9 +31,7 @@ class Format:
     read: Callable[[str, str, ReadOptions], RPC]  # of text, file name for messages, options
     write: Callable[..., str] | None = None  # of an RPC; `sized`: and of the width and height of its image, or None
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
-    consumers: tuple[
-        str, ...
-    ] = ()  # that read what is written (`barpc.pipeline.verify_outputs.CONSUMERS`), besides barpc
+    consumers: tuple[str, ...] = ()  # besides barpc, of what is written: rows of `verify_outputs.CONSUMERS`
     sized: bool = False  # whether it states the size of its image
 
 
@@ -78,7 +75,6 @@ class Carrier:
     suffixes: tuple[str, ...]
     write: Callable[[RPC, PathOrUrl, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
-    precision: Literal["nitf"] | None = None  # whose digits it holds (`barpc.fit.system`); None: all of them
 
 
 CARRIERS: dict[str, Carrier] = {
@@ -87,9 +83,6 @@ CARRIERS: dict[str, Carrier] = {
     ),
     "copy": Carrier(
         (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
-    ),
-    "nitf": Carrier(
-        NITF_NAMES, lambda rpc, image, path, _, over: write_rpc_nitf(rpc, image, path, overwrite=over), precision="nitf"
     ),
 }
 """Name -> raster that carries an RPC."""

@@ -1,4 +1,4 @@
-"""RPCs that rasters carry: a VRT that points at the untouched image, a GeoTIFF's tag (50844), a NITF's RPC00B.
+"""RPCs that rasters carry: a VRT that points at the untouched image, a GeoTIFF's tag (50844); a NITF's RPC00B is read.
 
 The tag is read from the file's directory itself, to the bit: GDAL prints its numbers with 15 digits on the way. A copy
 is made of the source's bytes; only its first directory is written anew, behind the pixels, so that compression, tiles,
@@ -43,8 +43,6 @@ from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
 TIFF_PROFILE = {"driver": "GTiff", "BIGTIFF": "IF_SAFER", "TILED": "YES", "COMPRESS": "DEFLATE"}
-NITF_NAMES = (".ntf", ".nitf", ".nsf")
-"""Ends of the names of NITF files, in any case."""
 _FULL = 1 << 16  # bytes: with less free space GDAL's error is taken for that of a full disk
 
 
@@ -149,15 +147,8 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
             with opened(image_path, IMAGE) as file, partial.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
         else:
-            _translate(dataset, partial, Path(copy_path), **TIFF_PROFILE)
+            _translate(dataset, partial, Path(copy_path))
         put_tag(partial, printable(rpc), placed=dataset.crs is not None)
-
-
-def write_rpc_nitf(rpc: RPC, image_path: Path | str, nitf_path: Path | str, *, overwrite: bool = False) -> None:
-    """Write a NITF copy of an image with an RPC in its RPC00B extension (content: `nitf_record`)."""
-    record = nitf_record(rpc)
-    with copying(image_path, nitf_path, overwrite) as (dataset, partial):
-        _translate(dataset, partial, Path(nitf_path), driver="NITF", TRE=f"RPC00B={record}")
 
 
 def write_crop(
@@ -173,8 +164,7 @@ def write_crop(
     Parameters
     ----------
     rpc : RPC, the camera of `image_path`
-    image_path, crop_path : Path or str, the image, and the file to write: a NITF by its name (`NITF_NAMES`), else a
-        tiled GeoTIFF
+    image_path, crop_path : Path or str, the image, and the file to write, a tiled GeoTIFF
     window : (col, row, width, height), whole pixels, inside the image
     overwrite : bool, replace an existing file, never the image itself
 
@@ -184,23 +174,19 @@ def write_crop(
 
     Raises
     ------
-    ImageError, OutputError, RpcFormatError
-        The window is not inside the image, or that cannot be read; the crop exists or cannot be written; a NITF does
-        not hold its RPC.
+    ImageError, OutputError
+        The window is not inside the image, or that cannot be read; the crop exists or cannot be written.
     """
     col, row, width, height = window
-    cropped, nitf = rpc.crop(col, row), Path(crop_path).name.lower().endswith(NITF_NAMES)
-    layout = {"driver": "NITF", "TRE": f"RPC00B={nitf_record(cropped)}"} if nitf else TIFF_PROFILE
+    cropped = printable(rpc.crop(col, row))
     with copying(image_path, crop_path, overwrite) as (dataset, partial):
         if not (0 <= col < col + width <= dataset.width and 0 <= row < row + height <= dataset.height):
             raise ImageError(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
-        _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height), **layout)
-        if nitf:
-            return read_nitf(partial) or cropped
-        put_tag(partial, printable(cropped), placed=dataset.crs is not None)
-    return printable(cropped)
+        _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height))
+        put_tag(partial, cropped, placed=dataset.crs is not None)
+    return cropped
 
 
 @contextmanager
@@ -216,20 +202,20 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
             raise unwritten(target, str(error.__cause__ or error)) from error
 
 
-def _translate(dataset: Any, partial: Path, target: Path, **options: str) -> None:
-    """Copy an image by another driver; a VRT's pixels are GDAL's only when they stand in a file."""
+def _translate(dataset: Any, partial: Path, target: Path) -> None:
+    """Copy an image into a GeoTIFF; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
     if isinstance(dataset, Mosaic):
-        _copy_window(dataset, partial, target, whole, **options)
+        _copy_window(dataset, partial, target, whole)
     else:
-        raster_copy(dataset, str(partial), **options)
+        raster_copy(dataset, str(partial), **TIFF_PROFILE)
         require_pixels(partial, target, lambda block: _sum(dataset, block))
 
 
-def _copy_window(dataset: Any, partial: Path, target: Path, window: Window, **options: str) -> None:
-    profile = {"width": window.width, "height": window.height, "count": dataset.count, **options}
+def _copy_window(dataset: Any, partial: Path, target: Path, window: Window) -> None:
+    profile = {"width": window.width, "height": window.height, "count": dataset.count, **TIFF_PROFILE}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
-    if dataset.crs is not None and options["driver"] == "GTiff":  # a NITF's corners are rounded, and north-up for some
+    if dataset.crs is not None:
         a, b, x, d, e, y = dataset.transform[:6]
         col, row = window.col_off, window.row_off
         moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)
@@ -242,7 +228,7 @@ def _copy_window(dataset: Any, partial: Path, target: Path, window: Window, **op
         crop.colorinterp = dataset.colorinterp
         for _, block in crop.block_windows(1):
             crop.write(dataset.read(window=part(block)), window=block)
-            if has_mask(dataset) and options["driver"] == "GTiff":
+            if has_mask(dataset):
                 crop.write_mask(dataset.read_masks(1, window=part(block)), window=block)
     require_pixels(partial, target, lambda block: _sum(dataset, part(block)))
 
@@ -469,38 +455,3 @@ def read_nitf(path: PathOrUrl) -> RPC | None:
     return rpc_from_fields(
         cells_of(record[1:], _RPC_FIELD_WIDTHS, SINGLE, name, f"RPC00{match.group(1).decode()}"), name
     )
-
-
-def nitf_record(rpc: RPC) -> str:
-    """Return the 1041 characters of an RPC00B extension; RpcFormatError where a number does not fit its field.
-
-    Image and height offsets and scales are integers, degrees have four decimals, coefficients seven digits: an
-    RPC that was not fitted for it (`barpc.fit`, precision "nitf") loses tenths of a pixel. The image's offsets have
-    no sign: those of a part of an image may be negative, and start from 0. An unknown accuracy is written as zero, as
-    the format asks.
-    """
-    fields = fields_from_rpc(
-        _counted_from(rpc, np.maximum(np.rint(rpc.image_offset), 0.0), np.maximum(np.rint(rpc.image_scale), 1.0))
-    )
-    decimals = {"ERR": 2, "LAT": 4, "LONG": 4}
-    cells = ["1"]
-    for key, width in zip(SINGLE, _RPC_FIELD_WIDTHS, strict=True):
-        value = fields.get(key, [0.0])[0]
-        axis = key.split("_")[0]
-        sign = "+" if axis in ("LAT", "LONG", "HEIGHT") else ""
-        cell = format(value, f"{sign}0{width}.{decimals.get(axis, 0)}f")
-        if len(cell) != width or (not sign and value < 0):
-            raise RpcFormatError(f"NITF RPC00B: {key} = {value:g} does not fit {width} characters")
-        cells.append(cell)
-    cells += [_nitf_coefficient(value, key) for key in COEFFICIENTS for value in fields[key]]
-    return "".join(cells)
-
-
-def _nitf_coefficient(value: float, key: str) -> str:
-    mantissa, exponent = f"{value:+.6E}".split("E")
-    power = int(exponent)
-    if power < -9:
-        return "+0.000000E+0"
-    if power > 9:
-        raise RpcFormatError(f"NITF RPC00B: a coefficient of {key} is {value:g}, beyond the format")
-    return f"{mantissa}E{power:+d}"

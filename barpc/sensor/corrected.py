@@ -31,7 +31,7 @@ from barpc.base.geodesy import (
     wrap_longitude,
 )
 from barpc.sensor import Behind, SensorModel
-from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix, rotation_vector
+from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
 from barpc.sensor.image_corrections import fixed_point
 
 _DERIVATIVE_ACCURACY = 1e-8  # of derivatives: the solver's steps ask for no more
@@ -213,9 +213,11 @@ def correction_of(matrix: Array, at: Array) -> Correction:
     matrix : (3, 4), [s R | t]: the motion X -> s R X + t, ECEF [m]
     at : (3,), a point of the scene [m], ECEF, which moves as the matrix says to the last digit
     """
+    from scipy.spatial.transform import Rotation  # a third of a second, of motions alone
+
     left, stretch, right = np.linalg.svd(matrix[:, :3])  # the rotation that a rounded matrix is nearest to
     motion = matrix @ np.append(at, 1.0) - at
-    turn = rotation_vector((left @ right).T)
+    turn = Rotation.from_matrix((left @ right).T).as_rotvec()
     return Correction(turn, motion, at, scale=1.0 / float(stretch.mean()))
 
 

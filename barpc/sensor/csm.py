@@ -226,9 +226,7 @@ _MODEL_READERS: dict[str, Callable[[_StateFields], Pushbroom | Frame]] = {LINESC
 
 def is_writable(model: SensorModel) -> bool:
     """Return whether a camera is a pushbroom one of a straight detector, behind corrections in space only."""
-    while isinstance(model, Corrected):
-        model = model.sensor
-    return isinstance(model, Pushbroom) and model.look.shape[1] == 2 and bool(model.line_period > 0)
+    return _base(model) is not None
 
 
 def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> str:
@@ -238,12 +236,13 @@ def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     with the row, true in the middle of the altitudes; what that lacks is measured by opening the state again.
     RpcError for another camera, or one that does not see the ground over its image.
     """
-    base = _base(model)
+    if (base := _base(model)) is None:
+        raise RpcError("only pushbroom cameras of a straight detector are written as a CSM state")
     count = int(np.ceil((size[1] - 1) * base.line_period / _step(base))) + 1
     step = (size[1] - 1) * base.line_period / (count - 1)
     late = step * np.arange(-_EXTRA_SAMPLES, count + _EXTRA_SAMPLES)
     rows: Array = np.asarray(late / base.line_period, dtype=np.float64)
-    positions = _positions(model, rows)
+    positions = _positions(model, base, rows)
     attitude = _row_rotations(model, base, rows, positions, (size[0], float(np.mean(alt_range))))
     velocities = np.gradient(positions, step, axis=0)
     middle = model.localize((np.array(size) - 1.0) / 2, np.array(np.mean(alt_range)))
@@ -276,13 +275,10 @@ def state_text(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
     return f"{LINESCAN}\n{json.dumps(dict(sorted(state.items())), indent=1)}\n"
 
 
-def _base(model: SensorModel) -> Pushbroom:
-    if not is_writable(model):
-        raise RpcError("only pushbroom cameras of a straight detector are written as a CSM state")
+def _base(model: SensorModel) -> Pushbroom | None:
     while isinstance(model, Corrected):
         model = model.sensor
-    assert isinstance(model, Pushbroom)
-    return model
+    return model if isinstance(model, Pushbroom) and model.look.shape[1] == 2 and model.line_period > 0 else None
 
 
 def _step(base: Pushbroom) -> float:
@@ -291,11 +287,11 @@ def _step(base: Pushbroom) -> float:
     return min(ATTITUDE_STEP, float(np.median(own)) / 2) if len(own) > 1 else ATTITUDE_STEP
 
 
-def _positions(model: SensorModel, rows: Array) -> Array:
+def _positions(model: SensorModel, base: Pushbroom, rows: Array) -> Array:
     """Return the camera positions (N, 3) [m], ECEF, at rows (N,), corrections included."""
     if not isinstance(model, Corrected):
-        return np.asarray(_base(model).position(rows))
-    return model.correction.undo(_positions(model.sensor, rows), rows)
+        return np.asarray(base.position(rows))
+    return model.correction.undo(_positions(model.sensor, base, rows), rows)
 
 
 def _row_rotations(

@@ -297,17 +297,6 @@ def rotation_matrix(rotation: npt.ArrayLike) -> Array:
     return Turn(np.asarray(rotation, dtype=np.float64)[..., None]).forth(np.eye(3))
 
 
-def rotation_vector(matrix: Array) -> Array:
-    """Return the rotation vector (3,) [rad], at most pi long, of a rotation matrix (3, 3): undoes `rotation_matrix`."""
-    trace, product = np.trace(matrix), np.empty((4, 4))  # four times the quaternion, scalar first, by itself
-    product[0, 0], product[1:, 1:] = 1.0 + trace, matrix + matrix.T + (1.0 - trace) * np.eye(3)
-    product[0, 1:] = product[1:, 0] = (matrix - matrix.T)[[2, 0, 1], [1, 2, 0]]
-    quaternion = product[product.diagonal().argmax()]  # the longest row: without cancellation (Shepperd, 1978)
-    quaternion *= np.copysign(1.0 / np.linalg.norm(quaternion), quaternion[0])
-    sine = np.linalg.norm(quaternion[1:])
-    return np.asarray(quaternion[1:] * (2.0 * np.arctan2(sine, quaternion[0]) / sine if sine > 0.0 else 2.0))
-
-
 def rotation_left_jacobian(rotation: npt.ArrayLike) -> Array:
     """Return the left Jacobians J (..., 3, 3) of vectors w (..., 3) [rad]: R(w + dw) is R(J dw) R(w) to first order."""
     return Turn(-np.asarray(rotation, dtype=np.float64)[..., None]).rate(np.eye(3))

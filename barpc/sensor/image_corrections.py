@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
@@ -156,8 +156,39 @@ def sine_and_cosine(row: Array, period: Array) -> Array:
     return np.where(np.isfinite(period), np.stack([np.cos(phase), np.sin(phase)]), 0.0)
 
 
+class _Curved(Frozen):
+    """Base of displacements by cubic B-splines along one image coordinate, `_axis`, of the corrected position."""
+
+    _axis: ClassVar[int]
+    coeffs: Array
+    _by_image: Callable[[Array], Array]  # the displacement (..., 2) [px] of points seen at (..., 2) [px]
+    rate: Callable[[Array], Array]  # its derivative (..., 2) [px/px] by that coordinate (...)
+
+    def apply(self, image: Array) -> Array:
+        """Return where points that a model without it has at (..., 2) [px] are seen."""
+        return fixed_point(lambda seen: image + self._by_image(seen), image)
+
+    def linearised(self, image: Array) -> tuple[Array, Array]:
+        """Return the same, and its derivative (..., 2, 2): a coordinate moves the spline, and the spline it."""
+        seen, axis = self.apply(image), self._axis
+        rate = self.rate(seen[..., axis])
+        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
+        slope[..., axis] += rate / (1.0 - rate[..., axis, None])
+        return seen, slope
+
+    def undo(self, image: Array) -> Array:
+        """Return where a model without it has points that are seen at (..., 2) [px]."""
+        return image - self._by_image(image)
+
+    def _splined(self, u: Array, rate: bool) -> Array:
+        """Return the spline (..., 2) at u (...) in -1 .. 1, or its derivative by u."""
+        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
+        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
+        return np.asarray(out).reshape(*u.shape, 2)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class RowSpline(Frozen):
+class RowSpline(_Curved):
     """A displacement of image points: corrected minus uncorrected position, as a function of the corrected one.
 
     Parameters
@@ -181,6 +212,7 @@ class RowSpline(Frozen):
     [[100.0, 7.0], [600.2, 7.0]]
     """
 
+    _axis = 1
     coeffs: Array
     row_offset: float = 0.0
     row_scale: float = 1.0
@@ -224,21 +256,7 @@ class RowSpline(Frozen):
             out += np.moveaxis(sine_and_cosine(image[..., 1], period), 0, -1) @ moves
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
-    def apply(self, image: Array) -> Array:
-        """Return where points that a model without it has at (..., 2) [px] are seen."""
-        return fixed_point(lambda seen: image + self.at(seen), image)
-
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and its derivative (..., 2, 2): the row moves the spline, and the spline the row."""
-        seen = self.apply(image)
-        rate = self.rate(seen[..., 1])
-        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
-        slope[..., 1] += rate / (1.0 - rate[..., 1:])
-        return seen, slope
-
-    def undo(self, image: Array) -> Array:
-        """Return where a model without it has points that are seen at (..., 2) [px]."""
-        return image - self.at(image)
+    _by_image = at
 
     def rate(self, row: Array) -> Array:
         """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
@@ -254,11 +272,7 @@ class RowSpline(Frozen):
 
     def _along(self, row: Array, rate: bool) -> Array:
         u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
-        if not len(self.coeffs):
-            return np.zeros((*u.shape, 2))
-        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
-        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
-        return np.asarray(out).reshape(*u.shape, 2)
+        return self._splined(u, rate) if len(self.coeffs) else np.zeros((*u.shape, 2))
 
 
 @dataclass(frozen=True)
@@ -277,7 +291,7 @@ class Splined(Displaced):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ColumnSpline(Frozen):
+class ColumnSpline(_Curved):
     """Displacement by column alone: the distortion and detector steps of a sensor, alike in all its images.
 
     Parameters
@@ -288,6 +302,7 @@ class ColumnSpline(Frozen):
     steps : (C, 2), what is added from each edge on, (col, row) [px]
     """
 
+    _axis = 0
     width: int
     coeffs: Array
     edges: Array = field(default_factory=lambda: np.zeros(0))
@@ -307,27 +322,15 @@ class ColumnSpline(Frozen):
             out += begun[np.searchsorted(self.edges, col, side="right").clip(0, len(self.edges))]
         return np.where(np.isfinite(col)[..., None], out, np.nan)
 
-    def apply(self, image: Array) -> Array:
-        """Return where points that a model without it has at (..., 2) [px] are seen."""
-        return fixed_point(lambda seen: image + self.at(seen[..., 0]), image)
+    def _by_image(self, image: Array) -> Array:
+        return self.at(image[..., 0])
 
-    def linearised(self, image: Array) -> tuple[Array, Array]:
-        """Return the same, and its derivative (..., 2, 2): the column moves the spline, and the spline the column."""
-        seen = self.apply(image)
-        rate = self._along(seen[..., 0], rate=True) * (2.0 / self.width)
-        slope = np.broadcast_to(np.eye(2), (*image.shape, 2)).copy()
-        slope[..., 0] += rate / (1.0 - rate[..., :1])
-        return seen, slope
-
-    def undo(self, image: Array) -> Array:
-        """Return where a model without it has points that are seen at (..., 2) [px]."""
-        return image - self.at(image[..., 0])
+    def rate(self, col: Array) -> Array:
+        """Return its derivative by the column (..., 2) [px/px] in columns (...) [px]."""
+        return self._along(col, rate=True) * (2.0 / self.width)
 
     def _along(self, col: Array, rate: bool) -> Array:
-        u = (np.asarray(col, dtype=np.float64) + 0.5) * (2.0 / self.width) - 1.0
-        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
-        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
-        return np.asarray(out).reshape(*u.shape, 2)
+        return self._splined((np.asarray(col, dtype=np.float64) + 0.5) * (2.0 / self.width) - 1.0, rate)
 
 
 @dataclass(frozen=True)

@@ -37,14 +37,9 @@ _FASTEST = 0.3  # rad/s: no imaging satellite turns so fast
 _QUATERNION_TOLERANCE = 1e-3  # by which the length of a quaternion may miss 1
 _RADII = (6.5e6, 8e6)  # m from the Earth's centre
 _ORBIT, _RATE = 7e6, 1.2e-3  # m, rad/s: radius and turn of an orbit: of its Taylor series in time
-_ATTITUDE_DEGREES, _ATTITUDE_TERM_TOLERANCE = (
-    range(2, 7),
-    1e-5,
-)  # m: the first degree whose next term is smaller is taken
+_TRACK_DEGREES, _TERM_TOLERANCE = range(2, 7), 1e-5  # m: the first degree whose next term is smaller is taken
 _SCATTER = 0.01  # m, RMS: samples farther from the polynomial are not noise
-_MAX_VELOCITY_DIFFERENCE = (
-    700.0  # m/s: by more than the Earth's rotation no stated velocity differs from that of the positions
-)
+_MAX_VELOCITY_DIFFERENCE = 700.0  # m/s: above the Earth's rotation: of stated velocities and those of positions
 
 _SAMPLE_LISTS = {"EPH": (13, 7), "ATT": (15, 5)}  # numbers of a row: with covariances, without
 _STAR_TRACKER_LIGHT = Light(aberration=True, refraction=True)  # star trackers tell where the body points
@@ -116,14 +111,8 @@ def _track(times: Array, positions: Array) -> Curve:
     Dense samples scatter by millimetres, which a curve through them all carries beyond the first by centimetres.
     """
     half = 0.5 * (times[-1] - times[0])
-    degree = next(
-        (
-            d
-            for d in _ATTITUDE_DEGREES
-            if _ORBIT * (_RATE * half) ** (d + 1) < _ATTITUDE_TERM_TOLERANCE * math.factorial(d + 1)
-        ),
-        0,
-    )
+    terms = ((d, _ORBIT * (_RATE * half) ** (d + 1) / math.factorial(d + 1)) for d in _TRACK_DEGREES)
+    degree = next((d for d, term in terms if term < _TERM_TOLERANCE), 0)
     if degree and len(times) > degree + 1:
         since = times - times[0]
         coeffs = polyfit(since, positions, degree)

@@ -1,18 +1,18 @@
 """Images to tracks: windowed reading, detection, matching, linking.
 
-`find_tracks` runs all stages: `select_pairs`, `detect`, `match_pairs`, `link`, `thin`, `refine`.
+`find_tracks` runs all stages: `possible_pairs`, `locate`, `match_pairs`, `link`, `thin`, `refine`.
 """
 
 from barpc.base.options import TieOptions
-from barpc.tie.matchers.features import Keypoints, detect
+from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import Matches
-from barpc.tie.matchers.matching import match_pair, match_pairs
-from barpc.tie.matchers.report import PairReport, require_matches
+from barpc.tie.matchers.matching import match_pairs
+from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.area import Area, read_area
-from barpc.tie.pairing.overlaps import Pair, Scope, select_pairs
+from barpc.tie.pairing.overlaps import Pair, Scope
 from barpc.tie.patches.register import refine
 from barpc.tie.reference import ReferenceControl
-from barpc.tie.tracks import TieResult, common_tracks, find_tracks, link, thin
+from barpc.tie.tracks import TieResult, find_tracks, link, thin
 
 __all__ = [
     "Area",
@@ -24,15 +24,10 @@ __all__ = [
     "Scope",
     "TieOptions",
     "TieResult",
-    "common_tracks",
-    "detect",
     "find_tracks",
     "link",
-    "match_pair",
     "match_pairs",
     "read_area",
     "refine",
-    "require_matches",
-    "select_pairs",
     "thin",
 ]

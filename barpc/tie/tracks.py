@@ -486,10 +486,3 @@ def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
     (first, second), num = tracks.row_pairs(), int(tracks.view.max(initial=0)) + 1
     keys, counts = np.unique(tracks.view[first] * num + tracks.view[second], return_counts=True)
     return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}
-
-
-def common_tracks(tracks: Tracks, first: int, second: int) -> tuple[Array, Array]:
-    """Return image points (M, 2), (M, 2) [px] of the tracks that two views have in common, in the same order."""
-    a, b = tracks.view == first, tracks.view == second
-    _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
-    return tracks.xy[a][rows_a], tracks.xy[b][rows_b]

@@ -196,7 +196,7 @@ def _to_folder(images: list[ImageLike], folder: Path, choices: Conversion, progr
     _refuse_source_folder(files, folder, names)
     cameras = own or _cameras(files, Path(choices.rpc or ""))
     if choices.move is not None or choices.transform is not None:
-        cameras = moved(cameras, choices.move, choices.transform, carrier)
+        cameras = moved(cameras, choices.move, choices.transform)
     ends = [".tif" if choices.cut else CARRIERS[carrier].suffixes[0], *(WRITABLE[name].beside for name in names)]
     shown = list(zip(files, cameras, strict=True))
     parts = windows_of(shown, _window_chooser(choices)) if choices.cut else [(*one, None) for one in shown]
@@ -223,8 +223,8 @@ def _to_target(source: ImageLike, target: str, choices: Conversion) -> Converted
     check_target(target, [image, camera.path], choices.overwrite, None if choices.cut else camera.rpc)
     if not choices.cut:
         return _copy(camera, image, target, choices)
-    if format_for(target) not in (CARRIERS["copy"], CARRIERS["nitf"]):
-        ends = ", ".join((*CARRIERS["copy"].suffixes, *CARRIERS["nitf"].suffixes))
+    if format_for(target) is not CARRIERS["copy"]:
+        ends = ", ".join(CARRIERS["copy"].suffixes)
         raise UsageError(f"{target}: a part of an image goes into a file whose name ends in {ends}")
     window = _window_chooser(choices)(camera, image)
     write_crop(camera.rpc, image, target, window, overwrite=choices.overwrite)
@@ -243,10 +243,7 @@ def _copy(camera: Camera, image: Path, target: str, choices: Conversion) -> Conv
 def _read_back(camera: Camera, rpc: RPC, target: str) -> Converted:
     """Return the difference of an RPC when it is read back."""
     reading = Reading(Path(target), _READ_BACK, float(rpc.off(read_rpc(target)).max()))
-    reason = (
-        f"{target} reads back with an error of {reading.max_error:.2g} px: too few digits for this RPC ('barpc fit' "
-        "makes another), or another RPC file beside it"
-    )
+    reason = f"{target} reads back with an error of {reading.max_error:.2g} px: another RPC file beside it?"
     return Converted((Path(target),), (reading,), reasons=() if reading.passed else (reason,), source=camera)
 
 

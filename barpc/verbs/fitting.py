@@ -16,7 +16,7 @@ from barpc.base.options import FitOptions, RunOptions
 from barpc.cameras import read_points, split_spec
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import terrain_range
-from barpc.rpcio import Carrier, format_for, read_rpc, write_camera
+from barpc.rpcio import read_rpc, write_camera
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.verbs.converting import check_target
@@ -118,9 +118,6 @@ def fitted(
     source = file_of(source)
     if output is not None:
         check_target(output, [place_of(source)], choices.overwrite)
-        row = format_for(output)
-        if isinstance(row, Carrier) and of_fit.precision is None:
-            of_fit = replace(of_fit, precision=row.precision)
     found, size = _fit_source(source, of_fit, choices)
     done = Fitted(found, of_fit.tolerance)
     if output is None or (done.verdict and not choices.keep_going):

@@ -15,7 +15,6 @@ from barpc.base.errors import BarpcWarning, FitError, InputError, Remark, UsageE
 from barpc.base.geodesy import Array, as_points, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pointio.tables import read_transform
-from barpc.rpcio import CARRIERS
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, correction_of
@@ -30,9 +29,7 @@ _EXACT_REFIT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC s
 _MOVED_NOTE = "moved and refitted"
 
 
-def moved(
-    cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str | Path | None, carrier: str
-) -> list[Camera]:
+def moved(cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str | Path | None) -> list[Camera]:
     """Return cameras that show the moved ground where these show it unmoved, each refitted into an RPC and certified.
 
     The motion is `move` (3,) [m], east, north and up at the middle of all the images, or that of the file
@@ -60,7 +57,7 @@ def moved(
             file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
         direct = isinstance(camera.model, RPC) and camera.model.direct is not None
-        options = replace(FitOptions(), precision=CARRIERS[carrier].precision, localisation=direct)
+        options = replace(FitOptions(), localisation=direct)
         out.append(_refitted(camera, correction_of(matrix, middle), (low, high), options))
     _tell_motion(matrix, middle)
     return out

@@ -219,43 +219,6 @@ def test_the_altitudes_may_come_from_a_dem(
     assert 700.0 < high < 1100.0
 
 
-@pytest.mark.slow
-def test_a_file_of_few_digits_is_fitted_for_them_and_certified_as_it_reads_back(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    image, out = shared_data / "optical" / "phr_triplet_north" / "img_01.tif", tmp_path / "a.ntf"
-    narrow = ("--alt-range", 100, 400, "--json")
-    assert run("fit", image, "-o", out, *narrow) == 0
-    report, truth, written = json.loads(capsys.readouterr().out), read_rpc(image), read_rpc(out)
-    rng = np.random.default_rng(0)
-    at = rng.uniform(0, 1, (4000, 2)) * [1024, 560] - 0.5
-    error = np.abs(written.project(truth.localize(at, rng.uniform(100, 400, 4000))) - at)
-    assert 1e-7 < error.max() <= 1.2 * max(report["max_ckp"])
-    assert max(report["max_ckp"]) <= 2 * error.max()
-    (tmp_path / "fit.toml").write_text('[fit]\nprecision = "rpcm"\n')  # digits that this file does not hold
-    out.unlink()
-    assert run("fit", image, "-o", out, *narrow, "--options", tmp_path / "fit.toml") == 3
-    said = capsys.readouterr()
-    assert not out.exists()
-    assert max(json.loads(said.out)["max_ckp"]) > 0.1
-    assert "nothing written" in said.err
-    assert run("fit", image, "-o", out, *narrow, "--options", tmp_path / "fit.toml", "--keep-going") == 3
-    assert out.exists()
-
-
-def test_a_copy_into_few_digits_is_not_passed_over(
-    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    image = shared_data / "optical" / "phr_triplet_north" / "img_01.tif"
-    assert run("convert", image, tmp_path / "a.ntf", "--json") == 3
-    said = capsys.readouterr()
-    assert json.loads(said.out)["max_px"] > 0.1
-    assert "'barpc fit'" in said.err
-    for name in ("b_RPC.TXT", "b.tif"):
-        assert run("convert", image, tmp_path / name, "--json") == 0
-        assert json.loads(capsys.readouterr().out)["max_px"] <= 1e-6
-
-
 def test_a_localisation_rpc_is_written_where_the_file_holds_it(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

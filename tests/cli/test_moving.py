@@ -124,7 +124,7 @@ def test_what_no_rpc_holds_so_exactly_is_fitted_over_its_image(shared_data: Path
     camera = open_camera(str(shared_data / "rpc_formats" / "md_ov_rpc.txt"))
     crop = replace(camera, model=camera.rpc.crop(6000, 20000), size=(500, 400))
     with pytest.warns(Remark) as said:
-        (after,) = moved([crop], np.array([600.0, -700.0, 400.0]), None, "vrt")
+        (after,) = moved([crop], np.array([600.0, -700.0, 400.0]), None)
     assert float(re.search(r"moved and refitted to (\S+) px", str(said[0].message))[1]) < 1e-7
     assert after.rpc.image_scale.tolist() == [250.0, 200.0]
 
@@ -132,7 +132,7 @@ def test_what_no_rpc_holds_so_exactly_is_fitted_over_its_image(shared_data: Path
 def test_an_image_beyond_what_its_rpc_states_is_held_too():
     rpc = make_rpc()
     for size in ((300, 200), (2600, 2500)):
-        (after,) = moved([Camera(rpc, Path("a.RPB"), "rpb", size, (0.0, 300.0))], np.full(3, 50.0), None, "vrt")
+        (after,) = moved([Camera(rpc, Path("a.RPB"), "rpb", size, (0.0, 300.0))], np.full(3, 50.0), None)
         ends = after.rpc.image_offset + [[-1.0], [1.0]] * after.rpc.image_scale
         assert (ends[0] <= -0.5).all()
         assert (ends[1] >= np.array(size) - 0.5).all()
@@ -163,7 +163,7 @@ def test_vendors_rpcs_follow_a_motion_over_all_their_ground(
         matrix[:3, :3] = Rotation.from_rotvec(turn * rng.normal(size=3)).as_matrix()
         middle = ecef.mean(axis=0)
         matrix[:3, 3] = middle - matrix[:3, :3] @ middle + length * shift / np.linalg.norm(shift)
-        (after,) = moved([replace(camera, size=size)], None, _saved(matrix, tmp_path), "vrt")
+        (after,) = moved([replace(camera, size=size)], None, _saved(matrix, tmp_path))
         moved_to = ecef @ matrix[:3, :3].T + matrix[:3, 3]
         there = np.stack(to_ecef.transform(*moved_to.T, direction="INVERSE"), axis=-1)
         off = np.abs(after.rpc.project(there) - rpc.project(ground)).max()

@@ -382,7 +382,7 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
     [
         ("a.TIF", "image/tiff; application=geotiff", "data"), ("a.vrt", "application/xml", "data"),
         ("a.xml", "application/xml", "metadata"), ("a.json", "application/json", "metadata"),
-        ("a.ntf", "application/vnd.nitf", "data"), ("a_RPC.TXT", "text/plain", "metadata"),
+        ("a_RPC.TXT", "text/plain", "metadata"),
     ],
 )  # fmt: skip
 def test_a_file_of_a_run_has_its_kind(name, kind, role):

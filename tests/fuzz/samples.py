@@ -29,7 +29,6 @@ from barpc.export import export_run
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.correspondences import read_correspondences
 from barpc.pointio.gcps import read_gcps
-from barpc.pointio.matches import read_matches
 from barpc.rasters.dem import Dem
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
@@ -47,6 +46,7 @@ from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
 from barpc.tie.pairing.area import read_area
 from barpc.workspace import Workspace
+from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import binary, colmap
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
@@ -126,7 +126,7 @@ def _tiff() -> bytes:
 
 def _nitf() -> bytes:
     from barpc.fit import FitOptions, fit_rpc
-    from barpc.rpcio.images import nitf_record
+    from tests.rpcio.conftest import nitf_record
 
     fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
     return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50

@@ -24,9 +24,9 @@ from barpc.base.options import AdjustOptions, FitOptions, Rule, declared, read_o
 from barpc.base.remote import Remote, hosts
 from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.fit import fit_rpc
-from barpc.pointio.matches import read_matches
 from barpc.rasters.raster import open_raster
 from barpc.simulate import SimulatedBlock, simulate_block
+from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import hloc
 from tests.rpcio.conftest import make_rpc, write_image
 

@@ -18,8 +18,8 @@ from barpc.base.statistics import robust_spread
 from barpc.pipeline import RunOptions, adjust, check
 from barpc.pipeline.inputs import given_matches, given_tracks
 from barpc.pipeline.loading import load_views
-from barpc.pointio.matches import read_matches
 from barpc.tie.pairing.epipolar import coherent, epipolar_segments
+from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import binary
 
 from .conftest import check_points

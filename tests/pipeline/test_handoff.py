@@ -44,7 +44,7 @@ from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
 
 SIZE, ALTITUDES = (2000, 1900), (30.0, 300.0)
-NAMES = [f"a{row.suffixes[0]}" for name, row in {**WRITABLE, **CARRIERS}.items() if name != "nitf"]
+NAMES = [f"a{row.suffixes[0]}" for row in {**WRITABLE, **CARRIERS}.values()]
 
 
 def refuse_hiding(folder: Path, names: list[str], inputs: list[Path]) -> None:
@@ -91,14 +91,6 @@ def test_a_sidecar_that_hides_a_tag_is_caught_by_its_effect(image, tmp_path):
     write_rpc(rpc.crop(0, 7), tmp_path / "out" / "a.RPB")
     for reading in verify([path], rpc, SIZE, ALTITUDES):
         assert reading.max_error == pytest.approx(7.0, abs=1e-6)
-
-
-def test_a_nitf_tells_what_its_record_cut_off(image, tmp_path):
-    """Half a pixel of the offsets, tenths of the 1e-4 degrees, the seventh digit of the coefficients."""
-    rpc = make_rpc()
-    (reading, *_) = verify([write(rpc, image, tmp_path / "out", "a.ntf")], rpc, SIZE, ALTITUDES)
-    assert not reading.passed
-    assert 0.1 < reading.max_error < 5
 
 
 def test_a_foreign_reader_sees_a_raster_with_its_rpc_files_and_nothing_else(image, tmp_path):

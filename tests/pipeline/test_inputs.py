@@ -12,9 +12,9 @@ import rasterio
 
 from barpc.base.errors import DisconnectedError, InputError
 from barpc.pipeline import RunOptions, adjust
-from barpc.pointio.matches import read_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
+from tests.pointio.stages import read_matches
 
 from .known import errors_at_check_points
 

@@ -14,10 +14,10 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.inputs import input_files, read_pairs
 from barpc.pipeline.loading import load_views
-from barpc.pointio.matches import read_matches
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
 from barpc.tie import read_area
+from tests.pointio.stages import read_matches
 from tests.reliability.conftest import barpc
 
 from .known import SAMPLES

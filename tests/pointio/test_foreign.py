@@ -14,7 +14,8 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.safe_io import Kind
-from barpc.pointio.matches import read_links, read_matches
+from barpc.pointio.matches import read_links
+from tests.pointio.stages import read_matches
 
 NAMES = ["a", "b", "c"]
 KEYPOINTS = {

@@ -14,8 +14,9 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.pointio import tables
 from barpc.pointio.gcps import read_gcps
-from barpc.pointio.matches import read_links, read_matches
+from barpc.pointio.matches import read_links
 from barpc.pointio.tables import read_table
+from tests.pointio.stages import read_matches
 
 ROOT = Path(__file__).resolve().parents[2]
 BATCH = tables._BATCH

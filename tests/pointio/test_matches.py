@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.pointio.matches import IMAGE_SIGMA, read_matches, write_matches
+from barpc.pointio.matches import IMAGE_SIGMA, write_matches
 from barpc.scene import Tracks
+from tests.pointio.stages import read_matches
 
 NAMES = ["a", "b", "c"]
 

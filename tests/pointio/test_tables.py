@@ -14,7 +14,7 @@ from rasterio.control import GroundControlPoint
 from barpc.base.errors import InputError
 from barpc.pointio.correspondences import correspondence_kind, read_correspondences, read_grid
 from barpc.pointio.gcps import read_gcps
-from barpc.pointio.matches import Links, asp_text, read_links, read_matches, tracks_of
+from barpc.pointio.matches import Links, asp_text, read_links, tracks_of
 from barpc.pointio.names import (
     MAX_NAME,
     ViewNames,
@@ -26,6 +26,7 @@ from barpc.pointio.names import (
 )
 from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.pointio.third_party_matches import index_pairs, pair_files, pair_of
+from tests.pointio.stages import read_matches
 
 NAMES = ["left", "right"]
 

@@ -20,7 +20,6 @@ from barpc.rpcio import (
     read_rpc_source,
     write_crop,
     write_rpc_copy,
-    write_rpc_nitf,
     write_rpc_vrt,
 )
 from barpc.rpcio.xml import rpc_domain
@@ -346,7 +345,6 @@ def test_a_vrt_is_copied_cropped_and_pointed_at_with_its_pixels_and_mask(tmp_pat
     path = vrt(tmp_path / "x.vrt", band(source("m.tif")), f"<MaskBand>{mask_of('m.tif')}</MaskBand>")
     write_rpc_copy(rpc, path, tmp_path / "copy.tif")
     write_rpc_vrt(rpc, path, tmp_path / "again.vrt")
-    write_rpc_nitf(make_rpc(), path, tmp_path / "copy.ntf")
     write_crop(rpc, path, tmp_path / "crop.tif", (3, 4, 20, 18))
     with open_raster(path) as dataset:
         pixels, mask = dataset.read(), dataset.read_masks(1)
@@ -354,11 +352,9 @@ def test_a_vrt_is_copied_cropped_and_pointed_at_with_its_pixels_and_mask(tmp_pat
         with open_raster(tmp_path / name) as dataset:
             np.testing.assert_array_equal(dataset.read(), pixels)
             np.testing.assert_array_equal(dataset.read_masks(1), mask)
-    with open_raster(tmp_path / "copy.ntf") as dataset:
-        np.testing.assert_array_equal(dataset.read(), pixels)
     with open_raster(tmp_path / "crop.tif") as dataset:
         np.testing.assert_array_equal(dataset.read(), pixels[:, 4:22, 3:23])
         np.testing.assert_array_equal(dataset.read_masks(1), mask[4:22, 3:23])
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "again.vrt", "copy.ntf", "copy.tif", "crop.tif", "m.tif", "x.vrt",
+        "again.vrt", "copy.tif", "crop.tif", "m.tif", "x.vrt",
     ]  # fmt: skip

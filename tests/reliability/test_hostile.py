@@ -250,7 +250,6 @@ def commands(image: Path, out: Path, *, slow: bool = False) -> list[list[object]
         ["convert", image, out / "c.tif", "--window", 0, 0, 60, 60],
         ["convert", image, out / "x.vrt"],
         ["convert", image, out / "x.tif"],
-        ["convert", image, out / "x.ntf"],
         ["convert", image, "--rpc", image, "-o", out / "applied", "--images", "copy"],
         ["fit", image, "-o", out / "f_RPC.TXT"],
     ]

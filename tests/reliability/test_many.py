@@ -45,7 +45,8 @@ import json, resource, sys, threading
 from pathlib import Path
 resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]),) * 2)
 from barpc.pipeline import load_views
-from barpc.tie import TieOptions, detect
+from barpc.tie import TieOptions
+from tests.tie.stages import detect
 from barpc.rasters.raster import hashed
 most, over = 0, threading.Event()
 def watch():

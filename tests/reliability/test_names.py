@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.pointio.matches import read_matches
 from barpc.pointio.names import MAX_NAME, cell, from_cell, require_pair_names, unique_names
 from barpc.rpcio import read_rpc
 from tests.lanes import rest_slow
+from tests.pointio.stages import read_matches
 
 from .conftest import Said, assert_one_line, barpc, hashes
 

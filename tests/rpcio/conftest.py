@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
+from rasterio.shutil import copy as raster_copy
 
-from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc
+from barpc.rasters.raster import open_raster
+from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
 from barpc.sensor.rpc import RPC
 
 
@@ -40,6 +42,23 @@ def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile
         with rasterio.open(path, "w", **(options | profile)) as out:
             out.write(data)
     return path
+
+
+def nitf_record(rpc: RPC) -> str:
+    """The record of RPC00B (STDI-0002) of numbers that it holds; an unknown accuracy is zero."""
+    fields = fields_from_rpc(rpc)
+    axes = "+08.4f", "+09.4f", "+05.0f"  # lat, lon, height
+    layouts = "07.2f", "07.2f", "06.0f", "05.0f", *axes, "06.0f", "05.0f", *axes
+    cells = [format(fields.get(key, [0.0])[0], layout) for key, layout in zip(SINGLE, layouts, strict=True)]
+    halves = [f"{value:+.6E}".split("E") for key in COEFFICIENTS for value in fields[key]]
+    return "1" + "".join(cells) + "".join(f"{mantissa}E{int(power):+d}" for mantissa, power in halves)
+
+
+def write_nitf(rpc: RPC, image: Path, path: Path) -> None:
+    """A NITF with an RPC and the pixels of an image, by GDAL."""
+    with open_raster(image) as dataset:
+        raster_copy(dataset, str(path), driver="NITF", TRE=f"RPC00B={nitf_record(rpc)}")
+    path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
 
 
 @pytest.fixture

@@ -26,14 +26,12 @@ from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import (
     Directory,
     Entry,
-    nitf_record,
     printable,
     put_tag,
     read_directory,
     read_tag,
     read_values,
     write_crop,
-    write_rpc_nitf,
 )
 from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
@@ -226,16 +224,6 @@ def test_a_vrt_is_copied_with_its_pixels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(tmp_path / "scene.tif"))
 
 
-def test_a_vrt_becomes_a_nitf_with_its_pixels(tmp_path: Path) -> None:
-    rpc = replace(
-        make_rpc(), image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
-        ground_scale=[0.0062, 0.0045, 143.0],
-    )  # fmt: skip
-    write_rpc_nitf(rpc, mosaic(tmp_path), tmp_path / "copy.ntf")
-    np.testing.assert_array_equal(pixels(tmp_path / "copy.ntf"), pixels(tmp_path / "scene.tif"))
-    np.testing.assert_allclose(read_rpc(tmp_path / "copy.ntf").image_offset, [950.0, 900.0])
-
-
 def test_a_vrt_of_a_part_of_an_image_is_not_pointed_at(tmp_path: Path) -> None:
     """Its pixels are not those of the image: a copy is made of it, no other VRT."""
     path = mosaic(tmp_path)
@@ -270,45 +258,8 @@ def test_a_window_lies_within_the_image_and_has_pixels(window: tuple[int, ...], 
     assert read_rpc(tmp_path / "b.tif") == crop
 
 
-@pytest.mark.parametrize(("middle", "offset"), [((950.0, 900.0), (943.0, 895.0)), ((-50.3, 1.0), (0.0, 0.0))])
-@pytest.mark.parametrize("placed", [False, True])
-@pytest.mark.parametrize("kind", [{"dtype": "uint16", "nodata": 0}, {"dtype": "float32", "shape": (3, 40, 60)}])
-def test_a_window_of_a_nitf_has_its_pixels_and_the_camera_that_the_file_holds(
-    kind, placed, middle, offset, tmp_path: Path
-) -> None:
-    """Also of an image that is placed on a map: the RPC alone says where a NITF is; nothing is left beside it. An
-    RPC's middle may lie before the part, where the format's numbers have no sign.
-    """
-    rpc = replace(
-        make_rpc(), image_offset=middle, image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
-        ground_scale=[0.0062, 0.0045, 143.0],
-    )  # fmt: skip
-    rpc = replace(rpc, coeffs=np.round(rpc.coeffs, 6))
-    turned = {"crs": 4326, "transform": rasterio.Affine(1.1e-5, 3e-6, 5.0, -2e-6, -0.9e-5, 44.0)}
-    image = write_image(tmp_path / "a.tif", **kind, **(turned if placed else {}))
-    crop = write_crop(rpc, image, tmp_path / "b.NTF", (7, 5, 30, 20))
-    assert crop == read_rpc(tmp_path / "b.NTF")
-    np.testing.assert_array_equal(crop.image_offset, offset)
-    assert crop.off(rpc.crop(7, 5)).max() < 2e-3
-    np.testing.assert_array_equal(pixels(tmp_path / "b.NTF"), pixels(image)[:, 5:25, 7:37])
-    with open_raster(tmp_path / "b.NTF") as made:
-        assert made.driver == "NITF"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.NTF"]
-
-
-def test_a_window_whose_rpc_a_nitf_cannot_hold_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
-    image = write_image(tmp_path / "a.tif")
-    with pytest.raises(RpcFormatError, match="does not fit"):
-        write_crop(replace(make_rpc(), ground_offset=[5.4, 43.2, 123456.0]), image, tmp_path / "b.ntf", (7, 5, 30, 20))
-    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
-
-
 def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
     rpc, image = make_rpc(), write_image(tmp_path / "a.tif", dtype="uint8")
-    whole = replace(
-        rpc, image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0], ground_offset=[5.4, 43.2, 167.0],
-        ground_scale=[0.0062, 0.0045, 143.0],
-    )  # fmt: skip
     none = CorrectionGrid([0.0, 59.0], [0.0, 39.0], np.zeros((2, 2, 2)))
     nodes = DirectGrid([0.0, 1.0], [0.0, 1.0], [0.0, 50.0], np.random.default_rng(0).uniform(5, 6, (2, 2, 2, 2)))
     path = tmp_path / "out"
@@ -316,7 +267,6 @@ def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
         lambda **how: write_rpc(rpc, path, format="txt", **how),
         lambda **how: write_rpc_vrt(rpc, image, path, **how),
         lambda **how: write_rpc_copy(rpc, image, path, **how),
-        lambda **how: write_rpc_nitf(whole, image, path, **how),
         lambda **how: write_crop(rpc, image, path, (0, 0, 5, 5), **how),
         lambda **how: grids.write_resampled(rpc, none, image, path, **how),
         lambda **how: write_correction(none, rpc, path, **how),
@@ -527,31 +477,6 @@ def test_a_yaml_of_two_images_or_without_numbers() -> None:
     assert (found.err_bias, found.err_rand) == (None, None)
     dashes = re.sub(r"\[([^\]]*)\]", lambda m: "".join(f"\n        - {v.strip()}" for v in m[1].split(",")), text)
     assert parse_rpc(dashes.encode(), "m")[0] == make_rpc()
-
-
-def test_a_record_of_a_nitf_holds_nine_powers_of_ten_and_whole_pixels() -> None:
-    rpc = replace(make_rpc(), image_offset=[950.0, 900.0], image_scale=[1010.0, 980.0])
-    coeffs = rpc.coeffs.copy()
-    coeffs[2, 1:5] = [1.5e9, 1.5e-9, 1.5e-10, -2.5e-3]
-    record = nitf_record(replace(rpc, coeffs=coeffs))
-    first = 1 + 7 + 7 + 2 * 33
-    cells = [record[first + 12 * k : first + 12 * (k + 1)] for k in range(5)]
-    assert cells[1:] == ["+1.500000E+9", "+1.500000E-9", "+0.000000E+0", "-2.500000E-3"]
-    coeffs[2, 1] = 1.5e10
-    with pytest.raises(RpcFormatError, match=r"a coefficient of LINE_NUM_COEFF is 1\.5e\+10, beyond"):
-        nitf_record(replace(rpc, coeffs=coeffs))
-    for change, ok in (
-        ({"image_offset": [99999.0, 999999.0]}, True),
-        ({"image_offset": [100000.0, 0.0]}, False),
-        ({"image_offset": [-1.0, 0.0]}, True),
-        ({"ground_offset": [-179.0, -89.0, -9999.0]}, True),
-        ({"ground_offset": [5.0, 43.0, 10000.0]}, False),
-    ):
-        if ok:
-            assert len(nitf_record(replace(rpc, **change))) == 1041
-        else:
-            with pytest.raises(RpcFormatError, match="does not fit"):
-                nitf_record(replace(rpc, **change))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 from barpc.base.errors import ImageError, OutputError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.formats import parse_rpc
-from barpc.rpcio.images import nitf_record
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
@@ -199,13 +198,6 @@ def test_alos_columns_are_read(tmp_path):
     np.testing.assert_array_equal(source.rpc.image_offset, [3550.0, 6500.0])
     np.testing.assert_array_equal(source.rpc.image_scale, [3551.0, 6501.0])
     np.testing.assert_array_equal(source.rpc.coeffs[:, 2], [3.25e-2, 4.25e-2, 1.25e-2, 2.25e-2])
-
-
-def test_a_nitf_record_has_1041_characters_and_says_when_a_number_does_not_fit(rpc):
-    assert len(nitf_record(rpc)) == 1041
-    assert nitf_record(rpc.crop(0, 1000))[15:26] == "00000000999"  # line, sample: no sign, so the first counts from 0
-    with pytest.raises(RpcFormatError, match=r"LINE_OFF = 1\.00095e\+06 does not fit"):
-        nitf_record(rpc.crop(0, -1_000_000))
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,10 @@ import rasterio
 from rasterio import Affine
 from rasterio.control import GroundControlPoint
 from rasterio.errors import NotGeoreferencedWarning
+from rasterio.shutil import copy as raster_copy
 
 from barpc.base.errors import ImageError, OutputError, RpcFormatError
+from barpc.fit import FitOptions, fit_rpc
 from barpc.pipeline.verify_outputs import CONSUMERS
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import (
@@ -23,11 +25,10 @@ from barpc.rpcio import (
     read_rpc_source,
     write_crop,
     write_rpc_copy,
-    write_rpc_nitf,
     write_rpc_vrt,
 )
 from barpc.rpcio.images import printable, put_tag, read_tag
-from tests.rpcio.conftest import grid, make_rpc, write_image
+from tests.rpcio.conftest import grid, make_rpc, write_image, write_nitf
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -173,7 +174,7 @@ def test_the_input_is_never_written_to(rpc, image, tmp_path):
     before = image.read_bytes()
     (tmp_path / "link.tif").symlink_to(image)
     for target in (image, tmp_path / "link.tif"):
-        for write in (write_rpc_copy, write_rpc_vrt, write_rpc_nitf):
+        for write in (write_rpc_copy, write_rpc_vrt):
             with pytest.raises(OutputError, match="never written to"):
                 write(rpc, image, target, overwrite=True)
         with pytest.raises(OutputError, match="never written to"):
@@ -216,8 +217,7 @@ def test_resampling_moves_pixel_centres_with_their_corners(rpc):
     np.testing.assert_allclose(half.project(grid(rpc)), projected, rtol=0, atol=1e-9)
 
 
-def test_a_nitf_copy_holds_what_its_record_can_hold(image, tmp_path):
-    """Numbers that fit the record come back to the bit; others are off by what the record cuts off."""
+def test_a_nitf_is_read_to_the_last_digit_of_its_record(image, tmp_path):
     rpc = make_rpc()
     fitting = type(rpc)(
         np.round(rpc.coeffs, 6),
@@ -228,13 +228,21 @@ def test_a_nitf_copy_holds_what_its_record_can_hold(image, tmp_path):
         3.1,
         0.7,
     )
-    write_rpc_nitf(fitting, image, tmp_path / "a.ntf")
+    write_nitf(fitting, image, tmp_path / "a.ntf")
     source = read_rpc_source(tmp_path / "a.ntf")
     assert (source.rpc, source.format) == (fitting, "nitf")
     np.testing.assert_array_equal(pixels(tmp_path / "a.ntf"), pixels(image))
-    with open_raster(tmp_path / "a.ntf") as dataset:
-        assert dataset.rpcs.line_off == 950.0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ntf", "in"]
+
+
+def test_gdal_makes_a_nitf_of_a_copy_that_was_fitted_for_its_digits(image, tmp_path):
+    """What barpc writes no NITF for: GDAL puts the tag's RPC into the record, and cuts off its last digit at most."""
+    truth = make_rpc()
+    fitted = fit_rpc(truth, (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf")).rpc
+    for rpc, least, most in ((fitted, 0.0, 1e-4), (truth, 0.1, 5.0)):
+        write_rpc_copy(rpc, image, tmp_path / "a.tif", overwrite=True)
+        with open_raster(tmp_path / "a.tif") as dataset:
+            raster_copy(dataset, str(tmp_path / "a.ntf"), driver="NITF")
+        assert least <= read_rpc(tmp_path / "a.ntf").off(rpc).max() <= most
 
 
 def test_a_raster_that_is_no_tiff_is_converted_and_leaves_nothing_beside(rpc, tmp_path):
@@ -246,8 +254,7 @@ def test_a_raster_that_is_no_tiff_is_converted_and_leaves_nothing_beside(rpc, tm
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.tif", "in.png"]
 
 
-@pytest.mark.parametrize("write", [write_rpc_copy, write_rpc_nitf])
-def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leaves_nothing(write, tmp_path, monkeypatch):
+def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leaves_nothing(tmp_path, monkeypatch):
     """As on a disk that is full when GDAL closes the file, of which it says nothing."""
     real = images.raster_copy
 
@@ -261,7 +268,7 @@ def test_a_converted_copy_whose_pixels_are_not_the_image_s_is_an_error_and_leave
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with pytest.raises(OutputError, match="other pixels than were written"):
-            write(make_rpc(), image, tmp_path / "out" / "copy.any")
+            write_rpc_copy(make_rpc(), image, tmp_path / "out" / "copy.any")
     assert not list((tmp_path / "out").iterdir())
 
 

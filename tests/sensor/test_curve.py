@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.polynomial import polynomial
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import RpcError
 from barpc.sensor.curve import (
@@ -18,7 +17,6 @@ from barpc.sensor.curve import (
     attitude_through,
     fit_orbit,
     rotation_left_jacobian,
-    rotation_vector,
 )
 
 RNG = np.random.default_rng(0)
@@ -208,14 +206,3 @@ def test_an_attitude_may_turn_by_two_radians_from_its_middle() -> None:
                   turned(np.nan)):  # fmt: skip
         with pytest.raises(RpcError, match="quaternions"):
             attitude_through(time, wrong)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-3, 1.0, 2.5, np.pi - 1e-7, np.pi])
-def test_the_rotation_vector_of_a_matrix_is_that_of_scipy(angle):
-    for axis in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(7).normal(size=(40, 3))]):
-        matrix = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-        found, wanted = rotation_vector(matrix), Rotation.from_matrix(matrix).as_rotvec()
-        if angle == np.pi:  # half a turn has two vectors
-            wanted = wanted * np.sign(found @ wanted)
-        assert np.abs(found - wanted).max() <= 2e-15 * angle
-        assert np.linalg.norm(found) <= np.pi * (1 + 1e-15)

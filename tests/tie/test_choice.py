@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from barpc.base.options import RunOptions
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
-from barpc.tie import Scope, TieOptions, find_tracks, select_pairs, tracks
+from barpc.tie import Scope, TieOptions, find_tracks, tracks
 from barpc.tie.matchers.features import KeypointFiles
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.report import PairReport
@@ -31,6 +31,7 @@ from barpc.tie.pairing.overlaps import (
 from barpc.tie.tasks import Store, Work
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
+from tests.tie.stages import select_pairs
 
 from .test_pairs import METRE, camera, views
 

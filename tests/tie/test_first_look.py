@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.tie import TieOptions, TieResult, common_tracks, find_tracks, tracks
+from barpc.tie import TieOptions, TieResult, find_tracks, tracks
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, worth_a_first_look
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.report import PairReport, ample
 from barpc.tie.pairing.overlaps import Pair
+from tests.tie.stages import common_tracks
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
 

@@ -14,10 +14,11 @@ import barpc.tie.pixels as reading
 from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
-from barpc.tie import Matches, Scope, TieOptions, common_tracks, find_tracks
+from barpc.tie import Matches, Scope, TieOptions, find_tracks
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
+from tests.tie.stages import common_tracks
 
 from .conftest import SIDES, Rendered, write_image
 

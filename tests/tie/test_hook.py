@@ -16,11 +16,12 @@ from barpc.base.errors import InputError, TiePointError
 from barpc.base.options import TieOptions, read_options
 from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
-from barpc.tie import Matches, common_tracks, find_tracks
+from barpc.tie import Matches, find_tracks
 from barpc.tie.matchers.matcher import Hook, Prediction, hook_files, hooked
 from barpc.tie.matchers.matching import MATCHERS, matcher_named
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.lanes import rest_slow
+from tests.tie.stages import common_tracks
 from tests.tie.test_pairs import METRE, camera, views
 
 ROOT = Path(__file__).parents[2]

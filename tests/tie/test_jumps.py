@@ -11,7 +11,7 @@ from scipy.ndimage import shift
 from barpc.base.options import TieOptions
 from barpc.rasters.raster import open_raster
 from barpc.scene import View
-from barpc.tie import common_tracks, find_tracks
+from barpc.tie import find_tracks
 from barpc.tie.matchers.given import verify_given
 from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import _PairSearch
@@ -20,6 +20,7 @@ from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tasks import HERE
 from benchmarks.planted import Plant
 from tests.tie.conftest import Rendered, write_image
+from tests.tie.stages import common_tracks
 
 PLANTS = [
     Plant("jump", 1, 1, 150, (0.0, 2.0)),

@@ -13,7 +13,7 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
-from barpc.tie import TieOptions, detect, find_tracks, link, select_pairs
+from barpc.tie import TieOptions, find_tracks, link
 from barpc.tie.matchers.features import KeypointDensity, Keypoints, detect_tile
 from barpc.tie.matchers.matching import match_pair
 from barpc.tie.matchers.report import PairReport
@@ -27,6 +27,7 @@ from barpc.tie.patches.register import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
 from tests.tie.conftest import Rendered, write_image
+from tests.tie.stages import detect, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
 
 

@@ -10,10 +10,11 @@ import pytest
 from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
-from barpc.tie import Scope, TieOptions, select_pairs
+from barpc.tie import Scope, TieOptions
 from barpc.tie.pairing.overlaps import shared_tiles
 from barpc.tie.pixels import tiles
 from tests.constants import chosen
+from tests.tie.stages import select_pairs
 
 
 def camera(lon: float, lat: float = 0.0, lean: float = 0.1) -> RPC:

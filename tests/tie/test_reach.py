@@ -17,7 +17,7 @@ from rasterio.warp import transform
 from barpc.base.geodesy import Array
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
-from barpc.tie import PairReport, TieOptions, common_tracks, find_tracks
+from barpc.tie import PairReport, TieOptions, find_tracks
 from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
@@ -27,6 +27,7 @@ from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches import oriented
 from barpc.tie.patches.oriented import PatchTile
 from tests.lanes import rest_slow
+from tests.tie.stages import common_tracks
 
 from .conftest import write_image
 from .test_pairs import METRE, camera, views

@@ -9,8 +9,9 @@ import pytest
 
 from barpc.base.statistics import robust_spread
 from barpc.scene import Tracks, View
-from barpc.tie import TieOptions, TieResult, common_tracks, detect, find_tracks, match_pairs, select_pairs
+from barpc.tie import TieOptions, TieResult, find_tracks, match_pairs
 from barpc.tie.pairing.epipolar import Affine, coherent, epipolar_segments, robust_affine
+from tests.tie.stages import common_tracks, detect, select_pairs
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 

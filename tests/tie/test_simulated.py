@@ -14,8 +14,9 @@ from barpc.base.errors import DisconnectedError, ImageError, TiePointError
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected
-from barpc.tie import TieOptions, common_tracks, find_tracks
+from barpc.tie import TieOptions, find_tracks
 from tests.lanes import rest_slow
+from tests.tie.stages import common_tracks
 
 from .conftest import SIDES, write_image
 

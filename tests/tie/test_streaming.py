@@ -26,6 +26,7 @@ from barpc.tie.pixels import Survey, read_picture, survey, tiles
 from barpc.tie.tasks import Store, Work
 from barpc.workspace import Workspace
 from tests.lanes import diagonal, rest_slow
+from tests.tie.stages import detect
 
 from .conftest import write_image
 from .test_pairs import camera
@@ -74,7 +75,7 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
     monkeypatch.setattr(features, "_ZOOMS", ((np.inf, zoom),))
     monkeypatch.setattr(features, "PER_IMAGE", most)
     options = TieOptions(tile=128)
-    for found in features.detect(pair, options):
+    for found in detect(pair, options):
         assert 0.9 * most <= len(found) <= most
         assert 0.4 <= left(found.xy) <= 0.6
     tracks = find_tracks(pair, options).tracks

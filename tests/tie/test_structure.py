@@ -14,14 +14,7 @@ from scipy import ndimage
 from barpc.base.errors import TiePointError
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
-from barpc.tie import (
-    Matches,
-    PairReport,
-    TieOptions,
-    common_tracks,
-    find_tracks,
-    select_pairs,
-)
+from barpc.tie import Matches, PairReport, TieOptions, find_tracks
 from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
@@ -45,6 +38,7 @@ from barpc.tie.pixels import read_pixels
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
 from tests.tie.conftest import write_image
+from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import camera, views
 
 

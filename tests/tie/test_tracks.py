@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from barpc.scene import Tracks
-from barpc.tie import Matches, TieOptions, common_tracks, select_pairs, thin
+from barpc.tie import Matches, TieOptions, thin
 from barpc.tie import link as link_pairs
 from barpc.tie.matchers.report import PairReport
 from barpc.tie.tracks import require_tracks
+from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
 
 PLACES = np.random.default_rng(0).uniform(0, 100, (4, 10, 2))

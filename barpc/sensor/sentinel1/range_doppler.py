@@ -331,10 +331,8 @@ class RangeDoppler(Clocked):
     def _geometry(self, ecef: Array) -> _ZeroDopplerPoints:
         point = ecef.T
         low, high = self.orbit.span
-        time, settled = (
-            np.where(np.isfinite(point[0]), (low + high) / 2, np.nan),
-            NEWTON_TOLERANCE * self.frame.interval,
-        )
+        time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
+        settled = NEWTON_TOLERANCE * self.frame.interval
         for _ in range(NEWTON_STEPS):
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
@@ -441,10 +439,8 @@ def swaths_model(
     nearest = swaths[0]
     alt = np.concatenate([a.grid.ground[:, 2] for a in swaths])
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
-    of_orbit, left = (
-        ORBITS.get(states.source, ORBITS["Downlink"]),
-        (RESIDUAL_DELAYS[0][atmosphere], RESIDUAL_DELAYS[1][bistatic == "full"]),
-    )
+    of_orbit = ORBITS.get(states.source, ORBITS["Downlink"])
+    left = RESIDUAL_DELAYS[0][atmosphere], RESIDUAL_DELAYS[1][bistatic == "full"]
     model = RangeDoppler(
         orbit=_fitted_orbit(nearest, states, epoch),
         epoch=epoch,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -18,7 +17,7 @@ from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
 from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
-from barpc.tie.tasks import Progress, Store, Work, names_of, store_of
+from barpc.tie.tasks import Store, Work, names_of
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""
@@ -322,18 +321,3 @@ def locate(
         part = slice(first, first := first + len(of_view))
         files.append(KeypointFiles(work.store, tuple(of_view), tuple(names[part]), tuple(counts[part])))
     return files
-
-
-def detect(
-    views: Sequence[View],
-    options: TieOptions = TIE_DEFAULTS,
-    *,
-    pairs: Sequence[Pair] | None = None,
-    area: Area | None = None,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-) -> list[Keypoints]:
-    """Detect the keypoints of every view in memory; the rest as for `locate`."""
-    with store_of(executor) as store:
-        files = locate(views, options, Work(executor, progress, store), pairs=pairs, area=area)
-        return [of_view.load()[0] for of_view in files]

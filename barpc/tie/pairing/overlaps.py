@@ -258,14 +258,6 @@ TRIES = (2, 4, 8)
 """Round by round: so many pairs lead to what is not tied yet, where there are so many."""
 
 
-def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
-    """Choose the pairs of views to match, ascending, by overlap and angle: the best partners of every view (as many as
-    `options.neighbours`), and a spanning tree; errors as of `possible_pairs`.
-    """
-    pairs = possible_pairs(views, options, scope)
-    return pairs if scope.only else best_pairs(pairs, len(views), options.neighbours)
-
-
 def several_dates(views: Sequence[View]) -> bool:
     """Return whether the views are known to be of more than one date."""
     return len({view.date for view in views if view.date}) > 1
