@@ -42,7 +42,7 @@ def public(name: str) -> Any:
 def test_every_verb_is_a_function_with_its_flags_as_keywords():
     assert set(COMMANDS) - {"report"} <= set(PUBLIC)  # of a report AdjustResult.report, and files
     positional = {"images", "points", "numbers", "files", "run_dir", "places", "target"}
-    printed = {"jobs", "image_list", "options_file", "paper", "against", "out", "output", "outlines", "help_all", "at"}
+    printed = {"image_list", "options_file", "paper", "out", "output", "outlines", "help_all", "at"}
     for verb in set(COMMANDS) - {"report"}:
         command = cli.get_command(click.Context(cli), verb)
         assert command is not None
