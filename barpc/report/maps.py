@@ -194,7 +194,7 @@ def _map_labels(
         free = [row for row in rows if _is_free(x, row, half, taken)]
         free = free if len(places) <= TABLE_ROWS_SHOWN or view.advice else free if y in free else []
         if free:
-            y = next((row for row in free if _is_free(x, row, half, marks or ())), free[0])
+            y = next((row for row in free if _is_free(x, row, half, marks or [])), free[0])
             taken.append((x, y, half))
             names.append((view, name, x, y))
             counted_in |= same
