@@ -39,6 +39,7 @@ from barpc.workspace import Homes, Workspace
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
 _FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
+_STRETCH = 100.0  # of lengths by a map: Mercator's is 57 at a latitude of 89 degrees
 _MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
 _RELIEF = 50.0  # m around a DEM's heights at sampled places
 _NODES = 17
@@ -169,6 +170,8 @@ class _Warp:
                              f"{pixel * _COARSEST:.2g} m")  # fmt: skip
         east, north = transform(_WGS84, crs, *rings.T)
         west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
+        if not max(east - west, north - south) * gsd < _STRETCH * pixel * np.hypot(*camera.extent):
+            raise InputError(f"{file}: --crs {crs.to_string()}: lies at both ends of this map; give another projection")
         west, north = float(np.floor(west)), float(np.ceil(north))
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
         side = min(_SIDE, int(_SIDE * pixel / gsd))

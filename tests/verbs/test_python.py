@@ -6,6 +6,8 @@ import inspect
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -275,3 +277,44 @@ def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path
     assert shown.count("<tr>") == 3
     assert found.record.headline.split(".")[0] in shown
     assert "view_00" in shown
+
+
+# --- who works --------------------------------------------------------------------------------------------
+
+
+def test_jobs_are_processes_a_cluster_or_the_executor_given(monkeypatch):
+    asked = list[Any]()
+    monkeypatch.setattr("barpc.pipeline.check", lambda *_, executor, **__: asked.append(executor))
+    monkeypatch.setattr("barpc.verbs.workers._processes", lambda jobs: nullcontext(("processes", jobs)))
+    monkeypatch.setattr("barpc.verbs.workers._cluster", lambda address: nullcontext(("cluster", address)))
+    own: Any = object()
+    for how in ({}, {"jobs": 1}, {"jobs": 3}, {"jobs": "tcp://a:1"}, {"executor": own}, {"executor": own, "jobs": 3}):
+        barpc.check(VIEWS, **how)
+    assert asked == [None, None, ("processes", 3), ("cluster", "tcp://a:1"), own, own]
+    for jobs in (0, -2):
+        with pytest.raises(InputError, match=f"jobs {jobs}: a number of processes"):
+            barpc.check(VIEWS, jobs=jobs)
+
+
+@pytest.mark.slow
+def test_two_processes_write_what_one_does(tmp_path):
+    for jobs in (1, 2):
+        barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)
+    one, two = ((tmp_path / name / "matches.csv").read_bytes() for name in "12")
+    assert one == two
+
+
+def test_an_rpc_is_compared_with_another_or_with_those_of_a_folder(tmp_path):
+    rpc = barpc.read_rpc(VIEWS[0])
+    moved = replace(rpc, image_offset=rpc.image_offset + [3.0, 4.0])
+    barpc.write_rpc(moved, tmp_path / f"{VIEWS[0].stem}_RPC.TXT")
+    for against in (tmp_path, tmp_path / f"{VIEWS[0].stem}_RPC.TXT"):
+        (found,) = barpc.check(VIEWS[0], against=against)
+        assert (found.image, Path(found.against).parent) == (str(VIEWS[0]), tmp_path)
+        assert found.max_px == pytest.approx(5.0, abs=1e-6)
+
+
+def test_a_fit_tells_its_progress(tmp_path):
+    told = list[tuple[str, int, int]]()
+    barpc.fit(VIEWS[0], alt_range=(0, 400), progress=lambda *stage: told.append(stage))
+    assert told == [("fit", 0, 1), ("fit", 1, 1)]
