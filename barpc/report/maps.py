@@ -175,7 +175,7 @@ def _map_labels(
     """Return labels of images at positions (2,), without those that would cover others or occupied areas.
 
     Those that would cover `marks`, and of few images or of one that needs review those that would cover others, stand a
-    line below or above, if there is room. A name tells how many images have their middle in the same place.
+    line or two below or above, if there is room. A name tells how many images have their middle in the same place.
     """
     taken, names, every = list(taken), [], np.array([place for _, place in places])
     counted_in = np.zeros(len(places), dtype=bool)
@@ -190,7 +190,7 @@ def _map_labels(
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 4.1 * len(name)  # units of a bold character: 8.2, of digits
         x = min(max(x, half), WIDTH - half)
-        rows = (y, y + 1.1 * _LABEL_HEIGHT, y - 1.1 * _LABEL_HEIGHT)
+        rows = [y + 1.1 * _LABEL_HEIGHT * k for k in (0, 1, -1, 2, -2)]
         free = [row for row in rows if _is_free(x, row, half, taken)]
         free = free if len(places) <= TABLE_ROWS_SHOWN or view.advice else free if y in free else []
         if free:

@@ -248,11 +248,14 @@ def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_the
         "free": [],
         "below": [mark],
         "above": [mark, (50.0, 66.0, 5.0)],
-        "nowhere": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
+        "two below": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
+        "nowhere": [(50.0, 50.0 + 16.0 * k, 5.0) for k in range(-2, 3)],
     }
     found = {key: [y for *_, y in maps._map_labels(place, [], marks)] for key, marks in rows.items()}
-    assert found == {"free": [50.0], "below": [pytest.approx(65.4)], "above": [pytest.approx(34.6)], "nowhere": [50.0]}
-    assert maps._map_labels(place, [(50.0, 66.0, 5.0), (50.0, 34.0, 5.0)], [mark])[0][3] == 50.0  # words are no room
+    rows = {"free": 50.0, "below": 65.4, "above": 34.6, "two below": 80.8, "nowhere": 50.0}
+    assert found == {key: [pytest.approx(y)] for key, y in rows.items()}
+    words = [(50.0, 50.0 + 16.0 * k, 5.0) for k in (-2, -1, 1, 2)]  # where these stand is no room
+    assert maps._map_labels(place, words, [mark])[0][3] == 50.0
 
 
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
