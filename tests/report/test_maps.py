@@ -202,7 +202,37 @@ def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
         caption = _map_section(files).charts[0][1]
         assert caption.endswith("; shaded: rows or columns with few tie points.")
         plain = _map_section(files_of(a_summary(views[:1]), outlines[:1])).charts[0][1]
-        assert plain.endswith("dashed: tie points that move.")
+        assert plain == "Footprints at the altitude of the scene."
+
+
+def test_the_caption_names_what_is_on_the_map_and_nothing_else():
+    views, outlines, pairs = scene()
+    moving = ExplanationEntry("moving_objects", "a cloud", None, 50.0, 40.0, box=(9.996, -0.004, 10.004, -0.001))
+    rows = ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0)
+    point = a_gcp("P", 10.0, 0.0)
+    check = SimpleNamespace(**{**vars(a_gcp("Q", 10.0, 0.0)), "observations": ()})
+    words = {
+        "dots": "tie points",
+        "triangles": "GCPs",
+        "inverted triangles": "check points",
+        "thicker lines": "more matches",
+        "dashed": "tie points that move",
+    }
+    for known in (set(), {"dots"}, {"triangles"}, {"inverted triangles"}, {"thicker lines"}, {"dashed"}, set(words)):
+        summary = a_summary(
+            views,
+            pairs if "thicker lines" in known else pairs[:1],
+            gcps=(point,) * ("triangles" in known),
+            check_points=(check,) * ("inverted triangles" in known),
+            scene=SimpleNamespace(explanations=(moving, rows) if "dashed" in known else (rows,)),
+        )
+        files = files_of(summary, outlines, [(10.0, 0.0, 0.0, 0.0)] * ("dots" in known))
+        _, *told = _map_section(files).charts[0][1].rstrip(".").split("; ")
+        told = [one for one in told if one != "those that need review on top"]
+        assert told == [f"{key}: {word}" for key, word in words.items() if key in known]
+        drawn = Drawing(ground_map(files))
+        for key, kind in (("triangles", "gcps"), ("inverted triangles", "check_points"), ("dashed", "group")):
+            assert bool(drawn.titles(kind)) == (key in known)
 
 
 def test_where_tie_points_move_is_outlined_and_says_so():
