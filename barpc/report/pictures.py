@@ -53,7 +53,7 @@ def _flagged_parts(files: RunFiles) -> dict[str, list[tuple[str, Limits]]]:
     found: dict[str, list[tuple[str, Limits]]] = {}
     for one in _named_lines(files):
         for ends in _ends(one):
-            words = getattr(one, "sentence", f"{one.axis} {ends[0]:.0f}-{ends[1]:.0f}")
+            words = one.place if isinstance(one, LeftEntry) else one.sentence
             limits: Limits = (ends, None) if one.axis == AXES[0] else (None, ends)
             found.setdefault(str(one.image), []).append((words, limits))
     for worse in () if files.summary.scene is None else files.summary.scene.held_out_places or ():
