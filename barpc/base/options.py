@@ -695,20 +695,27 @@ class DsmOptions(Options):
             raise InputError(f"alt: the lower altitude comes first, found {self.alt}")
 
 
-def with_values(options: OptionsRecord, values: Mapping[str, Any], where: str = "options") -> OptionsRecord:
+def with_values(
+    options: OptionsRecord, values: Mapping[str, Any], where: str = "options", *, of_file: bool = False
+) -> OptionsRecord:
     """Return a copy of a record with some fields changed, nested records by nested mappings.
 
-    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
+    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`; if it is
+    a file (`of_file`), for a host, or a module that would be run, too.
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
         if name not in known:
             raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
-        nested = getattr(options, name)
+        nested, rule = getattr(options, name), known[name].rule
+        runs = rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value)
+        if of_file and (rule.cli_only or runs):
+            why = f"{value!r} would run code, which" if runs else "is set by a file of unknown origin, which"
+            raise InputError(f"{where}: {name} {why} is not accepted; give the flag --{name.replace('_', '-')}")
         if isinstance(nested, Options):
             if not isinstance(value, Mapping):
                 raise InputError(f"{where}: [{name}] must be a table, found {value!r}")
-            changed[name] = with_values(nested, value, f"{where} [{name}]")
+            changed[name] = with_values(nested, value, f"{where} [{name}]", of_file=of_file)
     try:
         return replace(options, **changed)  # type: ignore[type-var]  # children are dataclasses
     except InputError as error:
@@ -736,23 +743,7 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
-    for name in data:
-        if (one := declared(RunOptions).get(name)) is not None and one.rule.cli_only:
-            raise InputError(f"{path}: {name} is not accepted from a file of unknown origin; give the flag")
-    _refuse_code(path, RunOptions, data)
-    return with_values(options or RunOptions(), data, str(path))
-
-
-def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, Any]) -> None:
-    """InputError where a file names a module that would be run: only a person may, by a flag or in Python."""
-    for name, one in declared(record).items():
-        value = values.get(name)
-        if isinstance(one.default, Options) and isinstance(value, Mapping):
-            _refuse_code(path, type(one.default), value)
-        elif one.rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
-            raise InputError(
-                f"{path}: {name} {value!r} would run code, which is not accepted from a file; give the flag --{name}"
-            )
+    return with_values(options or RunOptions(), data, str(path), of_file=True)
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
