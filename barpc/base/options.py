@@ -700,8 +700,8 @@ def with_values(
 ) -> OptionsRecord:
     """Return a copy of a record with some fields changed, nested records by nested mappings.
 
-    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`; if it is
-    a file (`of_file`), for a host, or a module that would be run, too.
+    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`; of a
+    file (`of_file`) also for a host, or a module that would be run.
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
