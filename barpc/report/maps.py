@@ -151,10 +151,18 @@ def ground_map(files: RunFiles) -> str:
         gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
         pairs=_pair_lines(middles, files),
         shown=_map_labels([(view, middles[view.name]) for view in named], taken, triangles),
-        marks=[(kind, point.name, x, y, up) for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)],
+        marks=[
+            (kind, "doubted" * doubted(point), point.name, x, y, up)
+            for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)
+        ],
         summary=summary,
     )
     return text
+
+
+def doubted(point: GcpEntry | CheckPointEntry) -> bool:
+    """Return whether a GCP contradicts others."""
+    return getattr(point, "status", "used") not in ("used", "not seen")
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:

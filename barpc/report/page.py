@@ -17,7 +17,7 @@ import numpy as np
 from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
-from barpc.report.maps import ground_map, residual_panels, template
+from barpc.report.maps import doubted, ground_map, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.ranking import (
@@ -183,7 +183,7 @@ def _map_section(files: RunFiles) -> Section:
         "Footprints at the altitude of the scene": True,
         "those that need review on top": any(view.advice for view in summary.views),
         "dots: tie points": len(files.points),
-        "triangles: GCPs": summary.gcps,
+        f"triangles: GCPs{', red where they contradict others' * any(map(doubted, summary.gcps))}": summary.gcps,
         "inverted triangles: check points": summary.check_points,
         "thicker lines: more matches": len(links) > 1,
         "dashed: tie points that move": any(one.box for one in (summary.scene.explanations if summary.scene else ())),

@@ -235,6 +235,18 @@ def test_the_caption_names_what_is_on_the_map_and_nothing_else():
             assert bool(drawn.titles(kind)) == (key in known)
 
 
+@pytest.mark.parametrize("status", ["used", "not seen", "contradicts", "rejected", "undecided"])
+def test_a_gcp_that_contradicts_others_is_red_and_the_caption_says_so(status):
+    views, outlines, _ = scene()
+    summary = a_summary(views, gcps=(a_gcp("P", 10.0, 0.0, status=status), a_gcp("Q", 10.001, 0.0)))
+    drawn, wrong = Drawing(ground_map(files_of(summary, outlines))), status not in ("used", "not seen")
+    classes = [mark.get("class") for mark in drawn.all("path") if "gcps" in (mark.get("class") or "").split()]
+    assert classes == ["gcps doubted" if wrong else "gcps", "gcps"]
+    told = _map_section(files_of(summary, outlines)).charts[0][1]
+    assert ("triangles: GCPs, red where they contradict others." in told) == wrong
+    assert told.endswith("triangles: GCPs.") != wrong
+
+
 def test_where_tie_points_move_is_outlined_and_says_so():
     views, outlines, pairs = scene()
     box = (9.996, -0.004, 10.004, -0.001)
