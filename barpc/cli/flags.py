@@ -103,7 +103,7 @@ def _parameter(target: str) -> str:
 
 def flag(target: str) -> Callable[[Function], Function]:
     """Return the click option that sets a field of a run's options: None where it is not given."""
-    return _option(field_of(target), target.rpartition(".")[2], _parameter(target))
+    return _field_flag(field_of(target), target.rpartition(".")[2], _parameter(target))
 
 
 def flags_of(record: type[Options], **others: str) -> Callable[[Function], Function]:
@@ -112,7 +112,7 @@ def flags_of(record: type[Options], **others: str) -> Callable[[Function], Funct
     def decorate(function: Function) -> Function:
         for name, one in reversed([*declared(record).items()]):
             rule = replace(one.rule, help=others.get(name, one.rule.help))
-            function = _option(replace(one, rule=rule), name, name)(function)
+            function = _field_flag(replace(one, rule=rule), name, name)(function)
         return function
 
     return decorate
@@ -123,7 +123,7 @@ def given_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in flags.items() if value is not None}
 
 
-def _option(one: Declared, name: str, parameter: str) -> Callable[[Function], Function]:
+def _field_flag(one: Declared, name: str, parameter: str) -> Callable[[Function], Function]:
     """Return the click option that sets a field: its type, range, choices, help and default are the field's own."""
     rule, kind, words = one.rule, one.kind, flag_name(name)
     if kind is bool:  # None: the options file, or the default, decides
@@ -138,7 +138,7 @@ def _option(one: Declared, name: str, parameter: str) -> Callable[[Function], Fu
         if parts and commas:
             value = [word.strip() for word in value.split(",")]
         if item in (int, float):
-            value = [_number(item, word) for word in value] if parts else _number(item, value)
+            value = [_as_number(item, word) for word in value] if parts else _as_number(item, value)
         try:
             return checked(name, kind, rule, value)
         except InputError as error:
@@ -154,7 +154,7 @@ def _option(one: Declared, name: str, parameter: str) -> Callable[[Function], Fu
     return click.option(words, parameter, help=_help(one, several), metavar=_metavar(one, several, choices), **how)
 
 
-def _number(kind: type, word: str) -> Any:
+def _as_number(kind: type, word: str) -> Any:
     """Return a word as a number; one that is none stays, and is refused by its field."""
     with suppress(ValueError):
         return kind(word)

@@ -14,7 +14,7 @@ from barpc.base.options import DsmOptions, OrthoOptions
 from barpc.cli.flags import flags_of, given_flags, jobs_option
 from barpc.cli.terminal import at_work, echo, print_comparison, remark, tell, tell_gate, wants_json
 
-_KINDS = "input", "output", "camera"  # of files that `verify` compares
+_VERIFIED = "input", "output", "camera"  # of files that `verify` compares
 _TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 

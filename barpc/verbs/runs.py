@@ -145,7 +145,7 @@ def check(
     """
     chosen = run_options(options, **keywords)
     if against is not None:
-        return _compared(images, Path(against))
+        return _rpc_differences(images, Path(against))
     with executor_for(jobs, executor) as workers:
         return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
 
@@ -158,7 +158,7 @@ class Compared(NamedTuple):
     max_px: float
 
 
-def _compared(images: ImageLike | Iterable[ImageLike], against: Path) -> list[Compared]:
+def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> list[Compared]:
     from barpc.cameras import open_camera
     from barpc.pipeline.verify_outputs import difference
     from barpc.rpcio import find_rpc
