@@ -128,7 +128,7 @@ def check(
 
     Returns
     -------
-    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of Compared, an image each
+    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of RpcDifference, an image each
 
     Raises
     ------
@@ -150,7 +150,7 @@ def check(
         return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
 
 
-class Compared(NamedTuple):
+class RpcDifference(NamedTuple):
     """An image, the file of the other RPC, and the largest difference of both over image and altitudes [px]."""
 
     image: str
@@ -158,7 +158,7 @@ class Compared(NamedTuple):
     max_px: float
 
 
-def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> list[Compared]:
+def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> list[RpcDifference]:
     from barpc.cameras import open_camera
     from barpc.pipeline.verify_outputs import difference
     from barpc.rpcio import find_rpc
@@ -167,7 +167,7 @@ def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> 
     for view in pipeline.load_views(every(images), min_views=1, distinct=False).views:
         other = find_rpc(against, Path(view.path)) if against.is_dir() else against
         far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
-        found.append(Compared(view.path, str(other), far))
+        found.append(RpcDifference(view.path, str(other), far))
     return found
 
 
