@@ -128,7 +128,7 @@ def check(
 
     Returns
     -------
-    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of RpcDifference, an image each
+    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of RpcDifference
 
     Raises
     ------
