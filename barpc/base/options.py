@@ -19,7 +19,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, UsageError
 from barpc.base.remote import HOST_PATTERN
 from barpc.base.safe_io import BYTES_PER_NUMBER, OPTIONS, TABLE, read_text
 
@@ -37,6 +37,7 @@ GEOID_HELP = (
     "ellipsoidal heights. Without: the one that their file names."
 )
 HEIGHTS_HELP = "Vertical datum of heights in files that state none: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
+LONGEST_MOVE = 22e3  # m along an axis: from the sea's deepest bottom to the highest ground
 MOST_POINTS = (TABLE.most or 0) // (5 * BYTES_PER_NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 _SHORT = reprlib.Repr()
@@ -57,6 +58,7 @@ class Rule:
     hook: bool = False  # or `module:name`, of a user's own
     removed: Mapping[str, str] = field(default_factory=dict)  # value of earlier releases -> what it was, what to use
     cli_only: bool = False  # given on the command line or in Python: no options file may set it
+    metavar: str = ""  # names of the values on the command line, with the commas that stand between them
 
     def holds(self, number: float) -> bool:
         """Return whether a number lies within the bounds; NaN and the infinities do not."""
@@ -165,6 +167,7 @@ def checked(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     if get_origin(kind) is tuple and rule.unit == "file" and isinstance(value, (str, os.PathLike)):
         value = (value,)  # of files one is as good as a list of one
     if get_origin(kind) is tuple:
+        value = value.tolist() if hasattr(value, "tolist") else value  # numpy's arrays
         if isinstance(value, (list, tuple)) and (parts[-1] is ... or len(parts) == len(value)):
             return tuple(checked(name, parts[0], rule, item) for item in value)
     elif rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
@@ -564,6 +567,93 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
 
 
 @dataclass(frozen=True, repr=False)
+class HeightOptions(Options):
+    """Heights of the ground that images show."""
+
+    alt: float | None = option(
+        None,
+        "Altitude where no DEM is given. Without: that of the run's tie points, else the middle of the camera's.",
+        unit="m",
+    )
+    dem: tuple[str, ...] = option(
+        (), "Take the altitudes from a DEM; of several, from the first that has one.", unit="file"
+    )
+    geoid: str | None = option(None, GEOID_HELP, unit="file", metavar="NAME|FILE")
+
+
+@dataclass(frozen=True, repr=False)
+class OrthoOptions(HeightOptions):
+    """Options of `barpc.ortho`."""
+
+    gsd: float | None = option(None, "Side of a pixel. Without: that of the finest image.", unit="m", above=0)
+    crs: str | None = option(None, "Map projection in metres. Without: the UTM zone of the first image.", unit="name")
+    overwrite: bool = option(False, "Replace orthoimages of an earlier call.")
+
+
+@dataclass(frozen=True, repr=False)
+class ConvertOptions(HeightOptions):
+    """Options of `barpc.convert`; some go with a folder alone (`out_dir`, -o)."""
+
+    rpc: str | None = option(None, "With a folder: an RPC file, or a folder of them by image name.", unit="file")
+    images: Literal["vrt", "copy"] | None = option(None, "With a folder: the image files. Without: vrt.")
+    rpc_format: str | None = option(
+        None, "Formats with commas between. Without: that of the target's name; in a folder txt.", metavar="NAMES"
+    )
+    move: tuple[float, float, float] | None = option(
+        None,
+        "With a folder: shift the ground east, north, up, from its position by the cameras to the true one.",
+        unit="m",
+        above=-LONGEST_MOVE,
+        below=LONGEST_MOVE,
+        metavar="E,N,U",
+    )
+    transform: str | None = option(
+        None,
+        "With a folder: the same by a 4 x 4 (or 3 x 4) matrix of ECEF coordinates, as pc_align writes it.",
+        unit="file",
+    )
+    window: tuple[int, int, int, int] | None = option(
+        None, "Cut out a part of one image.", unit="px", metavar="COL ROW WIDTH HEIGHT"
+    )
+    bbox: tuple[float, float, float, float] | None = option(
+        None,
+        "Cut out a box; with a folder of every image that covers it.",
+        unit="deg",
+        metavar="WEST SOUTH EAST NORTH",
+    )
+    aoi: str | None = option(None, "Cut out the box around polygons in lon/lat (GeoJSON), as with `bbox`.", unit="file")
+    overwrite: bool = option(False, "Replace an existing file, or files of an earlier run.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.move is not None and self.transform is not None:
+            raise UsageError("give either --move or --transform")
+
+    @property
+    def cut(self) -> bool:
+        """Whether a part of each image is cut out."""
+        return any(one is not None for one in (self.window, self.bbox, self.aoi))
+
+
+@dataclass(frozen=True, repr=False)
+class RefitOptions(Options):
+    """Options of `barpc.fit` beside those of `FitOptions`."""
+
+    alt_range: tuple[float, float] | None = option(
+        None,
+        """Altitudes above the ellipsoid to fit over. Without: the camera's own; of a radar all ground on Earth, -500
+        to 9000 m, where an RPC holds it.""",
+        unit="m",
+        metavar="LOW HIGH",
+    )
+    dem: tuple[str, ...] = option((), "Take the altitudes of this DEM over the image, with a margin.", unit="file")
+    dem_margin: float = option(500.0, "Margin below and above the DEM.", unit="m", least=0)
+    geoid: str | None = option(None, GEOID_HELP, unit="file", metavar="NAME|FILE")
+    keep_going: bool = option(False, "Write the RPC although it misses the tolerance.")
+    overwrite: bool = option(False, "Replace an existing file.")
+
+
+@dataclass(frozen=True, repr=False)
 class DsmOptions(Options):
     """Options of `barpc.dsm.make_dsm`."""
 
@@ -577,6 +667,7 @@ class DsmOptions(Options):
     crs: str | None = option(
         None,
         "Reference system of the map, in metres, such as `EPSG:32631`. Without: the UTM zone of the images.",
+        unit="name",
     )
     alt: tuple[float, float] | None = option(
         None,
@@ -585,6 +676,7 @@ class DsmOptions(Options):
         unit="m",
         least=-1000,
         most=10000,
+        metavar="LOW HIGH",
     )
     pairs: int = option(4, "Most image pairs matched at a point; the best come first.", least=1, most=16)
     band: int = option(1, "Band of multi-band images, from 1.", least=1)
@@ -593,6 +685,7 @@ class DsmOptions(Options):
         """Subtract the surface of the images of this run, and write the change: a finished run of the images of one
         date, which the run of both dates also has. Errors common to both dates cancel.""",
         unit="dir",
+        metavar="OTHER_RUN",
     )
     overwrite: bool = option(False, "Replace the file if it exists.")
 
@@ -602,24 +695,31 @@ class DsmOptions(Options):
             raise InputError(f"alt: the lower altitude comes first, found {self.alt}")
 
 
-def with_values(options: OptionsRecord, values: Mapping[str, Any], where: str = "options") -> OptionsRecord:
+def with_values(
+    options: OptionsRecord, values: Mapping[str, Any], where: str = "options", *, of_file: bool = False
+) -> OptionsRecord:
     """Return a copy of a record with some fields changed, nested records by nested mappings.
 
-    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`.
+    InputError for an unknown field, or a value of the wrong type or out of range, of the source called `where`; of a
+    file (`of_file`) also for a host, or a module that would be run.
     """
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
         if name not in known:
             raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
-        nested = getattr(options, name)
+        nested, rule = getattr(options, name), known[name].rule
+        runs = rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value)
+        if of_file and (rule.cli_only or runs):
+            why = f"{value!r} would run code, which" if runs else "is set by a file of unknown origin, which"
+            raise InputError(f"{where}: {name} {why} is not accepted; give the flag --{name.replace('_', '-')}")
         if isinstance(nested, Options):
             if not isinstance(value, Mapping):
                 raise InputError(f"{where}: [{name}] must be a table, found {value!r}")
-            changed[name] = with_values(nested, value, f"{where} [{name}]")
+            changed[name] = with_values(nested, value, f"{where} [{name}]", of_file=of_file)
     try:
         return replace(options, **changed)  # type: ignore[type-var]  # children are dataclasses
     except InputError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise type(error)(f"{where}: {error}") from error
 
 
 _PARTS = 10  # of a dotted key: tables of options are three deep at most
@@ -643,23 +743,7 @@ def read_options(path: str | Path, options: RunOptions | None = None) -> RunOpti
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a date or a number that is none is not its own class
         raise InputError(f"{path}: not an options file (TOML): {error}") from error
-    for name in data:
-        if (one := declared(RunOptions).get(name)) is not None and one.rule.cli_only:
-            raise InputError(f"{path}: {name} is not accepted from a file of unknown origin; give the flag")
-    _refuse_code(path, RunOptions, data)
-    return with_values(options or RunOptions(), data, str(path))
-
-
-def _refuse_code(path: str | Path, record: type[Options], values: Mapping[str, Any]) -> None:
-    """InputError where a file names a module that would be run: only a person may, by a flag or in Python."""
-    for name, one in declared(record).items():
-        value = values.get(name)
-        if isinstance(one.default, Options) and isinstance(value, Mapping):
-            _refuse_code(path, type(one.default), value)
-        elif one.rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value):
-            raise InputError(
-                f"{path}: {name} {value!r} would run code, which is not accepted from a file; give the flag --{name}"
-            )
+    return with_values(options or RunOptions(), data, str(path), of_file=True)
 
 
 def schema(record: type[Options] = RunOptions) -> dict[str, Any]:
@@ -703,7 +787,7 @@ def _documented(record: type[Options]) -> str:
     return "\n".join([str(record.__doc__), "", "Parameters", "----------", *rows])
 
 
-for _record in (TieOptions, AdjustOptions, FitOptions, RunOptions):
+for _record in (*Options.__subclasses__(), *HeightOptions.__subclasses__()):
     _record.__doc__ = _documented(_record)
 
 

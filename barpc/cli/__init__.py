@@ -20,9 +20,10 @@ import click
 
 from barpc import __version__
 from barpc.base.errors import BarpcError, BarpcWarning, Remark, UsageError, has_room, out_of_memory
-from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible, quicken
+from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
-from barpc.cli.terminal import THREADS, Formatter, echo, remark, say
+from barpc.cli.terminal import Formatter, echo, remark, say
+from barpc.verbs.workers import THREADS, quicken
 
 _LIBRARIES = 512 << 20  # bytes that numpy, scipy, GDAL and OpenCV map: 460 MB, of which OpenBLAS waits for its own
 
@@ -119,8 +120,7 @@ class Verbs(click.Group):
 )
 @click.option("--json", "as_json", is_flag=True, help="Results as JSON on stdout.")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
-@click.pass_context
-def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
+def cli(verbose: int, quiet: bool, **_: bool) -> None:
     r"""Correct the camera models (RPCs) of satellite images.
 
     \b
@@ -133,7 +133,6 @@ def cli(ctx: click.Context, /, verbose: int, quiet: bool, **_: bool) -> None:
     """
     if not has_room(_LIBRARIES):  # OpenBLAS tries for ever, deaf to signals
         raise MemoryError
-    ctx.obj = {"quiet": quiet, "verbose": verbose}
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s"))

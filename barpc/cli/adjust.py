@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
-from barpc.cli.terminal import (
-    echo,
-    executor_for,
-    output_width,
-    print_summary,
-    progress_told,
-    tell,
-    tell_gate,
-    wants_json,
-)
+from barpc.cli.terminal import at_work, is_quiet, output_width, print_summary, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult
@@ -33,14 +22,7 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
 @_out_dir
 @paper
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
-@click.pass_obj
-def adjust(
-    obj: dict[str, Any],
-    /,
-    images: tuple[str, ...],
-    out_dir: str,
-    **flags: Any,
-) -> int:
+def adjust(**flags: Any) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
 
     Tie points are matched across the images, a bundle adjustment estimates a rotation and a translation of
@@ -60,15 +42,14 @@ def adjust(
     """
     from barpc.verbs import runs
 
-    return _run_pipeline(obj, runs.adjust, images, flags, out_dir=out_dir)
+    return _run_pipeline(runs.adjust, flags)
 
 
 @click.command("match", cls=Grouped)
 @_images_argument
 @_out_dir
 @with_flags(*MATCH, *TIE)
-@click.pass_obj
-def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+def match(**flags: Any) -> int:
     r"""Match tie points and stop, for `barpc adjust --matches` and other tools.
 
     Writes matches.csv and matches.npz, and a text match file for each pair as ASP reads them (folder asp).
@@ -80,15 +61,14 @@ def match(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags
     """
     from barpc.verbs import runs
 
-    return _run_pipeline(obj, runs.match, images, flags, out_dir=out_dir)
+    return _run_pipeline(runs.match, flags)
 
 
 @click.command("check", cls=Grouped)
 @_images_argument
 @click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE)
-@click.pass_obj
-def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, **flags: Any) -> int:
+def check(**flags: Any) -> int:
     r"""Measure how well the cameras of overlapping images agree, without adjusting or writing anything.
 
     With --against, no tie points are matched: each image's RPC is compared with another one over the image and
@@ -101,48 +81,36 @@ def check(obj: dict[str, Any], /, images: tuple[str, ...], against: str | None, 
     """
     from barpc.verbs import runs
 
-    if against is not None:
-        return _compare(image_paths(images, flags["image_list"]), Path(against))
-    return _run_pipeline(obj, runs.check, images, flags)
+    against = flags.pop("against")
+    return _run_pipeline(runs.check, flags) if against is None else _compare(flags, against)
 
 
-def _run_pipeline(
-    obj: Mapping[str, Any],
-    work: Callable[..., AdjustResult],
-    images: tuple[str, ...],
-    flags: dict[str, Any],
-    **where: str,
-) -> int:
+def _run_pipeline(work: Callable[..., AdjustResult], flags: dict[str, Any]) -> int:
     """Run a verb of the pipeline with the options of the flags, and print the result."""
-    options = run_options(flags, flags["options_file"])
-    paths = image_paths(images, flags["image_list"], options.keep_going)
-    with executor_for(flags["jobs"]) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-        return _tell_result(obj, work(paths, options=options, executor=executor, progress=progress, **where))
+    options, where = run_options(flags, flags["options_file"]), [flags["out_dir"]] if "out_dir" in flags else []
+    images = image_paths(flags["images"], flags["image_list"], options.keep_going)
+    with at_work() as progress:
+        return _tell_result(work(images, *where, options, jobs=flags["jobs"], progress=progress))
 
 
-def _tell_result(obj: Mapping[str, Any], result: AdjustResult) -> int:
-    if wants_json():
-        echo(json.dumps(result.summary, indent=1))
-    elif not obj["quiet"]:
+def _tell_result(result: AdjustResult) -> int:
+    if wants_json() or is_quiet():
+        tell(result.summary)
+    else:
         print_summary(result.record, result.root)
     if result.passed:
         return 0
     # on the screen: every reason once
-    said = output_width() is not None and not (wants_json() or obj["quiet"])
+    said = output_width() is not None and not (wants_json() or is_quiet())
     reasons = [] if said else list(result.record.reasons)
-    return tell_gate("" if obj["quiet"] and reasons else result.record.headline, reasons)
+    return tell_gate("" if is_quiet() and reasons else result.record.headline, reasons)
 
 
-def _compare(images: list[str], against: Path) -> int:
+def _compare(flags: dict[str, Any], against: str) -> int:
     from barpc.pipeline.verify_outputs import READING_TOLERANCE
-    from barpc.verbs.runs import compared
+    from barpc.verbs.runs import check
 
-    found = compared(images, against)
-    if wants_json():
-        rows = [dict(zip(("image", "against", "max_px"), row, strict=True)) for row in found]
-        echo(json.dumps(rows, indent=1))
-    else:
-        for path, other, px in found:
-            tell(f"{path}  {other}  max {px:.3g} px")
-    off = [f"{path}: {px:.3g} px." for path, _, px in found if not px <= READING_TOLERANCE]
+    found = check(image_paths(flags["images"], flags["image_list"]), against=against)
+    tell([row._asdict() for row in found], *("{}  {}  max {:.3g} px".format(*row) for row in found))
+    off = [f"{row.image}: {row.max_px:.3g} px." for row in found if not row.max_px <= READING_TOLERANCE]
     return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

@@ -2,66 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
 import click
 
-from barpc.cli.project import with_heights
-from barpc.cli.terminal import progress_told, remark, tell, tell_gate, wants_json
+from barpc.base.options import ConvertOptions
+from barpc.cli.flags import flags_of, given_flags
+from barpc.cli.terminal import at_work, remark, tell, tell_gate, wants_json
 from barpc.pipeline.verify_outputs import Reading
 from barpc.rpcio import WRITABLE
 from barpc.scene import Camera
 from barpc.verbs import converting
 from barpc.verbs.converting import Converted
 
-
-def read_move(_: click.Context, __: click.Parameter, text: str | None) -> list[float] | None:
-    """Return the three numbers of --move, metres east, north and up."""
-    if text is None:
-        return None
-    try:
-        east, north, up = (float(word) for word in text.split(","))
-    except ValueError:
-        raise click.BadParameter(f"{text!r} is not three numbers E,N,U [m] with commas between") from None
-    return [east, north, up]
+_FORMAT_NAMES = ", ".join(f"{name} ({row.suffixes[0]})" for name, row in WRITABLE.items())
 
 
 @click.command("convert")
 @click.argument("files", nargs=-1, required=True, metavar="SOURCE... [TARGET]")
 @click.option("-o", "--out-dir", metavar="DIR", help="New folder for images of the same names, with proof.")
-@click.option("--rpc", "rpc", metavar="PATH", help="With -o: an RPC file, or a folder of them by image name.")
-@click.option("--images", "images", type=click.Choice(["vrt", "copy"]), help="With -o.  [default: vrt]")
-@click.option(
-    "--rpc-format",
-    "rpc_format",
-    metavar="NAMES",
-    help=f"Of {', '.join(f'{name} ({row.suffixes[0]})' for name, row in WRITABLE.items())}."
-    "  [default: TARGET's name; txt]",
-)
-@click.option(
-    "--move",
-    callback=read_move,
-    metavar="E,N,U",
-    help="With -o: shift the ground by metres east, north, up, from its position by the cameras to the true one.",
-)
-@click.option(
-    "--transform",
-    metavar="FILE",
-    help="With -o: the same by a 4 x 4 (or 3 x 4) matrix of ECEF coordinates, as pc_align writes it.",
-)
-@click.option("--window", type=(int, int, int, int), help="Cut out COL ROW WIDTH HEIGHT [px].")
-@click.option(
-    "--bbox",
-    type=(float, float, float, float),
-    help="Cut out WEST SOUTH EAST NORTH [deg]; with -o of every image that covers it.",
-)
-@click.option("--aoi", metavar="FILE", help="Cut out the box around polygons in lon/lat (GeoJSON), as --bbox.")
-@with_heights("Altitude of the ground of --bbox [m].  [default: of the run's tie points, else the camera's middle]")
-@click.option("--overwrite", is_flag=True, help="Replace an existing file, or files of an earlier run.")
-@click.pass_obj
-def convert(obj: dict[str, Any], /, files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
+@flags_of(ConvertOptions, rpc_format=f"Of {_FORMAT_NAMES}. Without: that of TARGET's name; in a folder txt.")
+def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.
 
     TARGET ends as --rpc-format says (xml is Maxar's, json rpcm's); .vrt, .tif and .ntf carry the image, too;
@@ -83,8 +45,8 @@ def convert(obj: dict[str, Any], /, files: tuple[str, ...], out_dir: str | None,
     if out_dir is None and len(files) != 2:
         raise click.UsageError("give SOURCE and TARGET, or images and -o DIR")
     source, target = (files[:1], files[1]) if out_dir is None else (files, None)
-    with progress_told(obj["quiet"], obj["verbose"]) as progress:
-        done = converting.convert(source, target, out_dir=out_dir, progress=progress, **flags)
+    with at_work() as progress:
+        done = converting.convert(source, target, out_dir=out_dir, progress=progress, **given_flags(flags))
     if done.source is not None:
         _tell_file(done, done.source)
     else:
@@ -94,29 +56,24 @@ def convert(obj: dict[str, Any], /, files: tuple[str, ...], out_dir: str | None,
     reasons = ["The hand-off needs review."] * (target is None) + [*done.reasons]
     code = tell_gate(reasons[0], reasons[1:]) if done.reasons else 0
     if target is None and not wants_json():
-        tell(done)
+        tell(None, done)
     return code
 
 
 def _tell_file(done: Converted, source: Camera) -> None:
     """Print one file with the difference of its RPC when it is read back."""
-    (target,) = map(str, done.paths)
+    (target,), lost = map(str, done.paths), done.readings[0].max_error
     row: dict[str, Any] = {"source": str(source.path), "format": source.format, "target": target}
     text = f"{source.path} ({source.format}) -> {target}"
     if done.window is not None:
-        row, text = (
-            {"path": target, "window": done.window},
-            "{}: col {}, row {}, {} x {} px".format(target, *done.window),
-        )
-    lost = done.readings[0].max_error
-    tell(json.dumps({**row, "max_px": lost}) if wants_json() else f"{text} (read back: {lost:.1g} px)")
+        row = {"path": target, "window": done.window}
+        text = "{}: col {}, row {}, {} x {} px".format(target, *done.window)
+    tell({**row, "max_px": lost}, f"{text} (read back: {lost:.1g} px)")
 
 
 def _tell_readings(readings: Sequence[Reading]) -> None:
     rows = [(str(r.path), r.consumer, None if r.note else r.max_error, r.note) for r in readings]
-    if wants_json():
-        keys = ("path", "consumer", "max_px", "note")
-        tell(json.dumps([dict(zip(keys, row, strict=True)) for row in rows]))
-        return
-    for path, consumer, error, note in rows:
-        tell(f"{path}: {consumer} {note or f'{error:.1e} px'}")
+    tell(
+        [dict(zip(("path", "consumer", "max_px", "note"), row, strict=True)) for row in rows],
+        *(f"{path}: {consumer} {note or f'{error:.1e} px'}" for path, consumer, error, note in rows),
+    )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.base.options import GEOID_HELP
-from barpc.cli.flags import flag, paper, run_options
-from barpc.cli.terminal import echo, tell_gate, wants_json
+from barpc.base.options import RefitOptions, declared
+from barpc.cli.flags import flag, flags_of, given_flags, paper, run_options
+from barpc.cli.terminal import at_work, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.fit import RpcFit
@@ -18,38 +17,12 @@ if TYPE_CHECKING:
 @click.command("fit")
 @click.argument("source", metavar="SOURCE")
 @click.option("-o", "--output", metavar="RPC", help="Where to write; the name chooses the format. Else measure.")
-@click.option(
-    "--alt-range",
-    type=(float, float),
-    metavar="LOW HIGH",
-    help="Altitudes [m above the ellipsoid] to fit over.  [default: the camera's own; of a radar all "
-    "ground on Earth, -500 to 9000 m, where an RPC holds it]",
-)
-@click.option(
-    "--dem",
-    metavar="FILE",
-    multiple=True,
-    help="Take the altitudes of this DEM over the image, with a margin (repeatable).",
-)
-@click.option(
-    "--dem-margin",
-    type=click.FloatRange(0),
-    default=500.0,
-    show_default=True,
-    metavar="M",
-    help="Margin below and above the DEM.",
-)
-@click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)
+@flags_of(RefitOptions, keep_going="Write the RPC although it misses the tolerance; exit 3.")
 @flag("fit.tolerance")
 @flag("fit.localisation")
 @paper
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
-@click.option("--keep-going", is_flag=True, help="Write the RPC although it misses the tolerance; exit 3.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@click.pass_obj
-def fit(
-    obj: dict[str, Any], /, source: str, output: str | None, keep_going: bool, overwrite: bool, **flags: Any
-) -> int:
+def fit(source: str, output: str | None, **flags: Any) -> int:
     r"""Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 
     SOURCE is whatever 'barpc info' knows as a camera - an image with an RPC or an RPC file (refitted), a
@@ -66,17 +39,13 @@ def fit(
     """
     from barpc.verbs.fitting import fitted
 
-    options = run_options(flags, flags["options_file"])
-    keywords = {name: value for name, value in flags.items() if name in ("alt_range", "dem", "dem_margin", "geoid")}
-    done = fitted(source, output, options, {**keywords, "keep_going": keep_going, "overwrite": overwrite})
+    options, own = run_options(flags, flags["options_file"]), {name: flags[name] for name in declared(RefitOptions)}
+    with at_work() as progress:
+        done = fitted(source, output, options, given_flags(own), progress)
     verdict = done.verdict
-    if wants_json():
-        summary = {**done.fit.summary(), "verdict": verdict, "output": output if done.written else None}
-        echo(json.dumps(summary, indent=1))
-    elif not obj["quiet"]:
-        echo(_certificate(done.fit, verdict))
-        if done.written:
-            echo(f"written       {output} (read back: these are its figures)")
+    written = [f"written       {output} (read back: these are its figures)"] * done.written
+    more = {"verdict": verdict, "output": output if done.written else None}
+    tell({**done.fit.summary(), **more} if wants_json() else None, _certificate(done.fit, verdict), *written)
     if flags["flag_fit_localisation"] and done.written and done.fit.rpc.direct is None:
         return tell_gate(f"{output} holds no localisation RPC: give a name in _RPC.TXT, .json or .vrt", [])
     if not verdict:

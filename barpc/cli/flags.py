@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import click
 
 from barpc.base.errors import InputError
-from barpc.base.options import PAPER, Declared, RunOptions, checked, declared, read_options, with_values
+from barpc.base.options import PAPER, Declared, Options, RunOptions, checked, declared, read_options, with_values
 from barpc.base.remote import is_url
 from barpc.base.safe_io import read_names
 from barpc.cli.terminal import echo
@@ -102,43 +102,80 @@ def _parameter(target: str) -> str:
 
 
 def flag(target: str) -> Callable[[Function], Function]:
+    """Return the click option that sets a field of a run's options: None where it is not given."""
+    return _field_flag(field_of(target), target.rpartition(".")[2], _parameter(target))
+
+
+def flags_of(record: type[Options], **others: str) -> Callable[[Function], Function]:
+    """Give a verb the flags of all fields of a record; `others`: other words for some of them."""
+
+    def decorate(function: Function) -> Function:
+        for name, one in reversed([*declared(record).items()]):
+            rule = replace(one.rule, help=others.get(name, one.rule.help))
+            function = _field_flag(replace(one, rule=rule), name, name)(function)
+        return function
+
+    return decorate
+
+
+def given_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the flags that were given."""
+    return {name: value for name, value in flags.items() if value is not None}
+
+
+def _field_flag(one: Declared, name: str, parameter: str) -> Callable[[Function], Function]:
     """Return the click option that sets a field: its type, range, choices, help and default are the field's own."""
-    one, name = field_of(target), flag_name(target)
-    rule, kind, parameter = one.rule, one.kind, _parameter(target)
-    if kind is bool:  # None: the options file decides
-        return click.option(name, parameter, help=rule.help, is_flag=True, default=None)
-    several = get_origin(kind) is tuple
+    rule, kind, words = one.rule, one.kind, flag_name(name)
+    if kind is bool:  # None: the options file, or the default, decides
+        return click.option(words, parameter, help=rule.help, is_flag=True, default=None)
+    parts = get_args(kind) if get_origin(kind) is tuple else ()
+    several, item = ... in parts, parts[0] if parts else kind
+    commas = bool(rule.rows) or "," in rule.metavar
 
     def convert(_context: click.Context, _parameter: click.Parameter, value: Any) -> Any:
         if value is None or value == ():
             return None
-        if rule.rows:
-            value = [word.strip() for word in value.split(",")] if several else value
-        elif kind in (int, float):
-            with suppress(ValueError):  # a text is refused by what follows
-                value = kind(value)
+        if parts and commas:
+            value = [word.strip() for word in value.split(",")]
+        if item in (int, float):
+            value = [_as_number(item, word) for word in value] if parts else _as_number(item, value)
         try:
-            return checked(target.rpartition(".")[2], kind, rule, value)
+            return checked(name, kind, rule, value)
         except InputError as error:
             raise click.BadParameter(str(error)) from error
 
     choices = [] if rule.rows else [str(choice) for choice in rule.choices(kind)]
-    listed = "|".join(choices)
 
     def complete(_context: click.Context, _parameter: click.Parameter, begun: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(begun)]
 
-    metavar = f"[{listed}]" if listed else (rule.unit or kind.__name__).upper()
-    if rule.rows:
-        metavar = "NAMES" if several else "NAME"
+    how: dict[str, Any] = {"multiple": several and not commas, "shell_complete": complete, "callback": convert}
+    how["nargs"] = len(parts) if parts and not (several or commas) else 1
+    return click.option(words, parameter, help=_help(one, several), metavar=_metavar(one, several, choices), **how)
+
+
+def _as_number(kind: type, word: str) -> Any:
+    """Return a word as a number; one that is none stays, and is refused by its field."""
+    with suppress(ValueError):
+        return kind(word)
+    return word
+
+
+def _metavar(one: Declared, several: bool, choices: Sequence[str]) -> str:
+    rule = one.rule
+    listed = f"[{'|'.join(choices)}]" if choices else (rule.unit or one.kind.__name__).upper()
+    return rule.metavar or ("NAME" + "S" * several if rule.rows else listed)
+
+
+def _help(one: Declared, several: bool) -> str:
+    """Return the help of a flag: the words of its field, unit and bounds, and the default."""
+    rule, numbers = one.rule, {int, float} & {one.kind, *get_args(one.kind)}
     default = ",".join(one.default) if isinstance(one.default, tuple) else one.default
-    notes = [f"default: {default}"] if default not in (None, "") else []
-    if kind in (int, float) and (bounds := replace(rule, unit="").bounds()):
-        notes.append(bounds.strip())
+    notes = [rule.unit] if rule.metavar and numbers else []  # else it stands for the value
+    notes += [f"default: {default}"] if default not in (None, "") else []
+    notes += [bounds.strip()] if numbers and (bounds := replace(rule, unit="").bounds()) else []
     how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"
-    text = rule.help + (how if several else "") + (f"  [{'; '.join(notes)}]" if notes else "")
-    how_given: dict[str, Any] = {"multiple": several and not rule.rows, "shell_complete": complete}
-    return click.option(name, parameter, help=text, metavar=metavar, callback=convert, **how_given)
+    return rule.help + how * several + (f"  [{'; '.join(notes)}]" if notes else "")
 
 
 paper = click.option(
@@ -193,8 +230,8 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
     options = options if options_file is None else read_options(options_file, options)
     targets = (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation")
-    given = {target.rpartition(".")[2]: flags.get(_parameter(target)) for target in targets}
-    return with_keywords(options, {name: value for name, value in given.items() if value is not None}, "command line")
+    found = {target.rpartition(".")[2]: flags.get(_parameter(target)) for target in targets}
+    return with_keywords(options, given_flags(found), "command line")
 
 
 # --- images -----------------------------------------------------------------------------------------------

@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from barpc.cli.project import with_heights
+from barpc.base.options import HeightOptions
+from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import echo, wants_json
 from barpc.verbs.describe import described, outlines_geojson
 from barpc.verbs.images import every
@@ -20,15 +21,9 @@ from barpc.verbs.points import terrain_of
 @click.option(
     "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
 )
-@with_heights("Altitude of the ground [m].  [default: of the run's tie points, else the middle of the camera's]")
+@flags_of(HeightOptions)
 @click.option("--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead.")
-def info(
-    images: tuple[str, ...],
-    at: tuple[float, float, float] | None,
-    alt: float | None,
-    outlines: bool,
-    **heights: Any,
-) -> int:
+def info(images: tuple[str, ...], at: tuple[float, float, float] | None, outlines: bool, **flags: Any) -> int:
     r"""Print the source of a camera, its coverage and view angles; of several, each pair's angle.
 
     The azimuth is that of the direction from the ground to the sensor, clockwise from north. A pair's convergence
@@ -48,7 +43,7 @@ def info(
     """
     if not images:
         raise click.UsageError("give at least one IMAGE")
-    found, terrain = every(images), terrain_of(**heights, alt=alt)
+    found, alt, terrain = every(images), flags["alt"], terrain_of(**given_flags(flags))
     if outlines:
         echo(json.dumps(outlines_geojson(found, alt, terrain)))
         return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import gc
 import io
 import os
 import signal
@@ -20,19 +19,8 @@ from barpc.base.errors import OutputError
 
 EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted; run the same command again to go on"
-_OBJECTS = 50_000  # made between two looks for cycles
 CLEAN_UP = 2.0
 """Seconds after a first signal in which more of them change nothing: `timeout` and batch systems send two at once."""
-
-
-def quicken() -> None:
-    """Shorten the start of barpc's own process; a host application's imports are left alone.
-
-    Cycles are not looked for every 700 objects, and rasterio does not load boto3, a sixth of a second: what is on
-    other hosts is opened by `barpc.base.remote`.
-    """
-    gc.set_threshold(_OBJECTS)
-    sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]  # an import of it fails
 
 
 # --- streams ----------------------------------------------------------------------------------------------

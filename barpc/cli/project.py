@@ -15,28 +15,15 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
-from barpc.base.options import GEOID_HELP
+from barpc.base.options import HeightOptions
 from barpc.base.safe_io import TABLE, opened_text
-from barpc.cli.flags import Function
+from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.verbs import points as verbs
 from barpc.verbs.images import camera_of, place_of
 
 _MAX_INTERSECTION_ERROR = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
-
-
-def with_heights(alt: str) -> Callable[[Function], Function]:
-    """Return the flags --alt, with this help, --dem and --geoid of a verb."""
-
-    def added(verb: Function) -> Function:
-        verb = click.option("--geoid", metavar="NAME|FILE", help=GEOID_HELP)(verb)
-        verb = click.option("--dem", metavar="FILE", multiple=True, help="Take the altitudes from a DEM (repeatable).")(
-            verb
-        )
-        return click.option("--alt", type=float, help=alt)(verb)
-
-    return added
 
 
 # --- the verbs ---------------------------------------------------------------------------------------------
@@ -50,7 +37,7 @@ def _points_option(columns: str) -> Callable[..., Any]:
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[LON LAT ALT]...")
 @_points_option("lon, lat, alt")
-@with_heights("Altitude of points without one [m above the ellipsoid].")
+@flags_of(HeightOptions, alt="Altitude of points without one, where no DEM is given.")
 def project(image: str, numbers: tuple[float, ...], points: str | None, alt: float | None, **heights: Any) -> int:
     r"""Print the image points (col, row; the first pixel's centre is 0, 0) of ground points.
 
@@ -59,7 +46,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    camera, terrain = camera_of(image), verbs.terrain_of(**heights)
+    camera, terrain = camera_of(image), verbs.terrain_of(**given_flags(heights))
     given = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
     ground = verbs.with_altitudes(given, None, terrain)
     found = camera.model.project(ground)
@@ -73,9 +60,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
 @click.argument("image")
 @click.argument("numbers", nargs=-1, type=float, metavar="[COL ROW]...")
 @_points_option("col, row and perhaps alt")
-@with_heights(
-    "Altitude of points without one [m].  [default: of the run's tie points, else the middle of the camera's]"
-)
+@flags_of(HeightOptions)
 def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: float | None, **heights: Any) -> int:
     r"""Print the ground points (lon, lat, alt) seen at image points.
 
@@ -84,7 +69,7 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96
     """
-    camera, terrain = camera_of(image), verbs.terrain_of(**heights)
+    camera, terrain = camera_of(image), verbs.terrain_of(**given_flags(heights))
     at = given_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
         at[without, 2] = verbs.altitude_of(camera, place_of(image), alt)

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from barpc.base.options import DsmOptions, declared
-from barpc.cli.flags import Function, jobs_option
-from barpc.cli.project import with_heights
-from barpc.cli.terminal import echo, executor_for, print_comparison, progress_told, remark, tell, tell_gate, wants_json
+from barpc.base.options import DsmOptions, OrthoOptions
+from barpc.cli.flags import flags_of, given_flags, jobs_option
+from barpc.cli.terminal import at_work, echo, print_comparison, remark, tell, tell_gate, wants_json
 
-if TYPE_CHECKING:
-    from barpc.dsm import Surface
-
-
+_VERIFIED = "input", "output", "camera"  # of files that `verify` compares
 _TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 
@@ -42,7 +37,7 @@ def report(run_dir: str, other: str | None) -> int:
             raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
         from barpc.pipeline.outputs import remake_report
 
-        tell(remake_report(run_dir))
+        tell(None, remake_report(run_dir))
         return 0
     from barpc.report.compare import compare_runs
 
@@ -81,12 +76,8 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     from barpc.verbs import runs
 
     paths = runs.export(run_dir, out_dir, target, alt=alt, overwrite=overwrite)
-    if wants_json():
-        echo(json.dumps([str(path) for path in paths]))
-        return 0
-    for path in paths:
-        tell(path)
-    if target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
+    tell([str(path) for path in paths], *paths)
+    if not wants_json() and target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
         remark("the images are not copied: move them together with both folders, or adjust with --images copy")
     return 0
 
@@ -95,8 +86,7 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
 @click.option("--expect", metavar="ROOT", help="The root that was printed, or a later one.")
-@click.pass_obj
-def verify(obj: dict[str, Any], /, run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
+def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
     r"""List changed, missing and added files of a run or export, and check that cameras read as certified.
 
     SHA256SUMS lists all (but .barpc), also for `sha256sum -c`; its own SHA-256 is the root. Only --expect detects
@@ -112,19 +102,18 @@ def verify(obj: dict[str, Any], /, run_dir: str, places: tuple[str, ...], expect
     from barpc.pipeline.outputs import SAME
     from barpc.verbs import runs
 
-    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+    with at_work() as progress:
         found = runs.verify(run_dir, places, expect=expect, progress=progress)
-    wrong = [one for one in found if not one.passed]
-    if wants_json():
-        echo(json.dumps([asdict(one) for one in found]))
-    else:
-        for one in found:
-            if one.now != SAME or one.kind == "root":
-                tell(f"{one.kind} {one.file}: {one.now}" + (f", {one.note}" if one.note else ""))
-        counts = Counter((one.kind, one.now) for one in found)
-        for kind in ("input", "output", "camera"):
-            told = ", ".join(f"{count} {now}" for (of, now), count in counts.items() if of == kind)
-            tell(f"{kind}s: {told or 'none'}")
+    wrong, counts = [one for one in found if not one.passed], Counter((one.kind, one.now) for one in found)
+    changed = (
+        f"{one.kind} {one.file}: {one.now}{one.note and f', {one.note}'}"
+        for one in found
+        if one.now != SAME or one.kind == "root"
+    )
+    kinds = {
+        kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in ("input", "output", "camera")
+    }
+    tell(list(map(asdict, found)), *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
     if not wrong:
         return 0
     return tell_gate("the run has changed:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
@@ -135,8 +124,7 @@ def verify(obj: dict[str, Any], /, run_dir: str, places: tuple[str, ...], expect
 @click.option("-o", "--out", required=True, metavar="FILE", help="The calibration to write: SENSOR.cal.")
 @click.option("--sensor", metavar="NAME", help="Its name, where images state none, or several.")
 @click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
-@click.pass_obj
-def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
+def calibrate(runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
     r"""Estimate the interior distortion and detector steps of one sensor from finished runs.
 
     `barpc adjust --calibration FILE` corrects for it. Exit code 1, and nothing written, where it changes with time,
@@ -148,81 +136,48 @@ def calibrate(obj: dict[str, Any], /, runs: tuple[str, ...], out: str, sensor: s
     """
     from barpc.pipeline.calibrate import calibrate as learn
 
-    with progress_told(obj["quiet"], obj["verbose"]) as progress:
+    with at_work() as progress:
         found = learn(runs, out, sensor, overwrite=overwrite, progress=progress)
-    if wants_json():
-        echo(json.dumps(found, indent=1))
-    elif not obj["quiet"]:
-        (col, row), (of_col, of_row) = found["size_px"], found["sigma_px"]
-        better = sum(run["gain"] > 0 for run in found["runs"])
-        tell(
-            f"{found['sensor']}: {col:.3f} px across and {row:.3f} px along the flight, standard deviations "
-            f"{of_col:.4f} and {of_row:.4f} px; {len(found['edges'])} steps; of {len(runs)} runs left out in turn the "
-            f"residuals of {better} improve"
-        )
-        tell(out)
+    sizes, better = (*found["size_px"], *found["sigma_px"]), sum(run["gain"] > 0 for run in found["runs"])
+    words = (
+        "{}: {:.3f} px across and {:.3f} px along the flight, standard deviations {:.4f} and {:.4f} px; {} steps; of "
+        "{} runs left out in turn the residuals of {} improve"
+    )
+    tell(found, words.format(found["sensor"], *sizes, len(found["edges"]), len(runs), better), out)
     return 0
 
 
 @click.command("ortho")
 @click.argument("images", nargs=-1, required=True, metavar="RUN | IMAGE...")
 @click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the orthoimages.")
-@with_heights(
-    "Without a DEM: altitude of the ground [m].  [default: of the run's tie points, else the camera's middle]"
-)
-@click.option("--gsd", type=float, metavar="M", help="Side of a pixel.  [default: that of the finest image]")
-@click.option("--crs", metavar="NAME", help="Map projection in metres.  [default: the UTM zone of the first image]")
-@click.option("--overwrite", is_flag=True, help="Replace orthoimages of an earlier call.")
-@click.pass_obj
-def ortho(obj: dict[str, Any], /, images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
+@flags_of(OrthoOptions)
+def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     r"""Make orthoimages of images with RPCs: Cloud-Optimised GeoTIFFs whose pixels lie on one grid.
 
     A RUN brings its corrected cameras and the DEMs that it was made with. GDAL warps each image by its RPC on the
     heights, which are above the ellipsoid first, whatever the DEM counts from. Where the DEM has no height, there are
     no pixels; without a DEM all ground is at one altitude.
 
-    
+    \b
     Examples:
       barpc ortho adjusted --dem srtm.tif --geoid egm96 -o maps
       barpc ortho image.tif --alt 180 --gsd 0.5 --crs EPSG:2154 -o maps
     """
     from barpc.verbs import orthoimages
 
-    with progress_told(obj["quiet"], obj["verbose"]) as progress:
-        done = orthoimages.ortho(images, out_dir, progress=progress, **flags)
-    if wants_json():
-        echo(json.dumps([{**asdict(one), "path": str(one.path)} for one in done]))
-        return 0
-    for one in done:
-        tell(f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}")
+    with at_work() as progress:
+        done = orthoimages.ortho(images, out_dir, progress=progress, **given_flags(flags))
+    lines = (f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}" for one in done)
+    tell([{**asdict(one), "path": str(one.path)} for one in done], *lines)
     return 0
-
-
-# --- a surface --------------------------------------------------------------------------------------------
-
-
-def _field_option(name: str, kind: Any, metavar: str | None = None) -> Callable[[Function], Function]:
-    """Return a click option whose words and default are the field's own."""
-    one = declared(DsmOptions)[name]
-    default = "" if one.default in (None, False) else f"  [default: {one.default}]"
-    if kind is bool:
-        return click.option(f"--{name}", help=one.rule.help, is_flag=True)
-    return click.option(f"--{name}", type=kind, metavar=metavar, help=one.rule.help + default)
 
 
 @click.command("dsm")
 @click.argument("source", nargs=-1, required=True, metavar="RUN | IMAGE IMAGE...")
 @click.option("-o", "--out", required=True, metavar="FILE", help="The GeoTIFF to write.")
-@_field_option("gsd", float, "M")
-@_field_option("crs", str, "NAME")
-@_field_option("alt", (float, float), "LOW HIGH")
-@_field_option("pairs", int, "N")
-@_field_option("band", int, "N")
-@_field_option("minus", str, "OTHER_RUN")
+@flags_of(DsmOptions)
 @jobs_option
-@_field_option("overwrite", bool)
-@click.pass_obj
-def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:
+def dsm(source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:
     r"""Make a first surface model (DSM) of a finished run, or of images with their delivered cameras.
 
     The best pairs of images are matched pixel by pixel, matches are intersected with the corrected cameras, and every
@@ -242,32 +197,27 @@ def dsm(obj: dict[str, Any], /, source: tuple[str, ...], out: str, jobs: int | s
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    given = {name: value for name, value in flags.items() if value is not None}
     from barpc.dsm import NoSurfaceError
+    from barpc.report.records import json_form
     from barpc.verbs import runs
 
     try:
-        with executor_for(jobs) as executor, progress_told(obj["quiet"], obj["verbose"]) as progress:
-            surface = runs.dsm(source, out, executor=executor, progress=progress, **given)
+        with at_work() as progress:
+            surface = runs.dsm(source, out, jobs=jobs, progress=progress, **given_flags(flags))
     except NoSurfaceError as error:
         return tell_gate(f"no surface: {error}", [])
-    if wants_json():
-        from barpc.report.records import json_form
-
-        echo(json.dumps(json_form(surface), indent=1))
-    elif not obj["quiet"]:
-        _tell_surface(surface)
-    return 0
-
-
-def _tell_surface(surface: Surface) -> None:
     cells = surface.size[0] * surface.size[1]
-    echo(f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}")
     said = {
         "pairs disagree by": surface.nmad,
         "sigma by matching": surface.sigma,
         "by cameras": surface.sigma_cameras,
         "shared by all cells": surface.datum,
     }
-    echo(", ".join(f"{words} {value:.2f} m" for words, value in said.items() if value == value) + " (medians)")
-    echo(f"Written to {surface.path}")
+    medians = (f"{words} {value:.2f} m" for words, value in said.items() if value == value)
+    tell(
+        json_form(surface),
+        f"{surface.known} of {cells} cells of {surface.gsd:g} m have a height, by {', '.join(surface.pairs)}",
+        f"{', '.join(medians)} (medians)",
+        f"Written to {surface.path}",
+    )
+    return 0

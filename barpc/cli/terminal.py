@@ -6,27 +6,22 @@ then one block a row. No column and no unit is ever dropped; in a pipe a row is 
 
 from __future__ import annotations
 
+import json
 import logging
-import multiprocessing
-import os
 import shlex
 import shutil
-import signal
 import sys
 import textwrap
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.base.errors import InputError, visible
-from barpc.cli.process import quicken
+from barpc.base.errors import visible
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
@@ -37,7 +32,6 @@ if TYPE_CHECKING:
 
 
 EXIT_GATE = 3
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 MOST_LINES = 60  # of a summary, whatever its size
 _TERMINAL_COLUMNS = 80  # columns of a terminal
 _LIMITS = {
@@ -52,13 +46,18 @@ _COLORS = {"good": "green", "look": "yellow", "bad": "red"}
 
 def wants_json() -> bool:
     """Return whether results go to stdout as JSON: `--json`, before or behind the verb."""
-    return _general("as_json")
+    return bool(_general("as_json"))
 
 
-def _general(name: str) -> bool:
-    """Return whether a flag was given that every verb has."""
+def is_quiet() -> bool:
+    """Return whether errors and requested numbers alone are printed: `-q`."""
+    return bool(_general("quiet"))
+
+
+def _general(name: str) -> int:
+    """Return how often a flag was given that every verb has."""
     context = click.get_current_context(silent=True)
-    return context is not None and bool(context.find_root().params.get(name))
+    return 0 if context is None else int(context.find_root().params.get(name) or 0)
 
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, **style: Any) -> None:
@@ -73,14 +72,17 @@ def say(message: str) -> None:
 
 def remark(message: str) -> None:
     """Print one line on stderr, a remark and no error; with -q nothing."""
-    if not _general("quiet"):
+    if not is_quiet():
         say(message)
 
 
-def tell(text: object) -> None:
-    """Print the result of a command, or its JSON, on stdout; with -q the JSON alone."""
-    if wants_json() or not _general("quiet"):
-        echo(text)
+def tell(data: object, *lines: object) -> None:
+    """Print the result of a command on stdout: its lines, or with --json its data; with -q the JSON alone."""
+    if wants_json():
+        echo(json.dumps(data, indent=1))
+    else:
+        for line in () if is_quiet() else lines:
+            echo(line)
 
 
 def tell_gate(headline: str, reasons: list[str]) -> int:
@@ -275,10 +277,15 @@ def _three_decimals(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-# --- progress, and who works ------------------------------------------------------------------------------
+# --- progress ---------------------------------------------------------------------------------------------
 
 
 MINUTE = 60.0  # s between two lines where nobody sees bars
+
+
+def at_work() -> AbstractContextManager[Progress]:
+    """Return the progress of a verb, as the flags that every verb has want it told."""
+    return progress_told(is_quiet(), _general("verbose"))
 
 
 @contextmanager
@@ -373,70 +380,3 @@ def _bars() -> Iterator[Progress]:
         yield show
     finally:
         finish()
-
-
-@contextmanager
-def executor_for(jobs: int | str) -> Iterator[Executor | None]:
-    """Yield the executor of a run: None works in this process."""
-    if jobs == 1:
-        yield None
-        return
-    with _cluster(jobs) if isinstance(jobs, str) else _processes(jobs) as executor:
-        yield executor
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(f"-j {address}: an address needs the extra: pip install 'barpc[cluster]'") from error
-    try:
-        client = Client(address, timeout=20)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise InputError(f"-j {address}: no scheduler answers there ({error})") from error
-    with client:
-        yield client.get_executor()  # type: ignore[no-untyped-call]
-
-
-@contextmanager
-def _processes(jobs: int) -> Iterator[Executor]:
-    context = multiprocessing.get_context("spawn")
-    pool = _Workers(jobs, mp_context=context, initializer=_enter_worker)
-    try:
-        yield pool
-    except BaseException:  # an error or Ctrl-C: nobody waits for what is in flight
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.kill()
-        raise
-    pool.shutdown()
-
-
-class _Workers(ProcessPoolExecutor):
-    """Processes, started one by one as tasks come, without an ear for Ctrl-C, which comes to all of a terminal."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        if not hasattr(signal, "pthread_sigmask"):
-            return super().submit(fn, *args, **kwargs)
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _enter_worker() -> None:
-    """Keep to one BLAS thread, so that sums keep their order; Ctrl-C is the parent's, and its end the worker's."""
-    os.environ.update(dict.fromkeys(THREADS, "1"))  # before numpy is imported
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    warnings.simplefilter("ignore")
-    quicken()
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-
-
-def _leave_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

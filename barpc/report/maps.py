@@ -151,10 +151,18 @@ def ground_map(files: RunFiles) -> str:
         gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
         pairs=_pair_lines(middles, files),
         shown=_map_labels([(view, middles[view.name]) for view in named], taken, triangles),
-        marks=[(kind, point.name, x, y, up) for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)],
+        marks=[
+            (kind, "doubted" * doubted(point), point.name, x, y, up)
+            for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)
+        ],
         summary=summary,
     )
     return text
+
+
+def doubted(point: GcpEntry | CheckPointEntry) -> bool:
+    """Return whether a GCP contradicts others."""
+    return getattr(point, "status", "used") not in ("used", "not seen")
 
 
 def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
@@ -174,23 +182,30 @@ def _map_labels(
 ) -> list[tuple[ViewEntry, str, float, float]]:
     """Return labels of images at positions (2,), without those that would cover others or occupied areas.
 
-    Labels that would cover `marks` stand a line below or above, if there is room. A name tells how many images have
-    their middle in the same place.
+    Those that would cover `marks`, and of few images or of one that needs review those that would cover others, stand a
+    line or two below or above, if there is room. A name tells how many images have their middle in the same place.
     """
     taken, names, every = list(taken), [], np.array([place for _, place in places])
-    for view, place in places:
-        alike = int((np.abs(every - place).max(axis=1) < _LABEL_HEIGHT / 2).sum()) - 1
+    counted_in = np.zeros(len(places), dtype=bool)
+    for k, (view, place) in enumerate(places):
+        if counted_in[k]:
+            continue
+        same = np.abs(every - place).max(axis=1) < _LABEL_HEIGHT / 2
+        alike = int(same.sum()) - 1
         name = (
             view.name if len(view.name) <= _MAX_LABEL_LENGTH else f"…{view.name[1 - _MAX_LABEL_LENGTH :]}"
         )  # its end tells of a series
         name += f" + {alike}" * bool(alike)
         (x, y), half = place.tolist(), 4.1 * len(name)  # units of a bold character: 8.2, of digits
         x = min(max(x, half), WIDTH - half)
-        if _is_free(x, y, half, taken):
-            rows = (y, y + 1.1 * _LABEL_HEIGHT, y - 1.1 * _LABEL_HEIGHT)
-            y = next((row for row in rows if _is_free(x, row, half, [*taken, *(marks or ())])), y)
+        rows = [y + 1.1 * _LABEL_HEIGHT * k for k in (0, 1, -1, 2, -2)]
+        free = [row for row in rows if _is_free(x, row, half, taken)]
+        free = free if len(places) <= TABLE_ROWS_SHOWN or view.advice else free if y in free else []
+        if free:
+            y = next((row for row in free if _is_free(x, row, half, marks or [])), free[0])
             taken.append((x, y, half))
             names.append((view, name, x, y))
+            counted_in |= same
     return names
 
 

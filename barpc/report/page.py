@@ -17,7 +17,7 @@ import numpy as np
 from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
 from barpc.report.compare import flat_options
-from barpc.report.maps import ground_map, residual_panels, template
+from barpc.report.maps import doubted, ground_map, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.ranking import (
@@ -179,11 +179,17 @@ def _map_section(files: RunFiles) -> Section:
     links = [(number[pair.a], number[pair.b]) for pair in summary.pairs]
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=num)
     lonely = [view.name for view, n in zip(summary.views, partners, strict=True) if n == 1 and num > 2]
-    caption = (
-        "Footprints at the altitude of the scene, those that need review on top; dots: tie points; triangles: GCPs; "
-        "inverted triangles: check points; thicker lines: more matches; dashed: tie points that move"
-    )
-    caption += "; shaded: rows or columns with few tie points." if any(view.gap for view in summary.views) else "."
+    drawn = {
+        "Footprints at the altitude of the scene": True,
+        "those that need review on top": any(view.advice for view in summary.views),
+        "dots: tie points": len(files.points),
+        f"triangles: GCPs{', red where they contradict others' * any(map(doubted, summary.gcps))}": summary.gcps,
+        "inverted triangles: check points": summary.check_points,
+        "thicker lines: more matches": len(links) > 1,
+        "dashed: tie points that move": any(one.box for one in (summary.scene.explanations if summary.scene else ())),
+        "shaded: rows or columns with few tie points": any(view.gap for view in summary.views),
+    }
+    caption = f"{'; '.join(words for words, some in drawn.items() if some)}."
     if num > MAX_SHOWN:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
     lengths = {length: count for length, count in summary.tracks.by_length.items() if count}

@@ -29,7 +29,7 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             evenly((seen.xy[rows] + 0.5) * (box / view.size), _DOTS) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
-        counts = f"{counted(view.num_observations, 'tie point')}, {view.num_rejected} rejected"
+        counts = f"{counted(view.num_observations, 'tie point')} (blue), {view.num_rejected} rejected (red)"
         text = template("drawings.svg.j2").module.thumbnail(
             number=k,
             view=view,
@@ -53,7 +53,7 @@ def _flagged_parts(files: RunFiles) -> dict[str, list[tuple[str, Limits]]]:
     found: dict[str, list[tuple[str, Limits]]] = {}
     for one in _named_lines(files):
         for ends in _ends(one):
-            words = getattr(one, "sentence", f"{one.axis} {ends[0]:.0f}-{ends[1]:.0f}")
+            words = one.place if isinstance(one, LeftEntry) else one.sentence
             limits: Limits = (ends, None) if one.axis == AXES[0] else (None, ends)
             found.setdefault(str(one.image), []).append((words, limits))
     for worse in () if files.summary.scene is None else files.summary.scene.held_out_places or ():

@@ -74,7 +74,7 @@ def _poorly_fitted_parts(view: ViewEntry, adjustment: Adjustment) -> Causes:
     """Yield the rows and columns that are inconsistent with the rest of a view."""
     for one in left_entries(adjustment):
         if one.image == view.name and (what := inconsistency(one)):
-            place, cause = f"{one.axis} {one.first:.0f}-{one.last:.0f}", "clouds, water, change there"
+            place, cause = one.place, "clouds, water, change there"
             if one.axis == AXES[0] and one.rejected <= MANY_REJECTED:  # nothing on the ground is as long as the pass
                 place, cause = f"{place}, over all rows,", "detectors or resampling"
             yield "place", {"place": place, "what": what, "cause": cause}
@@ -178,9 +178,8 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
     """Return the region with most of a view's rejected tie points in words; empty without one."""
     for one in left_entries(adjustment):
         if one.image == view.name and one.rejected > MANY_REJECTED and not one.moving:
-            place = f"{one.axis} {one.first:.0f}-{one.last:.0f}"
             return (
-                f"; most in {place}, where {100 * one.rejected:.0f} % were, half of these by more than "
+                f"; most in {one.place}, where {100 * one.rejected:.0f} % were, half of these by more than "
                 f"{one.rejected_median_px:.2f} px"
             )
     return ""

@@ -10,6 +10,7 @@ import csv
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,18 +22,18 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from barpc.base.errors import BarpcError, InputError, plain
+from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plain
 from barpc.base.geodesy import Array, feature_collection, geojson_feature
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
 from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
-from barpc.report.records import Number, Record, column, value_of
+from barpc.report.records import Number, Record, column, json_form, value_of
 from barpc.report.renamed import with_new_names
 from barpc.report.summary import SCHEMA, Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import Share, Side
+from barpc.report.summary.words import NAMED, Share, Side
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.geometry import footprints
 
@@ -278,7 +279,7 @@ class RunFiles:
 def read_summary(folder: Path) -> Summary:
     """Read the summary.json of a run folder.
 
-    Schema 2 is read under its new names, with a warning.
+    Schema 2 is read under its new names, with a warning; keys of no record are named in one, and passed over.
 
     Raises
     ------
@@ -302,7 +303,23 @@ def read_summary(folder: Path) -> Summary:
                 raise ValueError(f"no pair of its images is {pair.a} - {pair.b}")
     except ValueError as error:
         raise InputError(f"{path}: damaged, {error}: run the adjustment again") from None
+    if unknown := sorted(set(_unknown_keys(found, json_form(summary)))):
+        more = "which this release does not know and passes over"
+        warnings.warn(f"{path}: has {listed(unknown, NAMED)}, {more}", BarpcWarning, stacklevel=2)
     return summary
+
+
+def _unknown_keys(found: Any, read: Any, place: str = "") -> Iterator[str]:
+    """Yield the keys of parsed JSON that its record has not, after those that lead to them, without numbers of rows."""
+    if isinstance(found, list):
+        for row, known in zip(found, read, strict=True):
+            yield from _unknown_keys(row, known, place)
+    elif isinstance(found, dict):
+        for key, value in found.items():
+            if key in read:
+                yield from _unknown_keys(value, read[key], f"{place}{key}.")
+            elif value is not None:  # a field that is None is left out
+                yield place + key
 
 
 def read_tables(summary: Summary, folder: Path) -> RunFiles:

@@ -170,7 +170,7 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
     """
     said = {view.name for view in views if view.cause in _SAY_WHERE}
     found = left_entries(adjustment)
-    if moving := [f"rows {one.first:.0f}-{one.last:.0f} of {one.image}" for one in found if one.moving]:
+    if moving := [f"{one.place} of {one.image}" for one in found if one.moving]:
         yield (
             f"Most tie points of {listed(moving)} move together: moving objects, or a displacement of these rows that "
             "no camera models."
@@ -178,7 +178,7 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
     worst: dict[str, str] = {}
     for one in found:
         if what := inconsistency(one):
-            place = f"{one.axis.capitalize()} {one.first:.0f}-{one.last:.0f} of {one.image}"
+            place = f"{one.place.capitalize()} of {one.image}"
             worst.setdefault(one.image, f"{place} are inconsistent with the rest: {what}.")
     for unmet in held_out_places(run.met_worse, adjustment.names):  # what was solved with may agree with what it bent
         worst.setdefault(unmet.image, f"{unmet.sentence}.")

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
+from barpc.base.options import ConvertOptions, with_values
 from barpc.base.safe_io import plain_path
 from barpc.cameras import open_camera
 from barpc.fit import FitOptions
@@ -45,56 +45,12 @@ from barpc.tie import read_area
 from barpc.tie.tasks import Progress
 from barpc.verbs.images import ImageLike, camera_of, every, place_of
 from barpc.verbs.moving import moved, refitted
-from barpc.verbs.points import Files, altitude_of, exchanged, terrain_of
+from barpc.verbs.points import altitude_of, exchanged, terrain_of
 from barpc.workspace import Workspace
 
 Window = tuple[int, int, int, int]
 GroundBox = tuple[float, float, float, float]
 _READ_BACK = "barpc"  # the reader of a single file
-
-
-@dataclass(frozen=True)
-class Conversion:
-    """Keywords of `convert`, the flags of `barpc convert`.
-
-    Parameters
-    ----------
-    rpc : path, optional, with a folder: an RPC file, or a folder of them by image name, in place of the images' own
-    images : "vrt" or "copy", optional, with a folder: the image files; default vrt
-    rpc_format : str, optional, names of formats with commas between; default by the target's name, or txt
-    move : (3,), optional, with a folder: shift of the ground [m] east, north, up, from its position to the true one
-    transform : path, optional, the same by a 4 x 4 (or 3 x 4) matrix of ECEF coordinates, as pc_align writes it
-    window : (4,), optional, cut out col, row, width, height [px]; into a target alone
-    bbox : (4,), optional, cut out west, south, east, north [deg]
-    aoi : path, optional, cut out the box around polygons in lon/lat (GeoJSON)
-    alt : float, optional, altitude of the ground of a box [m]; else of the run's tie points, or the camera's middle
-    dem, geoid : as of `barpc.project`
-    overwrite : bool, replace an existing file, or files of an earlier run
-    """
-
-    rpc: str | Path | None = None
-    images: str | None = None
-    rpc_format: str | None = None
-    move: npt.ArrayLike | None = None
-    transform: str | Path | None = None
-    window: Sequence[int] | None = None
-    bbox: Sequence[float] | None = None
-    aoi: str | Path | None = None
-    alt: float | None = None
-    dem: Files | None = None
-    geoid: str | None = None
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.move is not None and self.transform is not None:
-            raise UsageError("give either --move or --transform")
-        if self.images not in (None, "vrt", "copy"):
-            raise UsageError(f"images {self.images!r}: vrt or copy")
-
-    @property
-    def cut(self) -> bool:
-        """Whether a part of each image is cut out."""
-        return any(one is not None for one in (self.window, self.bbox, self.aoi))
 
 
 @dataclass(frozen=True, repr=False)
@@ -150,7 +106,7 @@ def convert(
     target : path, optional, the file for one image: its name chooses the format (`barpc convert --help`)
     out_dir : path, optional, in place of it: a new folder for images with their RPCs, each opened as its readers do
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `barpc.verbs.converting.Conversion`: rpc, images, rpc_format, move, transform, window, bbox,
+    **keywords : fields of `barpc.base.options.ConvertOptions`: rpc, images, rpc_format, move, transform, window, bbox,
         aoi, alt, dem, geoid, overwrite
 
     Returns
@@ -174,7 +130,7 @@ def convert(
     >>> print(barpc.convert("data_samples/*.tif", out_dir="handoff"))
     3 images written, all readers agree to ...e-... px.
     """
-    given, choices = every(source), Conversion(**keywords)
+    given, choices = every(source), with_values(ConvertOptions(), keywords, "convert")
     if (target is None) == (out_dir is None) or (target is not None and len(given) != 1):
         raise UsageError("give SOURCE and TARGET, or images and -o DIR")
     if target is not None:
@@ -183,7 +139,7 @@ def convert(
     return _to_folder(given, Path(out_dir), choices, progress)
 
 
-def _to_folder(images: list[ImageLike], folder: Path, choices: Conversion, progress: Progress | None) -> Converted:
+def _to_folder(images: list[ImageLike], folder: Path, choices: ConvertOptions, progress: Progress | None) -> Converted:
     """Write images with their RPCs, or others, moved or not, into a new folder."""
     if choices.window is not None:
         raise UsageError("--window goes with a TARGET, not with -o: images differ in where their pixels are")
@@ -209,7 +165,7 @@ def _to_folder(images: list[ImageLike], folder: Path, choices: Conversion, progr
 # --- one file ---------------------------------------------------------------------------------------------
 
 
-def _to_target(source: ImageLike, target: str, choices: Conversion) -> Converted:
+def _to_target(source: ImageLike, target: str, choices: ConvertOptions) -> Converted:
     """Write one RPC in another syntax, as a grid, or with a part of its image."""
     if any(one is not None for one in (choices.rpc, choices.images, choices.move, choices.transform)):
         raise UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images, --move, --transform)")
@@ -231,7 +187,7 @@ def _to_target(source: ImageLike, target: str, choices: Conversion) -> Converted
     return replace(_read_back(camera, camera.rpc.crop(*window[:2]), target), window=window)
 
 
-def _copy(camera: Camera, image: Path, target: str, choices: Conversion) -> Converted:
+def _copy(camera: Camera, image: Path, target: str, choices: ConvertOptions) -> Converted:
     """Write an RPC unchanged, and read it back."""
     if choices.rpc_format is None:
         write_camera(camera.rpc, target, image, overwrite=choices.overwrite, size=camera.size)
@@ -283,14 +239,14 @@ def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: b
 # --- windows -----------------------------------------------------------------------------------------------
 
 
-def _window_chooser(choices: Conversion) -> Callable[[Camera, Path], Window]:
+def _window_chooser(choices: ConvertOptions) -> Callable[[Camera, Path], Window]:
     """Return a function from an image to its window: the one given, or that of a box or area on the ground."""
     if sum(one is not None for one in (choices.window, choices.bbox, choices.aoi)) != 1:
         raise UsageError("give one of --window, --bbox and --aoi")
     if choices.window is not None:
-        col, row, width, height = (int(number) for number in choices.window)
-        return lambda *_: (col, row, width, height)
-    west, south, east, north = box_of(choices.aoi) if choices.aoi else choices.bbox or ()
+        window = choices.window
+        return lambda *_: window
+    west, south, east, north = choices.bbox or box_of(choices.aoi or "")
     terrain = terrain_of(choices.dem, choices.geoid, choices.alt)
     return lambda camera, path: window_of(camera, path, (west, south, east, north), choices.alt, terrain)
 

@@ -4,51 +4,28 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from barpc.base.atomic import replacing
 from barpc.base.errors import FitError, Remark
-from barpc.base.options import FitOptions, RunOptions
+from barpc.base.options import FitOptions, RefitOptions, RunOptions, declared
 from barpc.cameras import read_points, split_spec
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import terrain_range
 from barpc.rpcio import read_rpc, write_camera
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
+from barpc.tie.tasks import Progress
 from barpc.verbs.converting import check_target
 from barpc.verbs.images import ImageLike, camera_of, file_of, place_of
 from barpc.verbs.options import OptionsLike, run_options
-from barpc.verbs.points import Files, terrain_of
+from barpc.verbs.points import terrain_of
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
-
-
-@dataclass(frozen=True)
-class FitChoices:
-    """Keywords of `fit` beside its options, flags of `barpc fit`.
-
-    Parameters
-    ----------
-    alt_range : (2,), optional
-        Altitudes [m above the ellipsoid] to fit over; else the camera's own, of a radar all ground on Earth where an
-        RPC holds it.
-    dem : path or paths, optional, take the altitudes of these DEMs over the image, with a margin
-    dem_margin : float, margin below and above the DEM [m]
-    geoid : str, optional, of DEMs that do not state theirs: a name or a file
-    keep_going : bool, write the RPC although it misses the tolerance
-    overwrite : bool, replace an existing file
-    """
-
-    alt_range: Sequence[float] | None = None
-    dem: Files | None = None
-    dem_margin: float = 500.0
-    geoid: str | None = None
-    keep_going: bool = False
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,6 +46,8 @@ def fit(
     source: ImageLike | SensorModel,
     output: str | Path | None = None,
     options: OptionsLike | FitOptions = None,
+    *,
+    progress: Progress | None = None,
     **keywords: Any,
 ) -> RpcFit:
     """Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
@@ -79,7 +58,8 @@ def fit(
         A camera (see `barpc.open_camera`), a table of points (CSV, npz, GeoJSON), or an image with GCPs and no RPC.
     output : path, optional, where to write; the name chooses the format. Without: measure only
     options : FitOptions, RunOptions, mapping or path of a TOML file, optional
-    **keywords : fields of `FitOptions` and of `barpc.verbs.fitting.FitChoices`: alt_range, dem, dem_margin, geoid,
+    progress : callable, optional, `progress(stage, done, total)`
+    **keywords : fields of `FitOptions` and of `barpc.base.options.RefitOptions`: alt_range, dem, dem_margin, geoid,
         keep_going, overwrite
 
     Returns
@@ -99,26 +79,32 @@ def fit(
     >>> bool(found.max_ckp.max() < 0.01), found.rpc == barpc.read_rpc("fitted_RPC.TXT")
     (True, True)
     """
-    done = fitted(source, None if output is None else os.fspath(output), options, keywords)
+    done = fitted(source, None if output is None else os.fspath(output), options, keywords, progress)
     if output is not None and not done.written:
         raise FitError(f"{done.verdict}; nothing written (keep_going=True writes it all the same)")
     return done.fit
 
 
 def fitted(
-    source: ImageLike | SensorModel, output: str | None, options: OptionsLike | FitOptions, keywords: Mapping[str, Any]
+    source: ImageLike | SensorModel,
+    output: str | None,
+    options: OptionsLike | FitOptions,
+    keywords: Mapping[str, Any],
+    progress: Progress | None = None,
 ) -> Fitted:
     """Return the fit of a source, written where it meets its tolerance or is to `keep_going`."""
-    own = {field.name for field in fields(FitChoices)}
-    choices = FitChoices(**{name: value for name, value in keywords.items() if name in own})
-    more = {name: value for name, value in keywords.items() if name not in own}
+    own = declared(RefitOptions)
+    choices = RefitOptions(**{name: value for name, value in keywords.items() if name in own})
+    more, tell = {name: value for name, value in keywords.items() if name not in own}, progress or (lambda *_: None)
     if isinstance(options, FitOptions):
         options = replace(RunOptions(), fit=options)
     of_fit = run_options(options, **more).fit
     source = file_of(source)
     if output is not None:
         check_target(output, [place_of(source)], choices.overwrite)
+    tell("fit", 0, 1)
     found, size = _fit_source(source, of_fit, choices)
+    tell("fit", 1, 1)
     done = Fitted(found, of_fit.tolerance)
     if output is None or (done.verdict and not choices.keep_going):
         return done
@@ -126,7 +112,7 @@ def fitted(
 
 
 def _fit_source(
-    source: ImageLike | SensorModel, options: FitOptions, choices: FitChoices
+    source: ImageLike | SensorModel, options: FitOptions, choices: RefitOptions
 ) -> tuple[RpcFit, tuple[int, int] | None]:
     """Return the fit, and the image's width and height, if known."""
     spec = os.fspath(source) if isinstance(source, (str, os.PathLike)) else ""
@@ -146,11 +132,11 @@ def _fit_source(
     return _fit_camera(camera, options, choices), camera.size
 
 
-def _fit_camera(camera: Camera, options: FitOptions, choices: FitChoices) -> RpcFit:
+def _fit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> RpcFit:
     """Return the fit of a camera over the altitudes given, of a DEM, of all ground on Earth, or its own."""
     low, high = camera.alt_range
     if choices.alt_range is not None:
-        low, high = map(float, choices.alt_range)
+        low, high = choices.alt_range
     elif (terrain := terrain_of(choices.dem, choices.geoid)) is not None:
         low, high = terrain_range(camera.model, camera.extent, (low, high), terrain, choices.dem_margin)
     elif all_ground := getattr(camera.model, "all_ground", None):
@@ -167,7 +153,7 @@ class _Missed(Exception):  # noqa: N818 - it never leaves this page
 
 
 def _write_rpc_file(
-    done: Fitted, source: str, output: str, choices: FitChoices, size: tuple[int, int] | None
+    done: Fitted, source: str, output: str, choices: RefitOptions, size: tuple[int, int] | None
 ) -> Fitted:
     """Write the RPC and read it back: the fit as its file holds it, and whether it stays there (within a tolerance)."""
     with suppress(_Missed), replacing(output, overwrite=choices.overwrite) as partial:

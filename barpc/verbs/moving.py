@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import BarpcWarning, FitError, InputError, Remark, UsageError
+from barpc.base.errors import BarpcWarning, FitError, InputError, Remark
 from barpc.base.geodesy import Array, as_points, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pointio.tables import read_transform
@@ -23,7 +23,6 @@ from barpc.sensor.rpc import RPC
 
 _DEEPEST, _HIGHEST = -12e3, 10e3
 """Altitudes between which all ground on Earth lies [m], that of the sea's bottom, too."""
-LONGEST_MOVE = _HIGHEST - _DEEPEST  # m, along an axis
 _NOTEWORTHY_ROUNDING = 0.01  # m: rounding of a matrix that is told
 _EXACT_REFIT = 1e-5  # px, a thousandth of the tolerance: over all that an RPC states; else its image goes first
 _MOVED_NOTE = "moved and refitted"
@@ -44,8 +43,6 @@ def moved(cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str 
         matrix = read_transform(transform)
     else:
         metres = as_points(() if move is None else move, 3, "a motion", "metres east, north, up")
-        if not (np.abs(metres) < LONGEST_MOVE).all():
-            raise UsageError(f"--move {metres}: less than 22 km along each axis is expected [m]")
         _check_position(metres, np.concatenate(corners))
         matrix = np.column_stack([np.eye(3), enu_basis(at).T @ metres])
     out = []

@@ -23,6 +23,7 @@ from barpc.base.errors import InputError, Remark
 from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
+from barpc.base.options import OrthoOptions, with_values
 from barpc.export.shots import Scene, read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
@@ -32,43 +33,19 @@ from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
 from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
-from barpc.verbs.points import Files, altitude_of, terrain_of
+from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
 _FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
+_STRETCH = 100.0  # of lengths by a map: Mercator's is 57 at a latitude of 89 degrees
 _MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
 _RELIEF = 50.0  # m around a DEM's heights at sampled places
 _NODES = 17
+_SPHERE = 6378137.0  # m: radius of a map on which degrees are lengths
 _COG = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK_SIZE), "BIGTIFF": "IF_SAFER"}
 _WGS84 = CRS.from_epsg(4326)
-
-
-@dataclass(frozen=True)
-class OrthoChoices:
-    """Keywords of `ortho`, the flags of `barpc ortho`.
-
-    Parameters
-    ----------
-    dem : path or paths, optional, terrain heights; of several, the first with a height at a place counts
-    geoid : str, optional, of DEMs that do not state theirs: a name or a file
-    alt : float, optional, without a DEM: one altitude for all ground [m above the ellipsoid]
-    gsd : float, optional, side of a pixel [m]; else that of the finest image
-    crs : str, optional, map projection in metres; else the UTM zone of the first image
-    overwrite : bool, replace what an earlier call wrote
-    """
-
-    dem: Files | None = None
-    geoid: str | None = None
-    alt: float | None = None
-    gsd: float | None = None
-    crs: str | None = None
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.gsd is not None and not 0 < self.gsd < np.inf:
-            raise InputError(f"gsd {self.gsd}: a side in metres is expected")
 
 
 @dataclass(frozen=True)
@@ -93,7 +70,7 @@ def ortho(
         datasets, Views, Cameras
     out_dir : path, folder for the orthoimages, each with the name of its image
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `barpc.verbs.orthoimages.OrthoChoices`: dem, geoid, alt, gsd, crs, overwrite
+    **keywords : fields of `barpc.base.options.OrthoOptions`: dem, geoid, alt, gsd, crs, overwrite
 
     Returns
     -------
@@ -116,7 +93,7 @@ def ortho(
     >>> done.crs, done.gsd, done.path.name
     ('EPSG:32631', 2.0, 'view_00.tif')
     """
-    choices, (given, _) = OrthoChoices(**keywords), one_or_many(images)
+    choices, (given, _) = with_values(OrthoOptions(), keywords, "ortho"), one_or_many(images)
     alt, terrain = choices.alt, terrain_of(choices.dem, choices.geoid, choices.alt)
     if (run := run_folder(given)) is None:
         cameras, files = zip(*((camera_of(image), Path(place_of(image))) for image in every(given)), strict=True)
@@ -193,6 +170,8 @@ class _Warp:
                              f"{pixel * _COARSEST:.2g} m")  # fmt: skip
         east, north = transform(_WGS84, crs, *rings.T)
         west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
+        if not max(east - west, north - south) * gsd < _STRETCH * pixel * np.hypot(*camera.extent):
+            raise InputError(f"{file}: --crs {crs.to_string()}: lies at both ends of this map; give another projection")
         west, north = float(np.floor(west)), float(np.ceil(north))
         size = int(np.ceil(east - west)), int(np.ceil(north - south))
         side = min(_SIDE, int(_SIDE * pixel / gsd))
@@ -266,11 +245,13 @@ def _write_terrain(path: Path, camera: Camera, terrain: Dem, levels: tuple[float
     if grid.crs.is_geographic:  # columns run on where the DEM begins
         col = col[0] + (ring[:, 0] - ring[0, 0]) * grid.to_pixel.a
     (left, top), (right, bottom) = (np.floor([col.min(), row.min()]) - 1, np.ceil([col.max(), row.max()]) + 2)
-    place = to_map @ Affine.translation(left, top)
-    if grid.crs.is_geographic:  # and lie where the image is, by whole turns
-        place = Affine.translation(360.0 * np.rint((ring[0, 0] - place.c) / 360.0), 0.0) @ place
-    size, whole = (int(right - left), int(bottom - top)), pyproj.CRS(grid.crs.to_wkt())
+    place, size = to_map @ Affine.translation(left, top), (int(right - left), int(bottom - top))
+    whole = pyproj.CRS(grid.crs.to_wkt())
     flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d().to_wkt()
+    if grid.crs.is_geographic:  # GDAL has no posts beyond a longitude of 180: the same in a map about the image
+        middle = place.c + place.a * size[0] / 2
+        place = Affine.scale(np.radians(_SPHERE)) @ Affine.translation(-middle, 0.0) @ place
+        flat = f"+proj=eqc +lon_0={wrap_longitude(middle)} +R={_SPHERE}"
     what = {"dtype": "float32", "nodata": -32768.0, "crs": flat, "transform": place, "tiled": True}
     with rasterio.open(path, "w", "GTiff", *size, 1, **what) as file:
         for rows in chunks(size[1], BLOCK_SIZE):

@@ -163,7 +163,7 @@ def triangulate(images: Sequence[ImageLike | SensorModel], at: npt.ArrayLike) ->
 # --- altitudes --------------------------------------------------------------------------------------------
 
 
-def terrain_of(dem: Files | None, geoid: str | None, alt: npt.ArrayLike | None = None) -> Dem | None:
+def terrain_of(dem: Files | None = None, geoid: str | None = None, alt: npt.ArrayLike | None = None) -> Dem | None:
     """Return the terrain of DEMs, if any are given; UsageError for a geoid alone, or beside an altitude."""
     if geoid is not None and not dem:
         raise UsageError("--geoid goes with --dem")

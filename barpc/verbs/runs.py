@@ -8,13 +8,14 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from barpc import pipeline
 from barpc.base.errors import UsageError
 from barpc.base.options import DsmOptions, with_values
 from barpc.verbs.images import ImageLike, every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
+from barpc.verbs.workers import executor_for
 
 if TYPE_CHECKING:
     from barpc.dsm import Surface
@@ -31,6 +32,7 @@ def adjust(
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
+    jobs: int | str = 1,
     progress: Progress | None = None,
     **keywords: Any,
 ) -> AdjustResult:
@@ -44,6 +46,8 @@ def adjust(
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``, ``report.html``
     options : RunOptions, mapping as of a TOML file, or path of one; None: the defaults
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
+    jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
+        ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
     progress : callable, optional, `progress(stage, done, total)`
     **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``
 
@@ -64,8 +68,9 @@ def adjust(
     >>> result.views[0].sensor.project([5.4, 43.3, 120.0]).shape
     (2,)
     """
-    where: dict[str, Any] = {"out_dir": os.fspath(out_dir), "executor": executor, "progress": progress}
-    return pipeline.adjust(every(images), options=run_options(options, **keywords), **where)
+    chosen, where = run_options(options, **keywords), os.fspath(out_dir)
+    with executor_for(jobs, executor) as workers:
+        return pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
 
 
 def match(
@@ -74,6 +79,7 @@ def match(
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
+    jobs: int | str = 1,
     progress: Progress | None = None,
     **keywords: Any,
 ) -> AdjustResult:
@@ -81,7 +87,7 @@ def match(
 
     Parameters
     ----------
-    images, out_dir, options, executor, progress, **keywords : as of `barpc.adjust`
+    images, out_dir, options, executor, jobs, progress, **keywords : as of `barpc.adjust`
         matches.csv and matches.npz are written, and a text file for each pair as ASP reads them.
 
     Returns
@@ -100,26 +106,29 @@ def match(
     True
     """
     chosen = replace(run_options(options, **keywords), stop_after="matching")
-    return adjust(images, out_dir, chosen, executor=executor, progress=progress)
+    return adjust(images, out_dir, chosen, executor=executor, jobs=jobs, progress=progress)
 
 
 def check(
     images: ImageLike | Iterable[ImageLike],
     options: OptionsLike = None,
     *,
+    against: PathLike | None = None,
     executor: Executor | None = None,
+    jobs: int | str = 1,
     progress: Progress | None = None,
     **keywords: Any,
-) -> AdjustResult:
+) -> Any:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
 
     Parameters
     ----------
-    images, options, executor, progress, **keywords : as of `barpc.adjust`
+    images, options, executor, jobs, progress, **keywords : as of `barpc.adjust`
+    against : path, optional, compare each image's RPC with this one, or with those of this folder; nothing is matched
 
     Returns
     -------
-    AdjustResult, with `tracks` and `summary`, without an adjustment
+    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of RpcDifference
 
     Raises
     ------
@@ -131,13 +140,25 @@ def check(
     >>> found = barpc.check("data_samples/view_0[01].tif", points_per_image=500)
     >>> found.passed, found.summary["pairs"][0]["num_matches"] > 100
     (False, True)
+    >>> [one.max_px for one in barpc.check("data_samples/view_00.tif", against="data_samples")]
+    [0.0]
     """
     chosen = run_options(options, **keywords)
-    return pipeline.check(every(images), options=chosen, executor=executor, progress=progress)
+    if against is not None:
+        return _rpc_differences(images, Path(against))
+    with executor_for(jobs, executor) as workers:
+        return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
 
 
-def compared(images: Iterable[ImageLike], against: Path) -> list[tuple[str, str, float]]:
-    """Return each image, the RPC compared with (a file, or of a folder), and the largest difference over both [px]."""
+class RpcDifference(NamedTuple):
+    """An image, the file of the other RPC, and the largest difference of both over image and altitudes [px]."""
+
+    image: str
+    against: str
+    max_px: float
+
+
+def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> list[RpcDifference]:
     from barpc.cameras import open_camera
     from barpc.pipeline.verify_outputs import difference
     from barpc.rpcio import find_rpc
@@ -146,7 +167,7 @@ def compared(images: Iterable[ImageLike], against: Path) -> list[tuple[str, str,
     for view in pipeline.load_views(every(images), min_views=1, distinct=False).views:
         other = find_rpc(against, Path(view.path)) if against.is_dir() else against
         far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
-        found.append((view.path, str(other), far))
+        found.append(RpcDifference(view.path, str(other), far))
     return found
 
 
@@ -156,6 +177,7 @@ def dsm(
     options: DsmOptions | None = None,
     *,
     executor: Executor | None = None,
+    jobs: int | str = 1,
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Surface:
@@ -166,7 +188,7 @@ def dsm(
     source : path of a run folder, or images: paths, patterns, open rasterio datasets
     out : path of the GeoTIFF
     options : DsmOptions, optional
-    executor, progress : as of `barpc.adjust`; the bytes written do not depend on them
+    executor, jobs, progress : as of `barpc.adjust`; the bytes written do not depend on them
     **keywords : fields of `DsmOptions`: gsd, crs, alt, pairs, band, minus, overwrite
 
     Returns
@@ -194,7 +216,8 @@ def dsm(
     run = run_folder(given)
     if run is None and chosen.minus is not None:
         raise UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
-    return make_dsm(run or every(given), out, chosen, executor=executor, progress=progress)
+    with executor_for(jobs, executor) as workers:
+        return make_dsm(run or every(given), out, chosen, executor=workers, progress=progress)
 
 
 def run_folder(source: Sequence[Any]) -> Path | None:

@@ -19,16 +19,19 @@ from click.testing import CliRunner
 from jsonschema import Draft202012Validator
 
 import barpc
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, UsageError
 from barpc.base.options import (
     _DEEP,
     _QUOTED,
     PAPER,
     AdjustOptions,
+    ConvertOptions,
     Declared,
     DsmOptions,
     FitOptions,
     Options,
+    OrthoOptions,
+    RefitOptions,
     Rule,
     RunOptions,
     TieOptions,
@@ -366,3 +369,46 @@ def test_parts_are_counted_in_a_time_that_grows_with_the_text(text) -> None:
     start = time.process_time()
     _DEEP.search(_QUOTED.sub("q", text[: 1 << 20]))
     assert time.process_time() - start < 3.0
+
+
+@pytest.mark.parametrize(
+    ("record", "values", "held"),
+    [
+        (ConvertOptions, {"move": np.array([1, 2, 3])}, (1.0, 2.0, 3.0)),
+        (ConvertOptions, {"window": np.array([1, 2, 3, 4])}, (1, 2, 3, 4)),
+        (ConvertOptions, {"bbox": [5, np.float32(43), 6, 44]}, (5.0, 43.0, 6.0, 44.0)),
+        (ConvertOptions, {"transform": Path("t.txt")}, "t.txt"),
+        (OrthoOptions, {"dem": Path("a.tif")}, ("a.tif",)),
+        (OrthoOptions, {"dem": [Path("a.tif"), "b.tif"]}, ("a.tif", "b.tif")),
+        (OrthoOptions, {"gsd": np.float64(2)}, 2.0),
+        (RefitOptions, {"alt_range": np.array([0, 300])}, (0.0, 300.0)),
+        (DsmOptions, {"alt": (np.int64(0), 300)}, (0.0, 300.0)),
+    ],
+)
+def test_keywords_of_a_verb_are_what_numpy_and_paths_give(record, values, held) -> None:
+    (name,) = values
+    found = getattr(with_values(record(), values), name)
+    assert found == held
+    assert [type(one) for one in np.atleast_1d(np.array(found, object))] == [
+        type(one) for one in np.atleast_1d(np.array(held, object))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"window": (1, 2, 3)}, r"window must be 4 values, each a whole number \[px\], found \(1, 2, 3\)"),
+        ({"window": (1.5, 2, 3, 4)}, r"window must be a whole number \[px\], found 1.5"),
+        ({"move": np.zeros((2, 3))}, "move must be 3 values"),
+        ({"move": (0, 0, 22000)}, r"move must be a number above -22000 and below 22000 \[m\], found 22000"),
+        ({"bbox": "abcd"}, r"bbox must be 4 values, each a number \[deg\], found 'abcd'"),
+        ({"images": "none"}, "images 'none' is not one of vrt, copy"),
+        ({"alt": float("nan")}, r"alt must be a number \[m\], found nan"),
+        ({"dem": 3}, "dem must be a list, each a file, found 3"),
+    ],
+)
+def test_keywords_of_a_verb_are_refused_by_name(values, message) -> None:
+    with pytest.raises(InputError, match=f"^convert: {message}"):
+        with_values(ConvertOptions(), values, "convert")
+    with pytest.raises(UsageError, match=r"^convert: give either --move or --transform"):  # of wrong usage: exit code 2
+        with_values(ConvertOptions(), {"move": (1, 2, 3), "transform": "t.txt"}, "convert")

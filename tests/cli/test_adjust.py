@@ -309,7 +309,7 @@ def test_what_is_not_needed_is_not_loaded(command, unwanted, tmp_path):
     (tmp_path / "boto3.py").write_text("")
     code = (
         f"import sys\nsys.path.append({str(tmp_path)!r})\nsys.argv = ['barpc', 'info', 'none.tif']\n"
-        "from barpc.cli import main\nfrom barpc.cli.terminal import _enter_worker\n"
+        "from barpc.cli import main\nfrom barpc.verbs.workers import _enter_worker\n"
         f"try:\n    {command}\nexcept SystemExit:\n    pass\nimport rasterio\n"
         f"print(*(name for name in {unwanted.split()} if sys.modules.get(name) is not None))\n"
     )

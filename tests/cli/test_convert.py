@@ -14,8 +14,9 @@ import rasterio
 from rasterio.windows import Window
 
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
+from barpc.base.options import ConvertOptions
 from barpc.cameras import open_camera
-from barpc.cli import convert as printing
+from barpc.cli import terminal as printing
 from barpc.cli.convert import _tell_readings
 from barpc.fit.points import Sample
 from barpc.pipeline.verify_outputs import Reading
@@ -23,7 +24,6 @@ from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
 from barpc.verbs import converting as module
 from barpc.verbs.converting import (
-    Conversion,
     Converted,
     _refuse_source_folder,
     _shadow_reasons,
@@ -80,7 +80,7 @@ def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("convert", "--help") == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "Of txt (_RPC.TXT)," in text
-    assert "default: TARGET's name; txt" in text
+    assert "Without: that of TARGET's name; in a folder txt." in text
 
 
 def test_an_rpc_is_copied_as_it_is_and_read_back(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -219,7 +219,7 @@ def test_a_box_may_lie_across_the_antimeridian() -> None:
 
 
 def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
-    assert _window_chooser(Conversion(window=(1, 2, 3, 4)))(CAMERA, Path("a")) == (1, 2, 3, 4)
+    assert _window_chooser(ConvertOptions(window=(1, 2, 3, 4)))(CAMERA, Path("a")) == (1, 2, 3, 4)
     none: dict[str, Any] = {}
     for both in (
         none,
@@ -227,7 +227,7 @@ def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
         {"bbox": (0.0,) * 4, "aoi": "a"},
     ):
         with pytest.raises(UsageError, match="give one of --window, --bbox and --aoi"):
-            _window_chooser(Conversion(**both))
+            _window_chooser(ConvertOptions(**both))
 
 
 # --- a part of the ground out of many images --------------------------------------------------------------
@@ -320,7 +320,7 @@ def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9)
     assert run("convert", str(image), target, *words) == 1
     assert run("convert", str(image), target, *words, "--overwrite", "--json") == 0
-    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    found = json.loads(capsys.readouterr().out)
     assert found.pop("max_px") < 1e-9
     assert found == {"path": target, "window": [50, 60, 100, 80]}
 

@@ -15,7 +15,7 @@ import pytest
 from barpc.base.errors import BarpcWarning, InputError
 from barpc.cli import COMMANDS, Verbs, _exit_message, _log_warning, cli, main
 from barpc.cli.process import interruptible
-from barpc.cli.terminal import THREADS
+from barpc.verbs.workers import THREADS
 
 
 def run(*args: str) -> int:
@@ -250,9 +250,10 @@ def test_how_much_is_logged(
     seen = list[object]()
 
     @click.command()
-    @click.pass_obj
-    def probe(obj: dict[str, object]) -> int:
-        seen.append((obj, warnings.showwarning))
+    @click.pass_context
+    def probe(context: click.Context) -> int:
+        asked = context.find_root().params
+        seen.append(({name: asked[name] for name in ("quiet", "verbose")}, warnings.showwarning))
         return 0
 
     monkeypatch.setattr(logging, "basicConfig", lambda **how: given.append(how))

@@ -211,13 +211,13 @@ def test_few_digits_are_told_in_metres(image: Path, tmp_path: Path, capsys):
 @pytest.mark.parametrize(
     ("move", "told"),
     [
-        ("1,2", "not three numbers"),
-        ("1,2,3,4", "not three numbers"),
-        ("1 2 3", "not three numbers"),
-        ("1,2,x", "not three numbers"),
-        ("1,2,nan", "less than 22 km"),
-        ("1,inf,3", "less than 22 km"),
-        ("602000,4795000,100", "less than 22 km"),
+        ("1,2", "must be 3 values, each a number"),
+        ("1,2,3,4", "must be 3 values, each a number"),
+        ("1 2 3", "must be 3 values, each a number"),
+        ("1,2,x", "and below 22000 [m], found 'x'"),
+        ("1,2,nan", "above -22000 and below 22000 [m]"),
+        ("1,inf,3", "above -22000 and below 22000 [m]"),
+        ("602000,4795000,100", "above -22000 and below 22000 [m]"),
     ],
 )
 def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, capsys, move: str, told: str):

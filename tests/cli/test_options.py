@@ -14,7 +14,7 @@ from barpc.base.errors import InputError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import cli
 from barpc.cli.adjust import adjust
-from barpc.cli.flags import _jobs, field_of, flag, flag_name, image_paths, run_options
+from barpc.cli.flags import _jobs, field_of, flag, flag_name, given_flags, image_paths, run_options
 
 
 def given(target: str, *words: str) -> Any:
@@ -191,6 +191,8 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
         TieOptions(band=9),
         AdjustOptions(jitter="off"),
     )
+    assert run_options({"flag_adjust_drift": 0}, None).adjust.drift == 0  # 0 is a value
+    assert given_flags({"alt": 0.0, "dem": None, "overwrite": False}) == {"alt": 0.0, "overwrite": False}
     with pytest.raises(InputError, match="command line"):
         run_options({"flag_fit_tolerance": -1.0}, None)
 

@@ -15,7 +15,9 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.cli import terminal as module
-from barpc.cli.terminal import MINUTE, THREADS, Lines, executor_for, progress_told
+from barpc.cli.terminal import MINUTE, Lines, progress_told
+from barpc.verbs import workers
+from barpc.verbs.workers import THREADS, executor_for
 
 
 class Told:
@@ -186,7 +188,7 @@ def test_a_bar_follows_the_numbers_it_is_given(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_one_process_is_this_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ProcessPoolExecutor", None)
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", None)
     with executor_for(1) as executor:
         assert executor is None
 
@@ -201,26 +203,32 @@ class Pool:
 
 
 def test_several_processes_are_spawned_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_Workers", Pool)
+    monkeypatch.setattr(workers, "_Workers", Pool)
     with executor_for(2) as pool:
         assert isinstance(pool, Pool)
         assert pool.jobs == 2
         assert pool.context.get_start_method() == "spawn"  # type: ignore[attr-defined]
-        assert pool.initializer is module._enter_worker
+        assert pool.initializer is workers._enter_worker
         assert pool.ended == []
     assert pool.ended == [{}]
+
+
+class Process:
+    def __init__(self, killed: list[int], number: int) -> None:
+        self.kill = lambda: killed.append(number)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_after_an_error_nobody_waits_for_workers(error: type[BaseException], monkeypatch: pytest.MonkeyPatch) -> None:
     killed = list[int]()
-    workers = [SimpleNamespace(kill=lambda n=n: killed.append(n)) for n in range(2)]
-    monkeypatch.setattr(module, "_Workers", Pool)
-    monkeypatch.setattr(module.multiprocessing, "active_children", lambda: workers)
+    others, own = ([Process(killed, n) for n in some] for some in ((7,), (0, 1)))  # those of a host stay
+    alive = iter([others, [*others, *own]])
+    monkeypatch.setattr(workers, "_Workers", Pool)
+    monkeypatch.setattr(workers.multiprocessing, "active_children", lambda: next(alive))
     with pytest.raises(error), executor_for(3) as pool:
         raise error
     assert pool.ended == [{"wait": False, "cancel_futures": True}]  # type: ignore[union-attr]
-    assert killed == [0, 1]
+    assert sorted(killed) == [0, 1]
 
 
 def test_a_worker_has_one_thread_of_blas_and_leaves_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,11 +236,11 @@ def test_a_worker_has_one_thread_of_blas_and_leaves_with_its_parent(monkeypatch:
         monkeypatch.setenv(name, "8")
     signals, ended, joined = list[tuple[int, object]](), list[int](), list[bool]()
     parent = SimpleNamespace(join=lambda: joined.append(True))
-    monkeypatch.setattr(module.signal, "signal", lambda *given: signals.append(given))
-    monkeypatch.setattr(module.multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(module.os, "_exit", ended.append)
+    monkeypatch.setattr(workers.signal, "signal", lambda *given: signals.append(given))
+    monkeypatch.setattr(workers.multiprocessing, "parent_process", lambda: parent)
+    monkeypatch.setattr(workers.os, "_exit", ended.append)
     with warnings.catch_warnings(record=True) as heard:
-        module._enter_worker()
+        workers._enter_worker()
         warnings.warn("nobody hears this", stacklevel=1)
     assert heard == []
     assert [os.environ[name] for name in THREADS] == ["1"] * 3
@@ -242,8 +250,8 @@ def test_a_worker_has_one_thread_of_blas_and_leaves_with_its_parent(monkeypatch:
             break
         time.sleep(0.01)
     assert (joined, ended) == ([True], [1])
-    monkeypatch.setattr(module.multiprocessing, "parent_process", lambda: None)
-    module._leave_with_parent()
+    monkeypatch.setattr(workers.multiprocessing, "parent_process", lambda: None)
+    workers._leave_with_parent()
     assert ended == [1]
 
 

@@ -314,8 +314,9 @@ def test_convert_cuts_by_window_and_by_box(image, tmp_path, capsys):
     west, east = sorted(corners[:, 0])
     south, north = sorted(corners[:, 1])
     box = ("--bbox", west, south, east, north, "--alt", 200)
+    capsys.readouterr()
     assert run("convert", image, tmp_path / "b.tif", *box, "--json") == 0
-    window = json.loads(capsys.readouterr().out.splitlines()[-1])["window"]
+    window = json.loads(capsys.readouterr().out)["window"]
     assert window[0] <= 100
     assert window[0] + window[2] >= 200
     assert window[1] <= 100

@@ -236,13 +236,15 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("barpc.cli.adjust.wants_json", lambda: as_json)
+    for place in ("adjust", "terminal"):
+        monkeypatch.setattr(f"barpc.cli.{place}.wants_json", lambda: as_json)
+        monkeypatch.setattr(f"barpc.cli.{place}.is_quiet", lambda: quiet)
     record = a_summary([], reasons=("One.",))
     result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True, root="")
-    assert _tell_result({"quiet": quiet}, result) == 0
+    assert _tell_result(result) == 0
     assert capsys.readouterr() == (out, "")
     result.passed = False
-    assert _tell_result({"quiet": quiet}, result) == 3
+    assert _tell_result(result) == 3
     headline = "" if quiet else "All well. "
     assert capsys.readouterr() == (out, f"barpc: exit code 3: {headline}One.\n")
 

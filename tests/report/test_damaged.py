@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import warnings
 from collections.abc import Iterator
 from copy import deepcopy
 from itertools import islice, product
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from barpc.base.errors import InputError
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.cli import cli
 from barpc.pipeline.outputs import remake_report
 from barpc.report import Run
@@ -143,3 +144,21 @@ def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, tmp_pat
     summary = {**block_run.summary, "headline": "of \udce9t\udce9"}
     (folder / "summary.json").write_text(json.dumps(summary))
     assert "of \\udce9t\\udce9" in remake_report(folder).read_text()
+
+
+@pytest.mark.parametrize("at", [(), ("views", 2), ("views", 0, "correction", "ellipse"), ("scene",), ("tracks",)])
+def test_a_key_that_no_record_has_is_named_and_passed_over(at: tuple[Any, ...], block_run: Finished, tmp_path: Path):
+    summary = deepcopy(block_run.summary)
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        known = read_summary(tmp_path)
+    holder: Any = summary
+    for key in at:
+        holder = holder[key]
+    holder |= {"of_later": {"a": 1}, "none": None}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    place = ".".join(key for key in at if isinstance(key, str))
+    with pytest.warns(BarpcWarning, match=rf"summary\.json: has {place}{'.' * bool(place)}of_later, which") as told:
+        assert read_summary(tmp_path) == known
+    assert len(told) == 1

@@ -202,7 +202,49 @@ def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
         caption = _map_section(files).charts[0][1]
         assert caption.endswith("; shaded: rows or columns with few tie points.")
         plain = _map_section(files_of(a_summary(views[:1]), outlines[:1])).charts[0][1]
-        assert plain.endswith("dashed: tie points that move.")
+        assert plain == "Footprints at the altitude of the scene."
+
+
+def test_the_caption_names_what_is_on_the_map_and_nothing_else():
+    views, outlines, pairs = scene()
+    moving = ExplanationEntry("moving_objects", "a cloud", None, 50.0, 40.0, box=(9.996, -0.004, 10.004, -0.001))
+    rows = ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0)
+    point = a_gcp("P", 10.0, 0.0)
+    check = SimpleNamespace(**{**vars(a_gcp("Q", 10.0, 0.0)), "observations": ()})
+    words = {
+        "dots": "tie points",
+        "triangles": "GCPs",
+        "inverted triangles": "check points",
+        "thicker lines": "more matches",
+        "dashed": "tie points that move",
+    }
+    for known in (set(), {"dots"}, {"triangles"}, {"inverted triangles"}, {"thicker lines"}, {"dashed"}, set(words)):
+        summary = a_summary(
+            views,
+            pairs if "thicker lines" in known else pairs[:1],
+            gcps=(point,) * ("triangles" in known),
+            check_points=(check,) * ("inverted triangles" in known),
+            scene=SimpleNamespace(explanations=(moving, rows) if "dashed" in known else (rows,)),
+        )
+        files = files_of(summary, outlines, [(10.0, 0.0, 0.0, 0.0)] * ("dots" in known))
+        _, *told = _map_section(files).charts[0][1].rstrip(".").split("; ")
+        told = [one for one in told if one != "those that need review on top"]
+        assert told == [f"{key}: {word}" for key, word in words.items() if key in known]
+        drawn = Drawing(ground_map(files))
+        for key, kind in (("triangles", "gcps"), ("inverted triangles", "check_points"), ("dashed", "group")):
+            assert bool(drawn.titles(kind)) == (key in known)
+
+
+@pytest.mark.parametrize("status", ["used", "not seen", "contradicts", "rejected", "undecided"])
+def test_a_gcp_that_contradicts_others_is_red_and_the_caption_says_so(status):
+    views, outlines, _ = scene()
+    summary = a_summary(views, gcps=(a_gcp("P", 10.0, 0.0, status=status), a_gcp("Q", 10.001, 0.0)))
+    drawn, wrong = Drawing(ground_map(files_of(summary, outlines))), status not in ("used", "not seen")
+    classes = [mark.get("class") for mark in drawn.all("path") if "gcps" in (mark.get("class") or "").split()]
+    assert classes == ["gcps doubted" if wrong else "gcps", "gcps"]
+    told = _map_section(files_of(summary, outlines)).charts[0][1]
+    assert ("triangles: GCPs, red where they contradict others." in told) == wrong
+    assert told.endswith("triangles: GCPs.") != wrong
 
 
 def test_where_tie_points_move_is_outlined_and_says_so():
@@ -229,18 +271,17 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
     places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
     drawn = drawn_names(places)
     assert drawn.texts("name") == [("view_0137", 36.9, 104.0, "middle"), ("B", 415.9, 54.0, "middle")]
-    assert len(maps._map_labels(places, [(30.0, 90.0, 20.0)])) == 1
+    assert [row[3] for row in maps._map_labels(places, [(30.0, 90.0, 20.0)])] == [pytest.approx(115.4), 50.0]
     (long,) = drawn_names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))]).texts("name")
     assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
-    for dx, dy, shown in ((8.3, 0.0, 2), (8.1, 0.0, 1), (0.0, 14.1, 2), (0.0, 13.9, 1)):
-        assert (
-            len(
-                maps._map_labels(
-                    [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))], []
-                )
-            )
-            == shown
-        )
+    for dx, dy, clear in ((8.3, 0.0, True), (8.1, 0.0, False), (0.0, 14.1, True), (0.0, 13.9, False)):
+        two = [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))]
+        aside = 15.4 * (not clear)  # of few images each has its name, a line lower where it would cover another
+        assert maps._map_labels(two, [])[1][3] == pytest.approx(50.0 + dy + aside)
+    crowd = [(a_view("V"), np.array([50.0 + 8.1 * k, 50.0])) for k in range(12)]  # of many those that find room
+    assert [row[2] for row in maps._map_labels(crowd, [])] == pytest.approx([50.0 + 16.2 * k for k in range(6)])
+    crowd[1] = (a_view("W", status="weak", advice="look"), crowd[1][1])  # and any that needs review
+    assert ("W", pytest.approx(65.4)) in [(name, y) for _, name, _, y in maps._map_labels(crowd, [])]
 
 
 def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_them():
@@ -249,16 +290,19 @@ def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_the
         "free": [],
         "below": [mark],
         "above": [mark, (50.0, 66.0, 5.0)],
-        "nowhere": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
+        "two below": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
+        "nowhere": [(50.0, 50.0 + 16.0 * k, 5.0) for k in range(-2, 3)],
     }
     found = {key: [y for *_, y in maps._map_labels(place, [], marks)] for key, marks in rows.items()}
-    assert found == {"free": [50.0], "below": [pytest.approx(65.4)], "above": [pytest.approx(34.6)], "nowhere": [50.0]}
-    assert maps._map_labels(place, [(50.0, 66.0, 5.0), (50.0, 34.0, 5.0)], [mark])[0][3] == 50.0  # words are no room
+    rows = {"free": 50.0, "below": 65.4, "above": 34.6, "two below": 80.8, "nowhere": 50.0}
+    assert found == {key: [pytest.approx(y)] for key, y in rows.items()}
+    words = [(50.0, 50.0 + 16.0 * k, 5.0) for k in (-2, -1, 1, 2)]  # where these stand is no room
+    assert maps._map_labels(place, words, [mark])[0][3] == 50.0
 
 
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
-    # seven pixels are half a line of names; what is farther is another place, whose name finds no room or finds some
-    for away, shown in ((6.9, ["A + 2"]), (7.1, ["A"]), (14.1, ["A", "B + 1"])):
+    # seven pixels are half a line of names; what is farther is another place, whose name stands a line lower
+    for away, shown in ((6.9, ["A + 2"]), (7.1, ["A", "B + 1"]), (14.1, ["A", "B + 1"])):
         places = [(a_view(name), np.array([60.0, 50.0 + away * (name != "A")])) for name in "ABC"]
         assert [text for text, *_ in drawn_names(places).texts("name")] == shown
 

@@ -115,7 +115,7 @@ def test_a_name_that_is_none_is_refused_before_anything_is_imported(name: str) -
 
 def test_an_options_file_names_no_code_and_reading_it_imports_nothing(tmp_path: Path) -> None:
     (tmp_path / "o.toml").write_text('[tie]\nmatcher = "antigravity:match"\n')
-    with pytest.raises(InputError, match=r"o\.toml: matcher 'antigravity:match' would run code.*--matcher"):
+    with pytest.raises(InputError, match=r"o\.toml \[tie\]: matcher 'antigravity:match' would run code.*--matcher"):
         read_options(tmp_path / "o.toml")
     assert "antigravity" not in sys.modules
     (tmp_path / "o.toml").write_text('[tie]\nmatcher = "structure"\n')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from barpc.base.errors import FitError, InputError, OutputError, Remark
 from barpc.rasters.dem import Dem
 from barpc.rpcio import write_rpc_copy
 from tests.cli.test_images import run
+from tests.lanes import rest_slow
 from tests.rasters.test_dem import write_geoid
 from tests.scenes.files import write_scene
 from tests.scenes.images import ImageOptions, Scene
@@ -83,6 +85,28 @@ def test_every_pixel_is_where_the_camera_sees_it_on_the_dem(crs, start, ramp, tm
     assert np.sqrt((off**2).mean()) < 0.02
     flat = errors(made.path, ramp, 150.0)
     assert np.nanmax(flat) > 5  # else the relief would show nothing
+
+
+@pytest.mark.parametrize("start", [179.99, -180.01])
+@pytest.mark.parametrize("middle", rest_slow([180.0, 179.9995, -180.0, -179.9995]))
+def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
+    """On DEMs that begin on either side of it; the camera's longitudes go on beyond 180 degrees."""
+    rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
+    east = middle - rpc.localize([SIDE / 2, SIDE / 2], 150.0)[0]
+    rpc = replace(rpc, ground_offset=rpc.ground_offset + [east, 0.0, 0.0])
+    pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
+    with rasterio.open(tmp_path / "raw.tif", "w", "GTiff", SIDE, SIDE, 2, dtype="float32") as file:
+        file.write(pixels)
+    write_rpc_copy(rpc, tmp_path / "raw.tif", image := tmp_path / "ramp.tif")
+    dem = write_hills(tmp_path / "dem.tif", start=start)
+    (made,) = barpc.ortho(image, tmp_path / "maps", dem=dem)
+    off = errors(made.path, image, Dem.open(dem))
+    assert np.isfinite(off).all()
+    assert off.max() < 0.1
+    with pytest.raises(InputError, match="--crs EPSG:3857: lies at both ends of this map"):  # not 40,000 km of it
+        barpc.ortho(image, tmp_path / "far", alt=150, crs="EPSG:3857")
+    (made,) = barpc.ortho(image, tmp_path / "middle", alt=150, crs="EPSG:3832")  # Mercator about 150 E
+    assert errors(made.path, image, 150.0).max() < 0.2
 
 
 def test_heights_above_a_geoid_are_lifted_to_the_ellipsoid(ramp, tmp_path):
@@ -161,7 +185,7 @@ def test_nothing_is_replaced_and_radar_s_complex_pixels_are_named(ramp, tmp_path
     with pytest.raises(InputError, match=r"complex\.tif: complex pixels"):
         barpc.ortho(tmp_path / "complex.tif", tmp_path / "other", alt=150)
     assert not list((tmp_path / "other").glob("*.tif"))
-    with pytest.raises(InputError, match="gsd 0: a side in metres"):
+    with pytest.raises(InputError, match="gsd must be a number above 0"):
         barpc.ortho(ramp, tmp_path / "other", alt=150, gsd=0)
     for gsd in (1e-6, 1e6):  # neither a map without end nor an image in one pixel
         with pytest.raises(InputError, match=r"an image pixel of 0\.5\d? m: give 0\.05\d* m to 3\d m"):

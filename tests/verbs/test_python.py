@@ -6,6 +6,8 @@ import inspect
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ def public(name: str) -> Any:
 def test_every_verb_is_a_function_with_its_flags_as_keywords():
     assert set(COMMANDS) - {"report"} <= set(PUBLIC)  # of a report AdjustResult.report, and files
     positional = {"images", "points", "numbers", "files", "run_dir", "places", "target"}
-    printed = {"jobs", "image_list", "options_file", "paper", "against", "out", "output", "outlines", "help_all", "at"}
+    printed = {"image_list", "options_file", "paper", "out", "output", "outlines", "help_all", "at"}
     for verb in set(COMMANDS) - {"report"}:
         command = cli.get_command(click.Context(cli), verb)
         assert command is not None
@@ -236,7 +238,7 @@ def test_what_is_converted_is_a_sentence_with_the_worst_reader(tmp_path):
     assert float(number[1]) == float(f"{max(one.max_error for one in done.readings):.1g}")
     with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and -o DIR"):
         barpc.convert(VIEWS, tmp_path / "a.RPB")
-    with pytest.raises(TypeError, match="windw"):
+    with pytest.raises(InputError, match=r"unknown option 'windw'; known are .*window"):
         barpc.convert(VIEWS[0], tmp_path / "a.tif", windw=(0, 0, 9, 9))
     assert barpc.convert(VIEWS[0], tmp_path / "a.tif", window=(10, 20, 30, 40)).window == (10, 20, 30, 40)
 
@@ -275,3 +277,44 @@ def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path
     assert shown.count("<tr>") == 3
     assert found.record.headline.split(".")[0] in shown
     assert "view_00" in shown
+
+
+# --- who works --------------------------------------------------------------------------------------------
+
+
+def test_jobs_are_processes_a_cluster_or_the_executor_given(monkeypatch):
+    asked = list[Any]()
+    monkeypatch.setattr("barpc.pipeline.check", lambda *_, executor, **__: asked.append(executor))
+    monkeypatch.setattr("barpc.verbs.workers._processes", lambda jobs: nullcontext(("processes", jobs)))
+    monkeypatch.setattr("barpc.verbs.workers._cluster", lambda address: nullcontext(("cluster", address)))
+    own: Any = object()
+    for how in ({}, {"jobs": 1}, {"jobs": 3}, {"jobs": "tcp://a:1"}, {"executor": own}, {"executor": own, "jobs": 3}):
+        barpc.check(VIEWS, **how)
+    assert asked == [None, None, ("processes", 3), ("cluster", "tcp://a:1"), own, own]
+    for jobs in (0, -2):
+        with pytest.raises(InputError, match=f"jobs {jobs}: a number of processes"):
+            barpc.check(VIEWS, jobs=jobs)
+
+
+@pytest.mark.slow
+def test_two_processes_write_what_one_does(tmp_path):
+    for jobs in (1, 2):
+        barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)
+    one, two = ((tmp_path / name / "matches.csv").read_bytes() for name in "12")
+    assert one == two
+
+
+def test_an_rpc_is_compared_with_another_or_with_those_of_a_folder(tmp_path):
+    rpc = barpc.read_rpc(VIEWS[0])
+    moved = replace(rpc, image_offset=rpc.image_offset + [3.0, 4.0])
+    barpc.write_rpc(moved, tmp_path / f"{VIEWS[0].stem}_RPC.TXT")
+    for against in (tmp_path, tmp_path / f"{VIEWS[0].stem}_RPC.TXT"):
+        (found,) = barpc.check(VIEWS[0], against=against)
+        assert (found.image, Path(found.against).parent) == (str(VIEWS[0]), tmp_path)
+        assert found.max_px == pytest.approx(5.0, abs=1e-6)
+
+
+def test_a_fit_tells_its_progress(tmp_path):
+    told = list[tuple[str, int, int]]()
+    barpc.fit(VIEWS[0], alt_range=(0, 400), progress=lambda *stage: told.append(stage))
+    assert told == [("fit", 0, 1), ("fit", 1, 1)]

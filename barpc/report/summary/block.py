@@ -151,6 +151,11 @@ class LeftEntry(Record):
     gain: float = column("Logarithm of the likelihood over that of a uniform image", "nats", "gain", ".0f")
     moving: bool = column("Whether the share is of a moving group, not of rejected tie points", default=False)
 
+    @property
+    def place(self) -> str:
+        """Its rows or columns in words."""
+        return f"{self.axis} {self.first:.0f}-{self.last:.0f}"
+
 
 class HeldOutEntry(Record):
     """Rows, columns or a cell of an image in which check tie points have larger residuals than in the rest."""
