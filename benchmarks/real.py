@@ -1,10 +1,10 @@
-"""Real images, each set by barpc and by the peers that are installed: one table, a row a set and tool.
+"""Real images, each set by barpc and by the peers that are installed: one table, a row a set.
 
     python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--only SET]...
 
-A row has the epipolar offset of independent points (median, spread 1.4826 MAD [px] and their number, the worst pair of
-a set), CPU seconds, peak memory, the exit code and the first sentence of the result. The points are those of the data's
-truth (SIFT or correlation without any RPC); of a --folder, and where the truth has none, SIFT matches made here,
+A cell has the epipolar offset of independent points (median, spread 1.4826 MAD [px] and their number, the worst pair
+of a set), CPU seconds, peak memory, the exit code and the first sentence of the result. The points are those of the
+data's truth (SIFT or correlation without any RPC); of a --folder, and where the truth has none, SIFT matches made here,
 filtered by a fundamental matrix. The offset is measured by tools/epi_check.py beside the data, which has its own RPC
 formula and reads files through GDAL. Tools:
   delivered  the cameras as they are
@@ -57,7 +57,6 @@ class Scene:
 class Row:
     """One set by one tool."""
 
-    scene: str
     tool: str
     offset: str = ""
     cpu: float = np.nan
@@ -65,10 +64,10 @@ class Row:
     code: int = 0
     said: str = ""
 
-    def line(self) -> str:
+    def cell(self) -> str:
         """For the table."""
-        cost = f"{self.cpu:.1f} | {self.peak:.0f}" if np.isfinite(self.cpu) else "| "
-        return f"| {self.scene} | {self.tool} | {self.offset} | {cost} | {self.code} | {self.said} |"
+        cost = f"; {self.cpu:.1f} s, {self.peak:.0f} MB, exit {self.code}" if np.isfinite(self.cpu) else ""
+        return f"{self.offset}{cost}{f'; {self.said}' if self.said else ''}"
 
 
 def scenes(data: Path) -> Iterator[Scene]:
@@ -205,7 +204,7 @@ def by_barpc(scene: Scene, arguments: list[str], place: Path) -> tuple[Row, dict
     out = place / "barpc"
     command = [sys.executable, "-m", "barpc", "-q", "adjust", *arguments, *scene.options, "-o", str(out)]
     cpu, peak, code = measured(command, ROOT, place / "barpc.log")
-    row = Row(scene.name, "barpc", "", cpu, peak, code)
+    row = Row("barpc", "", cpu, peak, code)
     if (out / "summary.json").is_file():
         told = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         row.said = "; ".join([told["status"], *told["reasons"][:1]])
@@ -242,7 +241,7 @@ def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -
         run = [sys.executable, "-m", "barpc", "-q", "convert", *given, "-o", str(place / f"cars_{back}")]
         if given:
             measured(run, ROOT, place / "cars_convert.log")
-        found.append((Row(scene.name, f"cars, {kind}", "", cpu, peak, code, said), cameras))
+        found.append((Row(f"cars, {kind}", "", cpu, peak, code, said), cameras))
     return found
 
 
@@ -258,7 +257,7 @@ def _shift(geom: Path, pixels: float) -> None:
 def rows(scene: Scene, check: Path, cars: str | None) -> Iterator[Row]:
     """The rows of a set."""
     if scene.missing:
-        yield Row(scene.name, "-", said=scene.missing)
+        yield Row("delivered", said=scene.missing)
         return
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder, "set")
@@ -267,7 +266,7 @@ def rows(scene: Scene, check: Path, cars: str | None) -> Iterator[Row]:
         measure: Callable[[dict[str, Path]], str] = lambda found: offsets(check, found, points)  # noqa: E731
         if scene.gcps is not None:
             measure = lambda found: _of_gcps(check, found, scene.gcps)  # noqa: E731
-        yield Row(scene.name, "delivered", measure(cameras))
+        yield Row("delivered", measure(cameras))
         row, found = by_barpc(scene, arguments, place)
         yield replace(row, offset=measure(found))
         if cars is not None and len(arguments) > 1:
@@ -303,11 +302,12 @@ def main() -> None:
     tool = given.data.parent / "tools/epi_check.py"
     if not tool.is_file():
         sys.exit(f"{tool}, which measures the check points, is absent")
-    print("| set | tool | epipolar offset [px] | CPU [s] | peak [MB] | exit | result |\n|---|---|---|---|---|---|---|")
+    tools = ["delivered", "barpc", *(["cars, as written", "cars, half a pixel back"] if given.cars else [])]
+    print(f"| set | {' | '.join(tools)} |\n|{'---|' * (len(tools) + 1)}")
     for scene in (*scenes(given.data), *map(of_folder, given.folder)):
         if not given.only or any(part in scene.name for part in given.only):
-            for row in rows(scene, tool, given.cars):
-                print(row.line(), flush=True)
+            found = {row.tool: row.cell() for row in rows(scene, tool, given.cars)}
+            print(f"| {scene.name} | {' | '.join(found.get(name, '-') for name in tools)} |", flush=True)
 
 
 if __name__ == "__main__":

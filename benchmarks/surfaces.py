@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
+from rasterio.transform import from_origin
 from rasterio.warp import Resampling, reproject
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -84,10 +85,23 @@ def by_cars(python: str) -> Tool:
         config["input"] = {"sensors": {name: sensors[name] for name in pair}, "pairing": [list(pair)]}
         config |= {"subsampling": {"advanced": {"resolutions": [1]}}, "orchestrator": {"mode": "sequential"}}
         config["output"] = {"directory": str(place / "out"), "resolution": CELL}
+        lon, lat, alt = np.median(read_scene(run).points, axis=0)
+        config["input"]["initial_elevation"] = {
+            name: str(level(place / f"{name}.tif", (lon, lat), value)) for name, value in (("dem", alt), ("geoid", 0.0))
+        }
         (place / "export/pair.json").write_text(json.dumps(config))
         return [str(Path(python).parent / "cars"), str(place / "export/pair.json")]
 
     return command
+
+
+def level(path: Path, middle: tuple[float, float], height: float) -> Path:
+    """A raster of one height [m] for a degree around a place: for CARS, which finds no disparities without any."""
+    side, step = 100, 0.01
+    place = from_origin(middle[0] - side * step / 2, middle[1] + side * step / 2, step, step)
+    with rasterio.open(path, "w", "GTiff", side, side, 1, "EPSG:4326", place, "float32") as file:
+        file.write(np.full((side, side), height, np.float32), 1)
+    return path
 
 
 def surface(tool: Tool, run: Path, pair: Pair, place: Path) -> tuple[Path | None, float]:
@@ -106,13 +120,9 @@ def surface(tool: Tool, run: Path, pair: Pair, place: Path) -> tuple[Path | None
 
 
 def heights(path: Path, like: Path, band: int = 1) -> np.ndarray:
-    """A surface on the cells of another, the nearest ones; what CARS filled in is unknown."""
+    """A surface on the cells of another, the nearest ones."""
     with rasterio.open(like) as grid, rasterio.open(path) as file:
         own = file.read(band, masked=True).astype(np.float32).filled(np.nan)
-        filled = path.parent / "filling.tif"
-        if filled.is_file():
-            with rasterio.open(filled) as why:
-                own[why.read(1, masked=True).filled(0) > 0] = np.nan
         out = np.full((grid.height, grid.width), np.nan, np.float32)
         reproject(
             own, out, src_transform=file.transform, src_crs=file.crs, dst_transform=grid.transform, dst_crs=grid.crs,
