@@ -217,7 +217,11 @@ def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -
     """cars-bundleadjustment, its cameras as written and with the half pixel that all have in common taken back."""
     program = Path(interpreter).parent / "cars-bundleadjustment"
     names = [Path(path).stem for path in arguments]
-    sensors = {name: {"image": path} for name, path in zip(names, arguments, strict=True)}
+    sensors: dict[str, dict[str, object]] = {}
+    for name, path in zip(names, arguments, strict=True):
+        beside = Path(path).with_suffix(".geom")
+        given = {"geomodel": str(beside)} if beside.is_file() else {}
+        sensors[name] = {"image": path, **given}
     pairing = [[names[0], name] for name in names[1:]]
     wanted = {"pairing": pairing, "separate": True, "nb_decimals": 0, "min_matches": 50}
     config = {
@@ -232,25 +236,28 @@ def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -
     found = []
     for kind, back in (("as written", 0.0), ("half a pixel back", 0.5)):
         cameras = {name: place / f"cars_{back}/{name}.vrt" for name in names}
-        given = []
+        shifted = []
         for name, path in zip(names, arguments, strict=True):
             geom = next(iter(sorted((place / "cars").rglob(f"*{name}*.geom"))), None)
             if geom is not None:
-                _shift(geom, back)
-                given.append(f"{path},camera={geom}")
-        run = [sys.executable, "-m", "barpc", "-q", "convert", *given, "-o", str(place / f"cars_{back}")]
-        if given:
+                _shift(geom, path, back)
+                shifted.append(f"{path},camera={geom}")
+        run = [sys.executable, "-m", "barpc", "-q", "convert", *shifted, "-o", str(place / f"cars_{back}")]
+        if shifted:
             measured(run, ROOT, place / "cars_convert.log")
         found.append((Row(f"cars, {kind}", "", cpu, peak, code, said), cameras))
     return found
 
 
-def _shift(geom: Path, pixels: float) -> None:
+def _shift(geom: Path, image: str, pixels: float) -> None:
+    """Take pixels from the places of an image in its .geom, and the crop's corner where it is that of a whole image."""
+    with rasterio.open(image) as file:
+        corner = (file.transform.c, file.transform.f) if file.rpcs is None and file.crs is None else (0.0, 0.0)
+    less = {"samp_off": pixels + corner[0], "line_off": pixels + corner[1]}
     lines = []
     for line in geom.read_text().splitlines():
         key, _, value = line.partition(":")
-        shifted = key.strip() in ("line_off", "samp_off")
-        lines.append(f"{key}: {float(value) - pixels!r}" if shifted else line)
+        lines.append(f"{key}: {float(value) - less[key.strip()]!r}" if key.strip() in less else line)
     geom.write_text("\n".join(lines) + "\n")
 
 
