@@ -43,15 +43,15 @@ def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[
     """
     keypoints = files.load()[0]
     xy, weight = keypoints.xy, np.zeros(len(keypoints))
-    every = [here @ [1.0, 1.0j] for here, _, _ in partners]
-    ties = np.isin(xy @ [1.0, 1.0j], np.concatenate(every)) if every else weight > 0.0
+    tied = [np.isin(xy @ [1.0, 1.0j], here @ [1.0, 1.0j]) for here, _, _ in partners]
+    ties = np.any([weight > 0.0, *tied], axis=0)
     strong = keypoints.response >= np.quantile(keypoints.response[ties], LEVEL) if ties.any() else ~ties
-    for here, there, other in partners:
+    for own, (here, there, other) in zip(tied, partners, strict=True):
         linear = np.linalg.lstsq(_affine_design(here), there, rcond=None)[0]
         relief = np.abs(there - _affine_design(here) @ linear).max(axis=0)  # it may hide what is so near an edge
         place = _affine_design(xy) @ linear
         seen = strong & ((place >= relief) & (place <= np.array(other) - 1.0 - relief)).all(axis=1)
-        weight[seen] = np.maximum(weight[seen], len(here) / seen.sum())
+        weight[seen] = np.maximum(weight[seen], own[seen].sum() / max(int(seen.sum()), 1))
     return in_parts(xy, size, weight / max(float(weight.max(initial=0.0)), np.finfo(float).tiny))
 
 
