@@ -223,16 +223,17 @@ def cars(folder: Path, place: Path) -> Figures:
     """On the first pair alone: minutes a pair. Not yet seen to its end: the docs' figures are of runs by hand."""
     scene = read_scene(folder)
     export_run(folder, "cars", place / "export")
-    ready = (place / "export/inputs.yaml").read_text(encoding="utf-8")
-    ready = re.sub(r'"pairing":\n(    - .*\n)+', f'"pairing":\n    - {json.dumps(pairs_of(scene)[0])}\n', ready)
-    ready += '"subsampling":\n  "advanced":\n    "resolutions": [1]\n'  # a quarter of a small image matches nothing
+    ready = json.loads((place / "export/inputs.yaml").read_text(encoding="utf-8"))
+    ready["input"]["pairing"] = [list(pairs_of(scene)[0])]
+    ready["subsampling"] = {"advanced": {"resolutions": [1]}}  # a quarter of a small image matches nothing
     found: Figures = {}
     for kind in ("delivered", "corrected"):
-        text = ready.replace('"cars_out"', json.dumps(str(place / kind)))
-        for shot in scene.shots if kind == "delivered" else ():
-            text = text.replace(f'"{shot.name}.geom"', json.dumps(str(Path(shot.file).absolute())))
-        (place / "export" / f"{kind}.yaml").write_text(text, encoding="utf-8")
-        run(["cars", f"{kind}.yaml"], place / "export")
+        for shot in scene.shots:
+            camera = Path(shot.file).absolute() if kind == "delivered" else f"{shot.name}.geom"
+            ready["input"]["sensors"][shot.name]["geomodel"]["path"] = str(camera)
+        ready["output"] = {"directory": str(place / kind)}
+        (place / "export" / f"{kind}.json").write_text(json.dumps(ready), encoding="utf-8")
+        run(["cars", f"{kind}.json"], place / "export")
         told = (place / kind / "intermediate_data/surface_modeling/res1/metadata.yaml").read_text()
         for name in ("mean", "std"):
             (value,) = re.findall(rf"before_correction_epi_error_{name}: (\S+)", told)

@@ -3,8 +3,8 @@
 Area: squares around the middle of the image, up to its shorter side, 50 x 50 x 10 control points in each. Grid length:
 n x n x 10 points over the whole image. Check points lie in the middle of the control points' cells. Optical: every
 vendor's RPC behind 30 microradians and 10 m. Radar: the paper's Sentinel-1 points (20 x 20 x 10 at most), cut around
-their middle or thinned, on its own test points; and whole Sentinel-1 images of three swaths, mosaicked, their parts of
-the same shape. RMSE over col and row: a thin line a file, mean and standard deviation.
+their middle or thinned, on its own test points; and the fifteen swaths of five Sentinel-1 images, alone and mosaicked
+to whole images, their parts of the same shape. RMSE over col and row: a thin line a file, mean and standard deviation.
 
     python benchmarks/paper_figure.py --data DATA --rpcfit SITE_PACKAGES -o docs/figures/paper_figure.svg
     python benchmarks/paper_figure.py --data DATA --rpcfit SITE_PACKAGES --sensors swaths
@@ -31,12 +31,13 @@ from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc_points
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
-from barpc.sensor.sentinel1 import Annotation, mosaic, read_annotation
+from barpc.sensor.sentinel1 import Annotation, RangeDoppler, mosaic, read_annotation
 from benchmarks.fit import Peer, Space, grid_of, rms
 from tests.fit.cameras import Camera, vendor
 
 LENGTHS = (5, 7, 10, 15, 20, 30, 40, 50)
 SHARES = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+SENSORS = ["optical", "points", "single", "swaths"]
 LONGEST, RADAR_LENGTH = 50, 20
 """Grid lengths of the paper's experiment on areas, and of its radar points."""
 Fit = Callable[[Array, Array], RPC]
@@ -98,6 +99,15 @@ def three_swaths(data: Path, altitudes: tuple[float, float] | None = None) -> li
     return [Swaths(name, m, m.size, altitudes or m.alt_range) for name, m in models.items()]
 
 
+def single_swaths(data: Path, altitudes: tuple[float, float] | None = None) -> list[Swaths]:
+    """Every swath of these images alone."""
+    found = []
+    for path in sorted((data / "radar" / "s1_three_swaths").glob("*_iw?.xml")):
+        model = RangeDoppler.from_annotation(read_annotation(path))
+        found.append(Swaths(path.stem[17:], model, model.size, altitudes or model.alt_range))
+    return found
+
+
 def swath(camera: Swaths, length: int, share: float | None, space: Space) -> Points:
     """Control and check points of a part of the image around its middle, or of all of it."""
     full = np.array(camera.size)
@@ -137,14 +147,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of vendors' RPC files and radar points")
     parser.add_argument("--rpcfit", metavar="DIR", help="site-packages folder that holds rpcfit")
     parser.add_argument("--every", type=int, default=1, help="take every so many optical files")
-    parser.add_argument("--sensors", nargs="+", default=["optical", "points", "swaths"], help="which of these")
+    parser.add_argument("--sensors", nargs="+", default=SENSORS, choices=SENSORS, help="which of these")
     parser.add_argument("--altitudes", nargs=2, type=float, help="of the three swaths, in place of the scene's [m]")
     parser.add_argument("--space", choices=("image", "ground"), default="image", help="grids of the three swaths")
     parser.add_argument("--longest", type=int, default=LONGEST, help="largest grid length")
     parser.add_argument("-o", "--output", type=Path, help="figure to write (svg, png)")
     args = parser.parse_args()
     cameras = vendor(args.data)[:: args.every] if "optical" in args.sensors else []
-    images = three_swaths(args.data, args.altitudes and tuple(args.altitudes)) if "swaths" in args.sensors else []
+    altitudes = args.altitudes and tuple(args.altitudes)
+    kinds = {"three swaths": ("swaths", three_swaths), "one swath": ("single", single_swaths)}
+    images = {kind: make(args.data, altitudes) for kind, (name, make) in kinds.items() if name in args.sensors}
     fits: dict[str, Fit] = {"barpc": ours, "barpc, lcurve-joint": paper}
     if args.rpcfit:
         fits["rpcfit"] = Peer(args.rpcfit).fit
@@ -165,9 +177,9 @@ def main() -> None:
                     [error(fit, radar(args.data, n, s))] if s or n <= RADAR_LENGTH else [np.nan] for n, s in settings
                 ]
                 found["Sentinel-1"] = errors, ["points"]
-            if images:
-                errors = [[error(fit, swath(c, n, s, args.space)) for c in images] for n, s in settings]
-                found["three swaths"] = errors, [c.name for c in images]
+            for kind, models in images.items():
+                errors = [[error(fit, swath(c, n, s, args.space)) for c in models] for n, s in settings]
+                found[kind] = errors, [c.name for c in models]
             for sensor, (table, names) in found.items():
                 results[sensor, sweep, name] = np.array(table)
                 tell(f"{sensor}, {sweep}, {name}", values, np.array(table), names)

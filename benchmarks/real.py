@@ -1,12 +1,12 @@
-"""Real images, each set by barpc and by the peers that are installed: one table, a row a set and tool.
+"""Real images, each set by barpc and by the peers that are installed: one table, a row a set.
 
     python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--only SET]...
 
-A row has the epipolar offset of independent points (median and spread, 1.4826 MAD [px], the worst pair of a set), CPU
-seconds, peak memory, the exit code and the first sentence of the result. The points are those of the data's truth
-(SIFT or correlation without any RPC); of a --folder, and where the truth has none, SIFT matches made here, filtered by
-a fundamental matrix. The offset is measured by tools/epi_check.py beside the data, which has its own RPC formula and
-reads files through GDAL. Tools:
+A cell has the epipolar offset of independent points (median, spread 1.4826 MAD [px] and their number, the worst pair
+of a set), CPU seconds, peak memory, the exit code and the first sentence of the result. The points are those of the
+data's truth (SIFT or correlation without any RPC); of a --folder, and where the truth has none, SIFT matches made here,
+filtered by a fundamental matrix. The offset is measured by tools/epi_check.py beside the data, which has its own RPC
+formula and reads files through GDAL. Tools:
   delivered  the cameras as they are
   barpc      `barpc adjust` with its defaults, and what a set gives (GCPs, DEM, reference)
   cars       cars-bundleadjustment of the interpreter given, its .geom as written and half a pixel back
@@ -36,6 +36,8 @@ import numpy as np  # noqa: E402
 import rasterio  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+Features = tuple[np.ndarray, np.ndarray | None]
+"""Places (N, 2) [px] and descriptors of an image's keypoints."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,6 @@ class Scene:
 class Row:
     """One set by one tool."""
 
-    scene: str
     tool: str
     offset: str = ""
     cpu: float = np.nan
@@ -63,10 +64,10 @@ class Row:
     code: int = 0
     said: str = ""
 
-    def line(self) -> str:
+    def cell(self) -> str:
         """For the table."""
-        cost = f"{self.cpu:.1f} | {self.peak:.0f}" if np.isfinite(self.cpu) else "| "
-        return f"| {self.scene} | {self.tool} | {self.offset} | {cost} | {self.code} | {self.said} |"
+        cost = f"; {self.cpu:.1f} s, {self.peak:.0f} MB, exit {self.code}" if np.isfinite(self.cpu) else ""
+        return f"{self.offset}{cost}{f'; {self.said}' if self.said else ''}"
 
 
 def scenes(data: Path) -> Iterator[Scene]:
@@ -138,27 +139,37 @@ def delivered(scene: Scene, place: Path) -> tuple[dict[str, Path], list[str]]:
 
 def check_points(scene: Scene, place: Path) -> dict[tuple[str, str], Path]:
     """Files of check points by the stems of two images: given, or SIFT matches that one fundamental matrix explains."""
-    names = [path.stem for path in scene.images]
     if scene.ties:
         return {tuple(path.stem.split("__")[1:3]): path for path in scene.ties}  # type: ignore[misc]
-    sift, found = cv2.SIFT_create(8000), {}
-    seen = [sift.detectAndCompute(_grey(path), None) for path in scene.images]
-    for (i, (a, first)), (j, (b, second)) in itertools.combinations(enumerate(seen), 2):
-        if first is None or second is None:
-            continue
-        forth, back = (cv2.BFMatcher().knnMatch(*pair, k=2) for pair in ((first, second), (second, first)))
-        of_second = {m[0].queryIdx: m[0].trainIdx for m in back if len(m) == 2 and m[0].distance < 0.7 * m[1].distance}
-        good = [m[0] for m in forth if len(m) == 2 and m[0].distance < 0.7 * m[1].distance]
-        good = [m for m in good if of_second.get(m.trainIdx) == m.queryIdx]
-        if len(good) < 30:
-            continue
-        left, right = np.float64([a[m.queryIdx].pt for m in good]), np.float64([b[m.trainIdx].pt for m in good])
-        _, kept = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, 1.0, 0.999, 10000)
-        rows = np.hstack([left, right])[kept.ravel() > 0]
-        path = place / f"{names[i]}__{names[j]}.csv"
-        np.savetxt(path, rows, delimiter=",", header="col_a,row_a,col_b,row_b", comments="")
-        found[names[i], names[j]] = path
+    found, seen = {}, {path.stem: features(_grey(path)) for path in scene.images}
+    for (a, first), (b, second) in itertools.combinations(seen.items(), 2):
+        rows = matched(first, second)
+        if len(rows) >= 30:
+            _, kept = cv2.findFundamentalMat(rows[:, :2], rows[:, 2:], cv2.USAC_MAGSAC, 1.0, 0.999, 10000)
+            found[a, b] = place / f"{a}__{b}.csv"
+            header = "col_a,row_a,col_b,row_b"
+            np.savetxt(found[a, b], rows[kept.ravel() > 0], delimiter=",", header=header, comments="")
     return found
+
+
+def features(grey: np.ndarray) -> Features:
+    """SIFT keypoints and descriptors. OpenCV's default places all points a quarter of a pixel aside in col and row:
+    nothing between images of one orientation, half a pixel between images that are turned by 180 degrees.
+    """
+    points, described = cv2.SIFT_create(8000, enable_precise_upscale=True).detectAndCompute(grey, None)
+    return np.array([point.pt for point in points]).reshape(-1, 2), described
+
+
+def matched(first: Features, second: Features) -> np.ndarray:
+    """Rows of col, row, col, row [px] that are nearest to each other by far."""
+    if first[1] is None or second[1] is None:
+        return np.empty((0, 4))
+    sides = []
+    for one, other in ((first, second), (second, first)):
+        pairs = (pair for pair in cv2.BFMatcher().knnMatch(one[1], other[1], k=2) if len(pair) == 2)
+        sides.append({near.queryIdx: near.trainIdx for near, far in pairs if near.distance < 0.7 * far.distance})
+    both = np.array([(i, j) for i, j in sides[0].items() if sides[1].get(j) == i], int).reshape(-1, 2)
+    return np.hstack([first[0][both[:, 0]], second[0][both[:, 1]]])
 
 
 def _grey(path: Path) -> np.ndarray:
@@ -170,7 +181,7 @@ def _grey(path: Path) -> np.ndarray:
 
 def offsets(check: Path, cameras: dict[str, Path], points: dict[tuple[str, str], Path]) -> str:
     """Median and spread of the epipolar offset in the pair where the median is largest."""
-    worst: tuple[float, float] | None = None
+    worst: tuple[float, float, int] | None = None
     for (a, b), ties in points.items():
         if not (cameras.get(a, Path()).is_file() and cameras.get(b, Path()).is_file()):
             return "a camera is missing"
@@ -184,8 +195,8 @@ def offsets(check: Path, cameras: dict[str, Path], points: dict[tuple[str, str],
             return (run.stderr.strip().splitlines() or ["failed"])[-1][:80]
         said = json.loads(run.stdout)
         if worst is None or abs(said["median"]) > abs(worst[0]):
-            worst = said["median"], said["spread"]
-    return "no check points" if worst is None else f"{worst[0]:+.3f} +- {worst[1]:.3f}"
+            worst = said["median"], said["spread"], said["n"]
+    return "no check points" if worst is None else "{:+.3f} +- {:.3f} ({})".format(*worst)
 
 
 def by_barpc(scene: Scene, arguments: list[str], place: Path) -> tuple[Row, dict[str, Path]]:
@@ -193,7 +204,7 @@ def by_barpc(scene: Scene, arguments: list[str], place: Path) -> tuple[Row, dict
     out = place / "barpc"
     command = [sys.executable, "-m", "barpc", "-q", "adjust", *arguments, *scene.options, "-o", str(out)]
     cpu, peak, code = measured(command, ROOT, place / "barpc.log")
-    row = Row(scene.name, "barpc", "", cpu, peak, code)
+    row = Row("barpc", "", cpu, peak, code)
     if (out / "summary.json").is_file():
         told = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         row.said = "; ".join([told["status"], *told["reasons"][:1]])
@@ -206,7 +217,11 @@ def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -
     """cars-bundleadjustment, its cameras as written and with the half pixel that all have in common taken back."""
     program = Path(interpreter).parent / "cars-bundleadjustment"
     names = [Path(path).stem for path in arguments]
-    sensors = {name: {"image": path} for name, path in zip(names, arguments, strict=True)}
+    sensors: dict[str, dict[str, object]] = {}
+    for name, path in zip(names, arguments, strict=True):
+        beside = Path(path).with_suffix(".geom")
+        given = {"geomodel": str(beside)} if beside.is_file() else {}
+        sensors[name] = {"image": path, **given}
     pairing = [[names[0], name] for name in names[1:]]
     wanted = {"pairing": pairing, "separate": True, "nb_decimals": 0, "min_matches": 50}
     config = {
@@ -221,32 +236,35 @@ def by_cars(interpreter: str, scene: Scene, arguments: list[str], place: Path) -
     found = []
     for kind, back in (("as written", 0.0), ("half a pixel back", 0.5)):
         cameras = {name: place / f"cars_{back}/{name}.vrt" for name in names}
-        given = []
+        shifted = []
         for name, path in zip(names, arguments, strict=True):
             geom = next(iter(sorted((place / "cars").rglob(f"*{name}*.geom"))), None)
             if geom is not None:
-                _shift(geom, back)
-                given.append(f"{path},camera={geom}")
-        run = [sys.executable, "-m", "barpc", "-q", "convert", *given, "-o", str(place / f"cars_{back}")]
-        if given:
+                _shift(geom, path, back)
+                shifted.append(f"{path},camera={geom}")
+        run = [sys.executable, "-m", "barpc", "-q", "convert", *shifted, "-o", str(place / f"cars_{back}")]
+        if shifted:
             measured(run, ROOT, place / "cars_convert.log")
-        found.append((Row(scene.name, f"cars, {kind}", "", cpu, peak, code, said), cameras))
+        found.append((Row(f"cars, {kind}", "", cpu, peak, code, said), cameras))
     return found
 
 
-def _shift(geom: Path, pixels: float) -> None:
+def _shift(geom: Path, image: str, pixels: float) -> None:
+    """Take pixels from the places of an image in its .geom, and the crop's corner where it is that of a whole image."""
+    with rasterio.open(image) as file:
+        corner = (file.transform.c, file.transform.f) if file.rpcs is None and file.crs is None else (0.0, 0.0)
+    less = {"samp_off": pixels + corner[0], "line_off": pixels + corner[1]}
     lines = []
     for line in geom.read_text().splitlines():
         key, _, value = line.partition(":")
-        shifted = key.strip() in ("line_off", "samp_off")
-        lines.append(f"{key}: {float(value) - pixels!r}" if shifted else line)
+        lines.append(f"{key}: {float(value) - less[key.strip()]!r}" if key.strip() in less else line)
     geom.write_text("\n".join(lines) + "\n")
 
 
 def rows(scene: Scene, check: Path, cars: str | None) -> Iterator[Row]:
     """The rows of a set."""
     if scene.missing:
-        yield Row(scene.name, "-", said=scene.missing)
+        yield Row("delivered", said=scene.missing)
         return
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder, "set")
@@ -255,7 +273,7 @@ def rows(scene: Scene, check: Path, cars: str | None) -> Iterator[Row]:
         measure: Callable[[dict[str, Path]], str] = lambda found: offsets(check, found, points)  # noqa: E731
         if scene.gcps is not None:
             measure = lambda found: _of_gcps(check, found, scene.gcps)  # noqa: E731
-        yield Row(scene.name, "delivered", measure(cameras))
+        yield Row("delivered", measure(cameras))
         row, found = by_barpc(scene, arguments, place)
         yield replace(row, offset=measure(found))
         if cars is not None and len(arguments) > 1:
@@ -291,11 +309,12 @@ def main() -> None:
     tool = given.data.parent / "tools/epi_check.py"
     if not tool.is_file():
         sys.exit(f"{tool}, which measures the check points, is absent")
-    print("| set | tool | epipolar offset [px] | CPU [s] | peak [MB] | exit | result |\n|---|---|---|---|---|---|---|")
+    tools = ["delivered", "barpc", *(["cars, as written", "cars, half a pixel back"] if given.cars else [])]
+    print(f"| set | {' | '.join(tools)} |\n|{'---|' * (len(tools) + 1)}")
     for scene in (*scenes(given.data), *map(of_folder, given.folder)):
         if not given.only or any(part in scene.name for part in given.only):
-            for row in rows(scene, tool, given.cars):
-                print(row.line(), flush=True)
+            found = {row.tool: row.cell() for row in rows(scene, tool, given.cars)}
+            print(f"| {scene.name} | {' | '.join(found.get(name, '-') for name in tools)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -252,6 +252,9 @@ def image_paths(images: tuple[str, ...], image_list: str | None, keep_going: boo
         name = line.strip()
         if not name or line.startswith("#"):
             continue
+        image, choice, camera = name.partition(",camera=")
+        if choice and not is_url(camera):
+            name = f"{image}{choice}{folder / camera}"
         paths.append(name if is_url(name) else str(folder / name))
         file = name_of(paths[-1])
         if not (keep_going or is_url(name) or os.path.lexists(file) or glob.glob(file)):  # noqa: PTH207

@@ -25,6 +25,7 @@ from barpc.fit.points import (
     screened,
     widened,
 )
+from barpc.fit.poles import MIN_DENOMINATOR_RATIO
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import LEAST_RANGE
@@ -330,7 +331,7 @@ def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: 
         fits.append(attempt("gauss-newton"))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [
-        (bool(said), not fit.min_denominator > 0, float(np.linalg.norm(fit.rmse_ckp)))
+        (bool(said), not fit.min_denominator >= MIN_DENOMINATOR_RATIO, float(np.linalg.norm(fit.rmse_ckp)))
         for said, fit in zip(wrong, fits, strict=True)
     ]
     return _accepted(fits[rank.index(min(rank))], options, strict)

@@ -36,32 +36,34 @@ class Gap:
 
 
 def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[Seen]) -> IntArray:
-    """Count the keypoints that any partner sees, by an affine of its matches, in parts of columns and rows (2, PARTS).
+    """Count the keypoints that partners see, by an affine of their matches, in parts of columns and rows (2, PARTS).
 
-    Those count that are as strong as most that tie: on water noise is found, too.
+    Those count that are as strong as most that tie: on water noise is found, too; each by the share of them that its
+    partner ties, relative to the best partner's: few are found again in an image of another side or season.
     """
     keypoints = files.load()[0]
-    xy, seen = keypoints.xy, np.zeros(len(keypoints), dtype=bool)
-    for here, there, other in partners:
+    xy, weight = keypoints.xy, np.zeros(len(keypoints))
+    tied = [np.isin(xy @ [1.0, 1.0j], here @ [1.0, 1.0j]) for here, _, _ in partners]
+    ties = np.any([weight > 0.0, *tied], axis=0)
+    strong = keypoints.response >= np.quantile(keypoints.response[ties], LEVEL) if ties.any() else ~ties
+    for own, (here, there, other) in zip(tied, partners, strict=True):
         linear = np.linalg.lstsq(_affine_design(here), there, rcond=None)[0]
         relief = np.abs(there - _affine_design(here) @ linear).max(axis=0)  # it may hide what is so near an edge
         place = _affine_design(xy) @ linear
-        seen |= ((place >= relief) & (place <= np.array(other) - 1.0 - relief)).all(axis=1)
-    every = [here @ [1.0, 1.0j] for here, _, _ in partners]
-    ties = np.isin(xy @ [1.0, 1.0j], np.concatenate(every)) if every else seen
-    if ties.any():
-        seen &= keypoints.response >= np.quantile(keypoints.response[ties], LEVEL)
-    return in_parts(xy[seen], size)
+        seen = strong & ((place >= relief) & (place <= np.array(other) - 1.0 - relief)).all(axis=1)
+        weight[seen] = np.maximum(weight[seen], own[seen].sum() / max(int(seen.sum()), 1))
+    return in_parts(xy, size, weight / max(float(weight.max(initial=0.0)), np.finfo(float).tiny))
 
 
 def _affine_design(xy: Array) -> Array:
     return np.column_stack([np.ones(len(xy)), xy])
 
 
-def in_parts(xy: Array, size: tuple[int, int]) -> IntArray:
-    """Count points (N, 2) [px] in parts of columns and rows (2, PARTS)."""
+def in_parts(xy: Array, size: tuple[int, int], weight: Array | None = None) -> IntArray:
+    """Count points (N, 2) [px], each as one or by its weight, in parts of columns and rows (2, PARTS)."""
     ends = [(-0.5, length - 0.5) for length in size]
-    return np.stack([np.histogram(xy[:, axis], PARTS_PER_SIDE, ends[axis])[0] for axis in (0, 1)]).astype(np.int64)
+    counts = [np.histogram(xy[:, axis], PARTS_PER_SIDE, ends[axis], weights=weight)[0] for axis in (0, 1)]
+    return np.asarray(np.rint(np.stack(counts)), dtype=np.int64)
 
 
 def gap(detail: IntArray, ties: IntArray, size: tuple[int, int]) -> Gap | None:

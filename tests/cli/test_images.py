@@ -7,10 +7,13 @@ import shutil
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
+from barpc.cameras import open_camera
 from barpc.cli import main
+from barpc.cli.flags import image_paths
 from barpc.rpcio import write_rpc, write_rpc_copy
 from barpc.verbs.images import expanded
 from tests.rpcio.conftest import make_rpc, write_image
@@ -142,3 +145,29 @@ def test_another_folder_is_no_zarr_store(tmp_path, capsys):
     (tmp_path / "zarr").mkdir()
     assert run("info", tmp_path / "zarr") == 1
     assert "Zarr" not in capsys.readouterr().err
+
+
+# --- lists ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", [".rpc", ".json"])
+def test_a_list_names_cameras_in_a_folder_of_their_own_wherever_it_is_read(folder, tmp_path, monkeypatch, layout):
+    """As sets for bundle adjustment and neural surfaces come: rpcs/NAME.rpc, and JSON that holds more than an RPC."""
+    lines = []
+    for number in (1, 2):
+        path = folder / "rpcs" / f"img {number}{layout}"
+        write_rpc(make_rpc().crop(900, 900 + number), path)
+        if layout == ".json":
+            told = json.loads(path.read_text())
+            more = {"img": f"img {number}.tif", "min_alt": 5, "keypoints": {"2d_coordinates": [[1.0, 2.0]]}}
+            path.write_text(json.dumps({**more, "rpc": told.get("rpc", told)}))
+        lines.append(f"images/img {number}.tif,camera=rpcs/{path.name}")
+    lines.append(f"images/img 2.tif,camera={path.absolute()},size=60:40")
+    (folder / "images.txt").write_text("\n".join(lines))
+    (tmp_path / "elsewhere").mkdir()
+    ground = make_rpc().localize([[930.0, 910.0]], 100.0)
+    for place, listed in ((tmp_path / "elsewhere", folder / "images.txt"), (folder, "images.txt")):
+        monkeypatch.chdir(place)
+        cameras = [open_camera(path) for path in image_paths((), str(listed))]
+        found = [camera.model.project(ground)[0] for camera in cameras]
+        assert np.array(found) == pytest.approx(np.array([[30, 9], [30, 8], [30, 8]]), abs=1e-6)

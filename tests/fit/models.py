@@ -69,6 +69,38 @@ class Frame:
         return np.concatenate([ground[..., :2], alt[..., None]], axis=-1)
 
 
+@dataclass(frozen=True)
+class Radar:
+    """Zero-Doppler images of 12000 x 9000 px, 50 km wide, from a straight flight."""
+
+    lon: float
+    lat: float
+    heading: float
+    side: float  # 1: looks to the right
+    ground_range: bool = False
+
+    def localize(self, image: Array, alt: Array) -> Array:
+        image, alt = np.broadcast_arrays(image, np.asarray(alt)[..., None])
+        target = np.array([self.lon, self.lat, 0.0])
+        axes = enu_basis(target)
+        turn = np.radians(self.heading)
+        ahead = axes.T @ [np.sin(turn), np.cos(turn), 0.0]
+        right = axes.T @ [np.cos(turn), -np.sin(turn), 0.0]
+        up = axes[2]
+        start = ecef_from_ground(target) + 600e3 * up - self.side * 400e3 * right
+        along = ahead * (image[..., 1:] - 4500) * 1.5
+        far = 5e4 * (image[..., :1] / 12000 - 0.5)
+        slant = np.sqrt(600e3**2 + (400e3 + far) ** 2) if self.ground_range else 721e3 + 0.55 * far
+        angle = np.full(slant.shape, np.arctan2(400e3, 600e3))
+        for _ in range(12):  # the look angle at which the beam's circle has the altitude
+            place = start + along + slant * (np.sin(angle) * self.side * right - np.cos(angle) * up)
+            turned = slant * (np.cos(angle) * self.side * right + np.sin(angle) * up)
+            normal = enu_basis(ground_from_ecef(place))[..., 2, :]
+            rise = (turned * normal).sum(axis=-1, keepdims=True)
+            angle = angle + (alt[..., :1] - ground_from_ecef(place)[..., 2:]) / rise
+        return ground_from_ecef(place)
+
+
 def pushbroom(lat: float, size: tuple[int, int] = (20000, 20000), gsd: float = 0.5, incidence: float = 12.0):
     """An orbiting pushbroom over longitude 5.4 [deg]."""
     return fly(np.array([5.4, lat, 200.0]), Look(incidence=incidence, azimuth=100.0), size, gsd)

@@ -15,14 +15,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import FitError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.cameras import open_camera
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.refit import _bundle, wrong_axes, wrong_axes_of_grid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.simulate import Look, fly
 from tests.fit.cameras import adjusted, synthetic_rpc
-from tests.fit.models import Bent, Frame, hard, waves
+from tests.fit.models import Bent, Frame, Radar, hard, waves
 
 SIZE, ALTS = (12000, 9000), (0.0, 1000.0)
 EXCHANGED, NEGATIVE = "with longitude and latitude exchanged", "with the altitude's sign changed"
@@ -54,38 +54,6 @@ class Changed:
     def localize(self, image: Array, alt: Array) -> Array:
         alt = -alt if self.change == NEGATIVE else alt
         return self._ground(self.model.localize(self._image(image), alt))
-
-
-@dataclass(frozen=True)
-class Radar:
-    """Zero-Doppler images from a straight flight: X where it is abeam and `near` + col * spacing m away."""
-
-    lon: float
-    lat: float
-    heading: float
-    side: float  # 1: looks to the right
-    ground_range: bool = False
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        image, alt = np.broadcast_arrays(image, np.asarray(alt)[..., None])
-        target = np.array([self.lon, self.lat, 0.0])
-        axes = enu_basis(target)
-        turn = np.radians(self.heading)
-        ahead = axes.T @ [np.sin(turn), np.cos(turn), 0.0]
-        right = axes.T @ [np.cos(turn), -np.sin(turn), 0.0]
-        up = axes[2]
-        start = ecef_from_ground(target) + 600e3 * up - self.side * 400e3 * right
-        along = ahead * (image[..., 1:] - SIZE[1] / 2) * 1.5
-        far = 5e4 * (image[..., :1] / SIZE[0] - 0.5)
-        slant = np.sqrt(600e3**2 + (400e3 + far) ** 2) if self.ground_range else 721e3 + 0.55 * far
-        angle = np.full(slant.shape, np.arctan2(400e3, 600e3))
-        for _ in range(12):  # the look angle at which the beam's circle has the altitude
-            place = start + along + slant * (np.sin(angle) * self.side * right - np.cos(angle) * up)
-            turned = slant * (np.cos(angle) * self.side * right + np.sin(angle) * up)
-            normal = enu_basis(ground_from_ecef(place))[..., 2, :]
-            rise = (turned * normal).sum(axis=-1, keepdims=True)
-            angle = angle + (alt[..., :1] - ground_from_ecef(place)[..., 2:]) / rise
-        return ground_from_ecef(place)
 
 
 @cache

@@ -13,6 +13,7 @@ from barpc.fit import FitOptions, fit_rpc_points
 from barpc.pointio.correspondences import read_correspondences
 from barpc.rpcio import read_rpc
 from tests.fit.cameras import Camera, random_points, synthetic
+from tests.fit.models import Radar
 
 NOISY = FitOptions(tolerance=20.0)
 
@@ -90,6 +91,24 @@ def test_the_papers_radar_points_are_met_as_well_as_by_its_own_code(shared_data:
     assert fit.min_denominator >= 0.5
     paper = fit_rpc_points(*train, check=(test[0], test[1]), options=FitOptions(method="lcurve-joint"))
     assert paper.rmse_ckp == pytest.approx([1.073e-4, 1.102e-4], rel=2e-3)
+
+
+def middles(values: Array) -> Array:
+    return 0.5 * (values[1:] + values[:-1])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_few_points_of_a_wide_radar_image_are_fitted_as_well_as_by_the_paper(side: float) -> None:
+    """A denominator's first degree is 50 times an optical image's there, and the misfit is no noise."""
+    radar = Radar(11.0, 46.0, -12.0, side)  # 250 km wide
+    edges = [np.linspace(-24000, 36000, 7), np.linspace(-18000, 27000, 7), np.linspace(0, 3000, 10)]
+    points = [np.stack(np.meshgrid(*at, indexing="ij"), -1).reshape(-1, 3) for at in (edges, map(middles, edges))]
+    given, unseen = ((radar.localize(at[:, :2], at[:, 2]), at[:, :2]) for at in points)
+    error = {}
+    for method in ("auto", "lcurve-joint"):
+        fit = fit_rpc_points(*given, options=FitOptions(method=method), strict=False)
+        error[method] = rms(fit.rpc.project(unseen[0]) - unseen[1])
+    assert 0.95 * error["lcurve-joint"] <= error["auto"] <= 1.02 * error["lcurve-joint"]
 
 
 @pytest.mark.parametrize("highest", [1300.0, 5000.0])

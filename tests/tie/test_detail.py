@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from barpc.rasters.raster import open_raster
 from barpc.scene import View
 from barpc.sensor.geometry import footprint
 from barpc.tie import Area, Scope, find_tracks
-from barpc.tie.detail import PARTS_PER_SIDE, Gap, gap, in_parts
+from barpc.tie.detail import PARTS_PER_SIDE, Gap, gap, in_parts, seen_detail
+from barpc.tie.matchers.features import Keypoints
 from barpc.tie.tracks import TieResult
 
 from .conftest import write_image
@@ -210,3 +212,23 @@ def test_beside_an_area_of_interest_nothing_is_expected(render) -> None:
     ties = find_tracks(views, scope=Scope(area=half))
     assert ties.tracks.num_points > 50
     assert lacking(views, ties) == [None, None]
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_where_only_an_unlike_image_looks_fewer_ties_are_expected(lost: bool) -> None:
+    """One partner sees the left third and ties 40 % of its keypoints; one of another side sees all and ties 0.4 %."""
+    rng, size = np.random.default_rng(7), (600, 600)
+    xy = rng.uniform(0, 599, (6000, 2))
+    keypoints = Keypoints(xy, np.ones(6000), np.zeros(6000), rng.uniform(1, 2, 6000), np.zeros((6000, 4), np.uint8))
+    first = (xy[:, 0] < 200) & (rng.uniform(size=6000) < 0.4)
+    second = rng.uniform(size=6000) < 0.004
+    if lost:
+        first &= (xy[:, 1] < 250) | (xy[:, 1] > 350)
+    moved = xy + [400.0, 0.0], xy + rng.normal(0, 1, xy.shape)
+    partners = [(xy[one], there[one], size) for one, there in zip((first, second), moved, strict=True)]
+    detail = seen_detail(SimpleNamespace(load=lambda: (keypoints, None)), size, partners)  # type: ignore[arg-type]
+    found = gap(detail, in_parts(xy[first | second], size), size)
+    assert (found is not None) is lost
+    if found is not None:
+        assert (found.axis, found.found) == (1, pytest.approx(0, abs=8))
+        assert 240 <= found.first < found.last <= 360
