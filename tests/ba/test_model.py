@@ -474,6 +474,19 @@ def test_a_drift_of_another_degree_is_taken_where_it_may_be_and_something_smooth
         assert found.outcome.number == 1
 
 
+def test_a_camera_that_turns_faster_and_faster_is_followed_by_a_drift_of_a_further_degree() -> None:
+    """Of a pair: by one degree a sixth of its ties is cut, and check tie points are off by a pixel."""
+    made = simulate_block(2, 800, seed=3, attitude=10e-6, position=2.0)
+    of_it, xy = made.tracks.view == 1, made.tracks.xy.copy()
+    bend = 6.0 * ((2.0 * xy[:, 1] / made.views[1].size[1] - 1.0) ** 2 - 1.0 / 3.0)
+    found = adjust_tracks(made.views, replace(made.tracks, xy=xy + (of_it * bend)[:, None] * [1.0, 0.5]))
+    assert found.cameras.unknowns.drift == 2
+    assert found.findings == ()
+    assert found.cameras.unknowns.waves is None
+    assert (found.inlier | found.held_out).mean() > 0.98
+    assert found.held_out_rms.max() < 0.11
+
+
 @pytest.mark.parametrize(
     ("noise", "kept", "suspect"),
     [(1.49, [81, 100], False), (1.51, [100, 100], True), (1.0, [79, 100], True), (1.0, [100, 79], True)],
