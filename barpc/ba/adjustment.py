@@ -124,7 +124,7 @@ def _solved_adjustment(
         whole = replace(_adjustment(model, found, options, common), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
-        return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
+        return _with_apart(whole, apart, found, parts.inner, given)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
@@ -143,7 +143,7 @@ def _warn(outcome: Outcome) -> None:
 
 
 def _with_apart(
-    whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
+    whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block]
 ) -> Adjustment:
     """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
 
@@ -168,7 +168,7 @@ def _with_apart(
         new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
         new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
     if placed is not None:
-        new["inlier"][parts[0].order[placed.rows]] = placed.agree(limit)
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree(CRITICAL)
         measured = measure(found.problem, params, parts[1])
         new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
     scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
