@@ -20,7 +20,7 @@ from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.parameters.additional_parameters import OF_VIEWS, AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.solving.linear import ArrayStore, Blocks, Cholesky, woodbury
-from barpc.ba.solving.structure import dissect
+from barpc.ba.solving.structure import dissect, unknowns_of
 from barpc.base.errors import InputError, listed, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
@@ -230,7 +230,7 @@ class BlockPrior:
         order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
         cholesky = Cholesky(blocks, order, ArrayStore(_FACTOR_BYTES))
         cholesky.factorize(0.0)
-        index, information = (views[:, None] * q + np.arange(q)).ravel(), cholesky.last()
+        index, information = unknowns_of(views, q), cholesky.last()
         if self.less is None or not len(self.less):
             return Rest(self, index, cholesky.solve), information
         root, _ = woodbury(cholesky.solve, self.less)
@@ -255,7 +255,7 @@ class BlockPrior:
         known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
         # what the later run has beyond what it was given
         more = later.dense().copy()
-        there, here = _unknowns(known, q), _unknowns(at[known], q)
+        there, here = unknowns_of(known, q), unknowns_of(at[known], q)
         more[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
         moved = np.zeros_like(self.params)
         moved[at[known]] = later.params[known] - self.params[at[known]]
@@ -285,10 +285,6 @@ class BlockPrior:
             told=told,
             shown=later.shown,
         )
-
-
-def _unknowns(views: IntArray, size: int) -> IntArray:
-    return np.asarray((views[:, None] * size + np.arange(size)).ravel())
 
 
 def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Blocks:
@@ -389,7 +385,7 @@ def apply_prior(
     views = np.array([place[name] for name in prior.names])
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
-    index, told = _unknowns(views, size), np.zeros(len(names))
+    index, told = unknowns_of(views, size), np.zeros(len(names))
     told[views] = 0.0 if prior.told is None else prior.told
     return replace(cameras, mean=mean, sigma=sigma), JointPrior(
         index, prior.params.ravel(), prior.dense(), prior.scene, told, prior.shown

@@ -21,6 +21,7 @@ from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
+from barpc.ba.solving.structure import unknowns_of
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, KEPT, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
@@ -134,13 +135,13 @@ class _Posterior:
         views = np.flatnonzero(change.any(axis=1))
         if not len(views):
             return replace(self, sigma=prior.sigma)
-        rows = (views[:, None] * change.shape[1] + np.arange(change.shape[1])).ravel()
+        rows = unknowns_of(views, change.shape[1])
         if (len(self.updates) + 1) * change.size * len(rows) > 30 * KEPT:  # 240 MB
             return around.posterior(prior)
         columns = self._columns(rows)
         own, offset = columns.reshape(-1, len(rows))[rows], self.offset[views].ravel()
         system = np.eye(len(rows)) + change[views].reshape(-1, 1) * own
-        gain = np.linalg.solve(system, np.diag(change[views].ravel()))
+        gain = np.asarray(np.linalg.solve(system, np.diag(change[views].ravel())), dtype=np.float64)
         pulled = gain @ offset
         volume = np.linalg.slogdet(system)[1]
         volume += (_log_variance(prior.sigma, self.free) - _log_variance(self.sigma, self.free)).sum()
