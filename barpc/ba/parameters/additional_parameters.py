@@ -45,7 +45,7 @@ class AdditionalParameters:
 
     @property
     def of_views(self) -> dict[str, Array]:
-        """What every view has of its own: rows (N, ...) by their name."""
+        """The arrays with a row (N, ...) a view, by their name."""
         return {name: getattr(self, name) for name in OF_VIEWS}
 
     def select(self, views: IntArray) -> AdditionalParameters:
