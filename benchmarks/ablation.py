@@ -52,7 +52,7 @@ NOISE = 0.1  # px, of the tie points of every world
 MOVED = (
     "local:0", "local:2", "local:4", "local:6", "local:7", "swing:1", "swing:3", "wander:2", "foreign:0",
     "foreign:2", "two:1", "agile:0", "priors:1", "biased:1", "control:1", "glacier:0", "glacier:2", "fault:1",
-    "fault:2", "lost:0", "lost:2", "slide:1", "cloud:1", "dem:0", "plane:0",
+    "fault:2", "glacier:22", "lost:0", "lost:2", "lost:3", "lost:5", "slide:1", "cloud:1", "dem:0", "plane:0",
 )  # fmt: skip
 """Worlds of every family, for whole mechanisms."""
 _NEVER: dict[str, Any] = {

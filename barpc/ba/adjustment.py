@@ -118,13 +118,13 @@ def _solved_adjustment(
         found, parts, apart = model.found, model.parts, model.foreign
         heights = None
         if altimetry is not None:
-            found, heights = hold_by_altimetry(found, parts.inner, parts.outer, options, altimetry)
+            found, heights = hold_by_altimetry(found, parts.inner, parts.outer, altimetry)
         found.heights.warn()
         _warn(found.outcome)
         whole = replace(_adjustment(model, found, options, common), altimetry=heights)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
-        return _with_apart(whole, apart, found, parts.inner, given, CRITICAL)
+        return _with_apart(whole, apart, found, parts.inner, given)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
@@ -134,7 +134,7 @@ def _solved_adjustment(
 
 def _warn(outcome: Outcome) -> None:
     """Warn where the last solve did not settle, or its priors were not learnt."""
-    if not outcome.minimum.settled:
+    if not outcome.settled:
         message = f"the adjustment did not settle in {ITERATIONS} steps: check its residuals before its result is used"
         warnings.warn(message, BarpcWarning, stacklevel=4)
     if outcome.prior.failed:
@@ -143,7 +143,7 @@ def _warn(outcome: Outcome) -> None:
 
 
 def _with_apart(
-    whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block], limit: float
+    whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block]
 ) -> Adjustment:
     """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
 
@@ -168,7 +168,7 @@ def _with_apart(
         new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
         new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
     if placed is not None:
-        new["inlier"][parts[0].order[placed.rows]] = placed.agree(limit)
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree(CRITICAL)
         measured = measure(found.problem, params, parts[1])
         new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
     scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
@@ -184,7 +184,7 @@ def _adjustment(
     """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
     parts, outcome, final = model.parts, found.outcome, found.final
     block = parts.inner
-    covariance = outcome.minimum.covariance(found.problem.free)
+    covariance = outcome.covariance(found.problem.free)
     if common is not None:
         covariance = replace(covariance, shared=common.respond(outcome.problem, final, outcome.weight, covariance))
     method = covariance.factor.method
@@ -209,7 +209,7 @@ def _adjustment(
         noise=outcome.noise,
         cost_history=final.history,
         steps=len(final.history) - outcome.passes,
-        status=f"{outcome.passes} passes of cutting; {outcome.minimum.status}; {method} factorisation",
+        status=f"{outcome.passes} passes of cutting; {outcome.status}; {method} factorisation",
         cameras=cameras,
         covariance=covariance,
         gauge=gauge,

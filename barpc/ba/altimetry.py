@@ -28,7 +28,6 @@ from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solution import Solution, finished
 from barpc.ba.solving.covariance import Covariance
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.base.options import AdjustOptions
 from barpc.base.statistics import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE, robust_spread
 from barpc.scene import Altimetry, IntArray
 
@@ -47,9 +46,7 @@ class AltimetryTest:
     why_not: str = ""  # why they hold nothing, in words; empty where they do
 
 
-def hold_by_altimetry(
-    found: Solution, block: Block, outer: Block, options: AdjustOptions, given: Altimetry
-) -> tuple[Solution, AltimetryTest]:
+def hold_by_altimetry(found: Solution, block: Block, outer: Block, given: Altimetry) -> tuple[Solution, AltimetryTest]:
     """Return the block constrained by heights too; unchanged where these contradict each other or other control."""
     ties = np.flatnonzero(found.seen[: block.num_tracks])
     points = found.final.points
@@ -60,7 +57,7 @@ def hold_by_altimetry(
         local = (points[ties] - middle) @ enu.T
         place = (ecef_from_ground(given.lonlatalt) - middle) @ enu.T
         radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
-        covariance = found.outcome.minimum.covariance(found.problem.free)
+        covariance = found.outcome.covariance(found.problem.free)
         known = _covariance_without_heights(covariance, found, ties)
         margin = CRITICAL * np.sqrt(np.diag(known)[:2])
         low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
@@ -80,7 +77,7 @@ def hold_by_altimetry(
     placed = _registered_ties(
         points, ties[chosen], local[chosen, :2] / radius, enu, registered, np.sqrt(np.diag(known))
     )
-    tried = _solved_with_heights(found, block, outer, options, placed)
+    tried = _solved_with_heights(found, block, outer, placed)
     if is_better(found.after, tried.after, outer):
         return found, replace(test, why_not="held by them, the images would agree less with each other")
     return tried, test
@@ -136,14 +133,11 @@ def _registered_ties(
     return PointPrior(index, mean, np.tile(enu / own, (len(index), 1, 1)), common)
 
 
-def _solved_with_heights(
-    found: Solution, block: Block, outer: Block, options: AdjustOptions, placed: PointPrior
-) -> Solution:
+def _solved_with_heights(found: Solution, block: Block, outer: Block, placed: PointPrior) -> Solution:
     """Return the block solved again from where it ended, held at some tie points."""
     held = replace(found, heights=replace(found.heights, placed=placed))
-    state = found.final
-    rounds = Rounds(found.problem, block, state, held.heights, block.use, found.outcome)
-    return finished(held, found.problem, block, outer, options, rounds.run())
+    rounds = Rounds(found.problem, block, found.final, held.heights, block.use, found.outcome)
+    return finished(held, found.problem, block, outer, rounds.run())
 
 
 def _tested(registered: Registration, many: int) -> AltimetryTest:

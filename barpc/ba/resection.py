@@ -150,7 +150,7 @@ class _Sight:
             along = np.zeros((2, size + 2 * m, self.xy.shape[1]))
             along[:, :size] = projected.by_unknown
             along[0, size : size + m] = along[1, size + m :] = beside
-            image = projected.image + np.einsum("cqn,q->cn", along[:, size:], moved[size:])
+            image = projected.image + moved[size:] @ along[:, size:]
             residual = np.einsum("ncd,dn->nc", root, image - self.xy)
             residual[~np.isfinite(residual).all(axis=1)] = np.inf
             squared = (residual**2).sum(axis=1)
@@ -160,10 +160,10 @@ class _Sight:
             scale = SURELY * max(middle, 1.0) if np.isinf(scale) else max(SURELY, SHRINK * scale)
             near = np.flatnonzero(np.isfinite(squared))
             counted = geman_mcclure(squared[near] / (2.0 * scale**2))[1]
-            rows = np.einsum("ncd,dqn->ncq", root[near], along[:, :, near])
-            weighted = rows * counted[:, None, None]
-            matrix = np.einsum("ncp,ncq->pq", weighted, rows) + np.diag(sigma**-2.0)
-            gradient = np.einsum("ncq,nc->q", weighted, residual[near]) + moved / sigma**2
+            rows = root[near] @ along[:, :, near].transpose(2, 0, 1)
+            weighted = (rows * counted[:, None, None]).reshape(-1, len(sigma)).T
+            matrix = weighted @ rows.reshape(-1, len(sigma)) + np.diag(sigma**-2.0)
+            gradient = weighted @ residual[near].ravel() + moved / sigma**2
             moved = moved - np.linalg.solve(matrix, gradient)
         covariance = np.asarray(np.linalg.inv(matrix)[:size, :size], dtype=np.float64)
         return moved[:size], covariance, residual.T

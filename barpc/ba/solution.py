@@ -56,7 +56,7 @@ class Solution:
     @property
     def final(self) -> State:
         """The minimum."""
-        return self.outcome.minimum.state
+        return self.outcome.state
 
     @property
     def goes_on(self) -> bool:
@@ -159,15 +159,13 @@ def solve_block(
     if block.gcps.names and agreed is None:
         free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
         agreed, heights = _with_control(block, given, outcome)
-        outcome = Rounds(problem, block, outcome.minimum.state, heights, block.use, outcome).run()
+        outcome = Rounds(problem, block, outcome.state, heights, block.use, outcome).run()
     _check_inliers(outcome, block)
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
-    found = finished(first, problem, block, outer, options, outcome)
-    return (
-        found
-        if free is None or not found.heights.has_control
-        else _without_distorting_control(found, free, block, outer, options)
-    )
+    found = finished(first, problem, block, outer, outcome)
+    if free is None or not found.heights.has_control:
+        return found
+    return _without_distorting_control(found, free, block, outer, options)
 
 
 def _with_more_drift(
@@ -177,7 +175,7 @@ def _with_more_drift(
     problem, outcome = solved
     unknowns = problem.cameras.unknowns
     more = make_problem(block, options, unknowns.center, None, unknowns.drift + 1)
-    ended, weight = outcome.minimum.state, block.use / block.sigma
+    ended, weight = outcome.state, block.use / block.sigma
     there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
     there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
     tried = Rounds(more, block, there, heights, outcome.inlier).run()
@@ -207,7 +205,7 @@ def _without_distorting_control(
         return found
     assert found.agreed is not None
     none = Agreement(np.zeros_like(found.agreed.used), torn=(without.whole_rms, found.after.whole_rms))
-    return finished(replace(free, agreed=none), free.problem, block, outer, options, free.outcome)
+    return finished(replace(free, agreed=none), free.problem, block, outer, free.outcome)
 
 
 def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
@@ -220,25 +218,23 @@ def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> 
     gone = np.isin(np.arange(count), block.gcps.point) & ~np.isin(
         np.arange(count), block.point[mine & block.use] - first
     )
-    covariance = outcome.minimum.covariance(outcome.problem.free)
+    covariance = outcome.covariance(outcome.problem.free)
     faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
-    found = agreement(offsets_of(covariance, block, outcome.minimum.state.points, faint), told)
+    found = agreement(offsets_of(covariance, block, outcome.state.points, faint), told)
     found = replace(found, used=found.used & ~lost & ~gone)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
     return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))
 
 
-def finished(
-    found: Solution, problem: Problem, block: Block, outer: Block, options: AdjustOptions, outcome: Outcome
-) -> Solution:
+def finished(found: Solution, problem: Problem, block: Block, outer: Block, outcome: Outcome) -> Solution:
     """Complete the rounds of a problem: control tested, held-out tracks measured; the start is that of `found`."""
     tested = None
     if found.agreed is not None:
-        covariance, points = outcome.minimum.covariance(problem.free), outcome.minimum.state.points
+        covariance, points = outcome.covariance(problem.free), outcome.state.points
         faint = downweighting(block, found.heights)[block.num_tracks : block.num_known]
         tested = control_test(covariance, points, block.num_tracks, block.gcps, found.agreed, faint)
-    after = measure(problem, outcome.minimum.state.params, outer)
+    after = measure(problem, outcome.state.params, outer)
     return replace(found, problem=problem, outcome=outcome, after=after, tested=tested)
 
 

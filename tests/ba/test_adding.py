@@ -99,7 +99,7 @@ def test_what_a_later_run_found_is_put_where_it_belongs(less: int) -> None:
         information=information,
         center=np.vstack([known.center, np.ones((1, 3))]),
         told=np.ones(4),
-        edges=np.zeros((4, 0)), strips=np.zeros((4, 0, 5)), periods=np.zeros((4, 0)),
+        layout=None,
         rest=None,
     )  # fmt: skip
     grown = known.joined(later)

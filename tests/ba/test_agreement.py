@@ -346,7 +346,7 @@ def test_control_stays_where_images_are_worse_with_it_by_no_more_than_they_tell(
     monkeypatch.setattr(solution, "finished", lambda first, *_: first)
     found: Any = SimpleNamespace(after=SimpleNamespace(whole_rms=held), agreed=Agreement(np.ones(3, dtype=bool)))
     state = SimpleNamespace(params=np.zeros((4, 2)))
-    alone = Solution(*[None] * 4, SimpleNamespace(minimum=SimpleNamespace(state=state)), *[None] * 3, {})
+    alone = Solution(*[None] * 4, SimpleNamespace(state=state), *[None] * 3, {})
     ended: Any = solution._without_distorting_control(found, alone, None, None, AdjustOptions(noise_floor=0.1))  # type: ignore[arg-type]
     assert (ended is not found) == let_go
     if let_go:

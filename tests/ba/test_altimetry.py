@@ -15,7 +15,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, altimetry
+from barpc.ba import Adjustment, adjust_tracks, altimetry
 from barpc.ba.constraints import registration
 from barpc.ba.constraints.registration import (
     PATCH_POINTS,
@@ -411,13 +411,13 @@ def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch
     monkeypatch.setattr(altimetry, "_registered_ties", lambda *given: held.append(given))
     monkeypatch.setattr(altimetry, "_solved_with_heights", lambda *_: SimpleNamespace(after="after"))
     monkeypatch.setattr(altimetry, "is_better", lambda one, other, outer: False)
-    outcome = SimpleNamespace(minimum=SimpleNamespace(covariance=lambda free: None))
+    outcome = SimpleNamespace(covariance=lambda free: None)
     found: Any = SimpleNamespace(
         seen=seen, final=SimpleNamespace(points=points), outcome=outcome, problem=SimpleNamespace(free=None),
         heights=SimpleNamespace(dem="a DEM" if whole else None), after="before",
     )  # fmt: skip
     block: Any = SimpleNamespace(num_tracks=60)
-    tried, said = altimetry.hold_by_altimetry(found, block, block, AdjustOptions(), heights)
+    tried, said = altimetry.hold_by_altimetry(found, block, block, heights)
     assert said == "47 of 60"
     assert tried.after == "after"
     ((_, ties, at, *_),) = held

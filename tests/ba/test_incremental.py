@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse as sp
 
 from barpc.ba.constraints.incremental import BlockPrior, apply_prior
+from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, EarlierScene
 from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
@@ -44,28 +45,28 @@ def test_a_prior_is_read_as_it_was_written(tmp_path) -> None:
 
 def test_strips_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) -> None:
     strips = np.random.default_rng(3).uniform(0.0, 9.0, (2, 3, 5))
-    replace(prior_of(), edges=np.zeros((2, 0)), strips=strips).save(tmp_path / "prior.npz")
+    replace(prior_of(), layout=AdditionalParameters(0, strips=strips)).save(tmp_path / "prior.npz")
     found = BlockPrior.load(tmp_path / "prior.npz").waves(("c", "new", "a"))
     assert found is not None
     np.testing.assert_array_equal(found.strips[[2, 0]], strips)
     assert np.isinf(found.strips[1]).all()
     assert found.size == 6
     for damaged in (strips[:1], strips[..., :4], strips[0]):
-        replace(prior_of(), strips=damaged).save(tmp_path / "prior.npz")
+        replace(prior_of(), layout=AdditionalParameters(0, strips=damaged)).save(tmp_path / "prior.npz")
         with pytest.raises(InputError, match="not the prior of an adjusted block"):
             BlockPrior.load(tmp_path / "prior.npz")
 
 
 def test_swings_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) -> None:
     periods = np.array([[200.0, 80.5], [600.0, np.inf]])
-    replace(prior_of(), edges=np.zeros((2, 0)), periods=periods).save(tmp_path / "prior.npz")
+    replace(prior_of(), layout=AdditionalParameters(0, periods=periods)).save(tmp_path / "prior.npz")
     found = BlockPrior.load(tmp_path / "prior.npz").waves(("c", "new", "a"))
     assert found is not None
     np.testing.assert_array_equal(found.periods[[2, 0]], periods)
     assert np.isinf(found.periods[1]).all()
     assert found.size == 8
     for damaged in (periods[:1], periods[0], -periods, periods * np.nan):
-        replace(prior_of(), periods=damaged).save(tmp_path / "prior.npz")
+        replace(prior_of(), layout=AdditionalParameters(0, periods=damaged)).save(tmp_path / "prior.npz")
         with pytest.raises(InputError, match="not the prior of an adjusted block"):
             BlockPrior.load(tmp_path / "prior.npz")
 
@@ -239,25 +240,28 @@ def test_a_sparse_matrix_reads_nothing_but_its_own(tmp_path, name: str, change: 
     ],
 )
 def test_a_layout_of_splines_that_no_block_has_is_refused(tmp_path, splines: int, edges: Any, whole: bool) -> None:
-    given = replace(prior_of(size=5), splines=splines, edges=edges, radars=("c",))
+    given = replace(prior_of(size=5), layout=AdditionalParameters(splines, edges), radars=("c",))
     given.save(tmp_path / "prior.npz")
     if not whole:
         with pytest.raises(InputError, match="do not go together"):
             BlockPrior.load(tmp_path / "prior.npz")
         return
     read = BlockPrior.load(tmp_path / "prior.npz")
-    assert (read.splines, read.radars) == (splines, ("c",))
-    np.testing.assert_array_equal(read.edges, edges)
+    assert read.layout is not None
+    assert (read.layout.count, read.radars) == (splines, ("c",))
+    np.testing.assert_array_equal(read.layout.edges, edges)
 
 
 def test_views_go_on_with_their_own_detectors_and_new_ones_with_none() -> None:
-    prior = replace(prior_of(), splines=9, edges=np.array([[5.0, np.inf], [7.0, 9.0]]))
+    edges = np.array([[5.0, np.inf], [7.0, 9.0]])
+    prior = replace(prior_of(), layout=AdditionalParameters(9, edges))
     waves = prior.waves(("new", "c", "a"))
     assert waves is not None
     assert waves.count == 9
     np.testing.assert_array_equal(waves.edges, [[np.inf] * 2, [7.0, 9.0], [5.0, np.inf]])
-    for edges, splines, some in ((None, 9, False), (np.zeros((2, 0)), 0, False), (np.zeros((2, 0)), 9, True)):
-        assert (replace(prior, edges=edges, splines=splines).waves(("a",)) is not None) == some
-    only_edges = replace(prior, splines=0).waves(("a",))
+    none = np.zeros((2, 0))
+    for layout, some in ((None, False), (AdditionalParameters(0, none), False), (AdditionalParameters(9, none), True)):
+        assert (replace(prior, layout=layout).waves(("a",)) is not None) == some
+    only_edges = replace(prior, layout=AdditionalParameters(0, edges)).waves(("a",))
     assert only_edges is not None
     assert only_edges.count == 0

@@ -25,6 +25,8 @@ from barpc.base.statistics import LEVEL
 from barpc.scene import BoolArray, GroundPoints, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
+from benchmarks.worlds import DEM_AS_STATED, judge
+from benchmarks.worlds_families import make
 from tests.lanes import rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
@@ -356,3 +358,15 @@ def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
 def test_least_squares_that_were_asked_for_have_no_group() -> None:
     block, tracks, _ = drifting(3, 600, 0.3, 2.0)
     assert not adjust_tracks(block.views, tracks, AdjustOptions(loss="linear")).moving.any()
+
+
+@pytest.mark.slow
+def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() -> None:
+    """A pair of which 42 % moves by 2.6 m: a drift of degree 2 leaves 20 m of the scene's shape, and no group."""
+    world = make("glacier", 22)
+    found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
+    assert [one.kind for one in found.findings] == ["moving_objects"]
+    assert found.cameras.unknowns.drift == 1
+    judged = judge(world, found.sensors)
+    assert judged.left < 0.03
+    assert judged.shape < 0.3

@@ -15,7 +15,7 @@ from barpc.ba.parameters.priors import CameraPrior
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _weighted_median
 from barpc.ba.solving.problem import Problem
-from barpc.ba.solving.solve import State
+from barpc.ba.solving.solve import Minimum, State
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
 from tests.constants import chosen
@@ -264,7 +264,7 @@ def passes(
 
     class Scripted(rounds.Rounds):
         def __init__(self) -> None:
-            found: Any = SimpleNamespace(covariance=lambda free: SimpleNamespace(is_large=False))
+            nothing: Any = None
             self.problem = Problem(None, None, None, learnt(0), None)  # type: ignore[arg-type]
             self.state: Any = SimpleNamespace(points=None)
             self.options, self.everything, self.use = options, every, every
@@ -281,7 +281,8 @@ def passes(
             self.variances: Any = SimpleNamespace(learnt=lambda *_: (learnt(self.passes), SimpleNamespace(shared=1.0)))
             self.smooth: Any = SimpleNamespace(test_neighbours=lambda *_: "smooth")
             self.residual = self.weight = np.zeros(1)
-            self.found = found
+            covariance: Any = SimpleNamespace(is_large=False)
+            self.found = Minimum(nothing, nothing, _known=[covariance])
 
         def _search(self) -> None:
             pass

@@ -278,7 +278,7 @@ def combined(*rows: tuple[str, int, float]) -> _SearchState:
     """A combination of terms, each of a kind and view, with what it gains."""
     seen = residuals_of(tracks=30)
     taken = tuple(_Taken(placed(kind, view), gain, 1.0, "", (), seen) for kind, view, gain in rows)
-    return _SearchState(seen, seen.base, taken)
+    return _SearchState(seen, taken)
 
 
 def placed(kind: str, view: int = 0) -> Term:

@@ -84,6 +84,14 @@ class Block:
         out[self.order] = rows
         return out
 
+    def groups(self, rows: BoolArray) -> list[list[int]]:
+        """Return the groups into which views fall that points of some observations (K,) connect, the largest first."""
+        order = np.flatnonzero(rows)
+        order = order[np.lexsort((self.view[order], self.point[order]))]
+        same = np.flatnonzero(np.diff(self.point[order]) == 0)
+        pairs = np.unique(np.column_stack([self.view[order[same]], self.view[order[same + 1]]]), axis=0)
+        return connected_groups(len(self.views), [(int(i), int(j)) for i, j in pairs])
+
     def first_points(self) -> Array:
         """Return the points (P, 3), ECEF [m], on the first observing view's rays at its middle altitude."""
         return self._first_points.copy()

@@ -19,7 +19,7 @@ import scipy.linalg as la
 from barpc.ba.constraints.ground import FIRST_PLACED
 from barpc.ba.parameters.priors import EarlierScene, JointPrior
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.solving.normal import Reduced, solve_lower
+from barpc.ba.solving.normal import Reduced, by_cameras, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, parts
@@ -129,23 +129,16 @@ def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, sha
     """Return the motions by the cameras' unknowns (10, N q), their covariance (10, 10) with cameras known; `pick`
     (10, n, 3) is their derivative by the moves of points.
     """
-    reduced = covariance.reduced
-    structure = reduced.structure
-    count, q = len(MOTIONS), covariance.num_unknowns
-    index = np.flatnonzero(use)
-    lower = reduced.lower[:, index]
-    whitened = np.zeros((len(use), 3, count))  # L^-1 of each motion's weights: dX = -L^-T Y dp
-    whitened[index] = solve_lower(lower, pick.transpose(2, 0, 1)).transpose(2, 0, 1)
-    rows = np.flatnonzero(use[structure.point])
-    by_view = np.empty((count, structure.num_views, q))
-    for v, of_view in enumerate(np.split(rows, np.searchsorted(rows, structure.bounds[1:-1]))):
-        of_points = whitened[structure.point[of_view]].reshape(-1, count)
-        by_view[:, v] = -of_points.T @ reduced.cross[of_view].reshape(-1, q)
-    by_camera = by_view.reshape(count, -1)
-    flat = whitened[index].reshape(-1, count)
+    reduced, index = covariance.reduced, np.flatnonzero(use)
+    # L^-1 of each motion's weights: dX = -L^-T Y dp
+    whitened = solve_lower(reduced.lower[:, index], pick.transpose(2, 0, 1)).transpose(2, 0, 1)
+    by_camera = by_cameras(reduced.structure, reduced.cross, index, whitened)
+    flat = whitened.reshape(-1, len(MOTIONS))
     own = share * flat.T @ flat
     if reduced.common is not None:
-        moved = np.einsum("qic,qim->cm", whitened[reduced.common.index], reduced.common.cross)
+        counted = np.isin(reduced.common.index, index)
+        at = np.searchsorted(index, reduced.common.index[counted])
+        moved = np.einsum("qic,qim->cm", whitened[at], reduced.common.cross[counted])
         shared = -la.solve_triangular(reduced.common.upper, moved.T, trans="T").T
         by_camera, own = by_camera - shared @ reduced.common.by_camera, own + shared @ shared.T
     return by_camera, own

@@ -17,10 +17,10 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from barpc.ba.constraints.gauge import MOTIONS
-from barpc.ba.parameters.additional_parameters import AdditionalParameters
+from barpc.ba.parameters.additional_parameters import OF_VIEWS, AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.solving.linear import ArrayStore, Blocks, Cholesky, woodbury
-from barpc.ba.solving.structure import dissect
+from barpc.ba.solving.structure import dissect, unknowns_of
 from barpc.base.errors import InputError, listed, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
@@ -62,8 +62,8 @@ class BlockPrior:
         Camera centres [m], ECEF.
     less : (m, n q)
         Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
-    splines, edges, strips, periods : int, (n, C), (n, M, 5), (n, M)
-        Layout of the unknowns in the image (see `barpc.ba.parameters.additional_parameters`).
+    layout : AdditionalParameters or None
+        Of the unknowns in the image; None: there are none.
     radars : tuple of str
         Views of the block whose unknowns are a radar's clocks.
     scene : EarlierScene or None
@@ -83,11 +83,8 @@ class BlockPrior:
     information: Array | Blocks
     center: Array
     less: Array | None = None
-    splines: int = 0
-    edges: Array | None = None
+    layout: AdditionalParameters | None = None
     radars: tuple[str, ...] = ()
-    strips: Array | None = None
-    periods: Array | None = None
     scene: EarlierScene | None = None
     told: Array | None = None
     shown: Array | None = None
@@ -95,30 +92,18 @@ class BlockPrior:
 
     def waves(self, names: tuple[str, ...]) -> AdditionalParameters | None:
         """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
-        of_views = self._edges, self._strips, self._periods
-        if self.edges is None or not (self.splines or any(one.size for one in of_views)):
+        if not self._layout.size:
             return None
         place = {name: i for i, name in enumerate(self.names)}
-        old = np.array([place.get(name, len(place)) for name in names])
-        return AdditionalParameters(
-            self.splines, *(np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)])[old] for x in of_views)
-        )
+        return self._layout.select(np.array([place.get(name, -1) for name in names]))
 
     @property
-    def _edges(self) -> Array:
-        return np.zeros((len(self.names), 0)) if self.edges is None else self.edges
-
-    @property
-    def _strips(self) -> Array:
-        return np.zeros((len(self.names), 0, 5)) if self.strips is None else self.strips
-
-    @property
-    def _periods(self) -> Array:
-        return np.zeros((len(self.names), 0)) if self.periods is None else self.periods
+    def _layout(self) -> AdditionalParameters:
+        return AdditionalParameters(0, np.zeros((len(self.names), 0))) if self.layout is None else self.layout
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
-        arrays = {name: getattr(self, name) for name in ("params", "center")}
+        arrays = {name: getattr(self, name) for name in ("params", "center")} | self._layout.of_views
         if isinstance(self.information, np.ndarray):
             arrays["information"] = self.information
         else:
@@ -133,11 +118,8 @@ class BlockPrior:
                 names=np.array(self.names),
                 model=self.model,
                 drift=self.drift,
-                splines=self.splines,
+                splines=self._layout.count,
                 radars=np.array(self.radars, dtype=np.str_),
-                edges=self._edges,
-                strips=self._strips,
-                periods=self._periods,
                 **arrays,
             )
 
@@ -156,22 +138,18 @@ class BlockPrior:
             params = file["params"]
             matrix = file["information"] if "information" in file else _read_blocks(file, *params.shape)
             less = None if "information" in file else file["less"]
-            splines, edges = int(file.get("splines", 0)), file.get("edges", np.zeros((len(names), 0)))
+            of_views = {name: file.get(name, np.zeros((len(names), *shape))) for name, shape in OF_VIEWS.items()}
+            layout = AdditionalParameters(int(file.get("splines", 0)), **of_views)
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             radars = tuple(str(name) for name in file.get("radars", ()))
-            strips = file.get("strips", np.zeros((len(names), 0, 5)))
-            periods = file.get("periods", np.zeros((len(names), 0)))
             scene = None
             if "scene_radius" in file:
                 by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
                 scene = EarlierScene(by_unknown, own, float(radius))
             shown = file.get("shown")
-            if (
-                shown is not None and len(shown) == 3 + known[1]
-            ):  # of release 0.3: what is along lines of sight came later
+            if shown is not None and len(shown) == 3 + known[1]:  # of release 0.3, which learnt nothing of turns
                 shown = np.vstack([shown, np.zeros(shown.shape[1])])
-            learnt = file.get("told"), shown
-            prior = cls(names, *known, splines, edges, radars, strips, periods, scene, *learnt)
+            prior = cls(names, *known, layout, radars, scene, file.get("told"), shown)
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
         if not prior._is_whole():
@@ -197,15 +175,7 @@ class BlockPrior:
             and all(array.dtype == np.float64 for array in arrays.values())
             and all(_is_square_finite(array) for array in arrays.values())
             and bool((diagonal > 0).all())
-            and self._edges.ndim == 2
-            and len(self._edges) == n
-            and self._strips.shape[::2] == (n, 5)
-            and self._strips.dtype == np.float64
-            and self._periods.ndim == 2
-            and len(self._periods) == n
-            and self._periods.dtype == np.float64
-            and bool((self._periods > 0.0).all())
-            and (self.splines == 0 or 4 <= self.splines <= q)
+            and self._layout.is_whole(n, q)
             and (self.scene is None or _is_scene(self.scene, n * q))
             and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
             and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_counted(self.shown)))
@@ -248,9 +218,7 @@ class BlockPrior:
             information=information,
             center=self.center[views],
             less=None,
-            edges=self._edges[views],
-            strips=self._strips[views],
-            periods=self._periods[views],
+            layout=self._layout.select(views),
             radars=tuple(name for name in self.radars if name in wanted),
             scene=scene,
             told=None if self.told is None else self.told[views],
@@ -264,7 +232,7 @@ class BlockPrior:
         order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
         cholesky = Cholesky(blocks, order, ArrayStore(_FACTOR_BYTES))
         cholesky.factorize(0.0)
-        index, information = (views[:, None] * q + np.arange(q)).ravel(), cholesky.last()
+        index, information = unknowns_of(views, q), cholesky.last()
         if self.less is None or not len(self.less):
             return Rest(self, index, cholesky.solve), information
         root, _ = woodbury(cholesky.solve, self.less)
@@ -289,7 +257,7 @@ class BlockPrior:
         known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
         # what the later run has beyond what it was given
         more = later.dense().copy()
-        there, here = _unknowns(known, q), _unknowns(at[known], q)
+        there, here = unknowns_of(known, q), unknowns_of(at[known], q)
         more[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
         moved = np.zeros_like(self.params)
         moved[at[known]] = later.params[known] - self.params[at[known]]
@@ -313,18 +281,12 @@ class BlockPrior:
             information=_extended(whole, more, place, len(new)),
             center=np.concatenate([whole.center, later.center[new]]),
             less=np.pad(np.zeros((0, whole.params.size)) if whole.less is None else whole.less, ((0, 0), (0, wider))),
-            edges=np.concatenate([whole._edges, later._edges[new]]),
-            strips=np.concatenate([whole._strips, later._strips[new]]),
-            periods=np.concatenate([whole._periods, later._periods[new]]),
+            layout=whole._layout.joined(later._layout.select(new)),
             radars=(*whole.radars, *(name for name in later.radars if name in names)),
             scene=scene,
             told=told,
             shown=later.shown,
         )
-
-
-def _unknowns(views: IntArray, size: int) -> IntArray:
-    return np.asarray((views[:, None] * size + np.arange(size)).ravel())
 
 
 def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Blocks:
@@ -425,7 +387,7 @@ def apply_prior(
     views = np.array([place[name] for name in prior.names])
     mean, sigma = cameras.mean.copy(), cameras.sigma.copy()
     mean[views], sigma[views] = prior.params, np.inf
-    index, told = _unknowns(views, size), np.zeros(len(names))
+    index, told = unknowns_of(views, size), np.zeros(len(names))
     told[views] = 0.0 if prior.told is None else prior.told
     return replace(cameras, mean=mean, sigma=sigma), JointPrior(
         index, prior.params.ravel(), prior.dense(), prior.scene, told, prior.shown

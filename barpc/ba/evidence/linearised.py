@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -123,6 +124,12 @@ class Linear:
         """`by_unknown` observation by observation (K, 2, q)."""
         return np.ascontiguousarray(self.by_unknown.transpose(2, 0, 1))
 
+    @cached_property
+    def bounds(self) -> list[int]:
+        """Where the observations of each view begin (N,), and the end."""
+        found: list[int] = np.searchsorted(self.view, np.arange(self.views + 1)).tolist()
+        return found
+
     @property
     def taking_part(self) -> BoolArray:
         """Observations (K,) of tracks."""
@@ -133,7 +140,9 @@ class Linear:
 
     def left(self, step: Array) -> Array:
         """Return the residuals (2, K) after a step (N, q) of the cameras."""
-        left: Array = self.residual + np.einsum("cqk,kq->ck", self.by_unknown, step[self.view])
+        left, by_row = self.residual.copy(), self.by_row.reshape(-1, self.shape[1])
+        for v, (a, b) in enumerate(pairwise(self.bounds)):
+            left[:, a:b] += (by_row[2 * a : 2 * b] @ step[v]).reshape(-1, 2).T
         return left
 
     def thinned(self, most: int) -> Linear:

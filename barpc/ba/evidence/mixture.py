@@ -447,9 +447,9 @@ class Mixture:
             pull = kind.pull / noise**2
             pulls += pull
             out[camera : camera + beside.shape[1]] += np.einsum("cek,ck->e", beside, pull)
-        of_each = np.einsum("cqk,ck->qk", linear.by_unknown, pulls)
-        of_views = [np.bincount(linear.view, one, minlength=linear.views) for one in of_each]
-        out[:camera] += np.stack(of_views, axis=1).ravel()
+        by_row, flat = linear.by_row.reshape(-1, linear.shape[1]), pulls.T.ravel()
+        for v, (a, b) in enumerate(pairwise(linear.bounds)):
+            out[v * linear.shape[1] : (v + 1) * linear.shape[1]] += flat[2 * a : 2 * b] @ by_row[2 * a : 2 * b]
         return out
 
     def _curvature(self, weights: Sequence[Array], beside: Array) -> Array:

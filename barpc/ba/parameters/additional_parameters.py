@@ -8,7 +8,7 @@ an image with a known period. How large all of them are in a view is learnt (`ba
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +21,7 @@ from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_an
 
 MIN_SPLINES = 7  # splines
 FIRST_SIGMA = 1.0  # px: a prior's standard deviation before anything is known
+OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row a view: shapes of empty rows
 DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope and a bend: splines are apart from them
 
 
@@ -35,6 +36,39 @@ class AdditionalParameters:
     strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (N, M) periods of the rows' swings [px]; infinite where a view has fewer
     periods: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        views = max(map(len, self.of_views.values()))
+        for name, shape in OF_VIEWS.items():
+            if not len(getattr(self, name)):
+                object.__setattr__(self, name, np.zeros((views, *shape)))
+
+    @property
+    def of_views(self) -> dict[str, Array]:
+        """The arrays with a row (N, ...) a view, by their name."""
+        return {name: getattr(self, name) for name in OF_VIEWS}
+
+    def select(self, views: IntArray) -> AdditionalParameters:
+        """Return the layout of some views (n,); -1: of a new one, which has splines alone."""
+        rows = {name: np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)]) for name, x in self.of_views.items()}
+        return AdditionalParameters(self.count, **{name: one[views] for name, one in rows.items()})
+
+    def joined(self, others: AdditionalParameters) -> AdditionalParameters:
+        """Return the layout of these views and, behind them, of others."""
+        both = self.of_views.items(), others.of_views.values()
+        rows = {name: np.concatenate([x, y]) for (name, x), y in zip(*both, strict=True)}
+        return AdditionalParameters(self.count, **rows)
+
+    def is_whole(self, views: int, size: int) -> bool:
+        """Return whether its arrays are those of so many views, of `size` unknowns each."""
+        own = self.of_views.values()
+        return (
+            [one.ndim for one in own] == [2, 3, 2]
+            and self.strips.shape[2] == 5
+            and all(len(one) == views and one.dtype == np.float64 for one in own)
+            and bool((self.periods > 0.0).all())
+            and (self.count == 0 or 4 <= self.count <= size)
+        )
 
     @cached_property
     def _of_splines(self) -> Array:
@@ -144,22 +178,20 @@ class AdditionalParameters:
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
         """Return the correction of a view with the unknowns (size,)."""
-        (m, s, num, swings), (_, of_steps, of_strips, of_swings) = self.parts, self.kinds
-        coeffs = self._of_splines @ params[: 2 * m].reshape(2, m).T if m else np.zeros((0, 2))
-        found = RowSpline(coeffs, row_offset, row_scale)
-        known = np.isfinite(self.edges[view]) if s else np.zeros(0, dtype=bool)
-        if known.any():
-            steps = self._of_steps @ params[of_steps].reshape(2, s).T
-            found = replace(found, edges=self.edges[view][known], steps=steps[: known.sum() + 1])
-        if num:
-            there = np.isfinite(self.strips[view, :, 1])
-            moved = params[of_strips].reshape(2, num).T
-            found = replace(found, strips=self.strips[view][there], moved=moved[there])
-        if swings:
-            there = np.isfinite(self.periods[view])
-            swung = params[of_swings].reshape(2, 2, -1).T  # swing, cosine or sine, coordinate
-            found = replace(found, periods=self.periods[view][there], swings=swung[there])
-        return found
+        splines, steps, moved, swung = (params[part].reshape(2, -1).T for part in self.kinds)
+        edges, strips, periods = (one[view] for one in self.of_views.values())
+        begins, lies_off, swings = np.isfinite(edges), np.isfinite(strips[:, 1]), np.isfinite(periods)
+        return RowSpline(
+            self._of_splines @ splines,
+            row_offset,
+            row_scale,
+            edges[begins],
+            (self._of_steps @ steps)[: begins.sum() + begins.any()],
+            strips[lies_off],
+            moved[lies_off],
+            periods[swings],
+            swung.reshape(2, -1, 2).swapaxes(0, 1)[swings],  # sinusoid, cosine or sine, coordinate
+        )
 
     def carried(self, params: Array, known: AdditionalParameters) -> Array:
         """Return unknowns (N, size) started from those of another layout (N, known.size), where kinds agree."""

@@ -41,12 +41,11 @@ _MIN_NOISE_RATIO = 0.5  # of the stated sigmas, while outliers are about
 _MANY_CUT = 0.01  # of the observations: more are looked at again
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The end of the rounds."""
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Minimum):
+    """The end of the rounds: the last minimum, and its observations there."""
 
     problem: Problem  # with the priors on points as they ended
-    minimum: Minimum  # unknowns, points, the last linearisation
     residual: Array  # (2, K) projected - observed [px]
     weight: Array  # (K,) 1 / sigma of the observations, as solved last [1/px]
     inlier: BoolArray  # (K,) observations in the final solve
@@ -160,19 +159,18 @@ class Rounds:
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, self.learnt, exact=True)[1]
             noise = self.noise if self.options.estimate_noise else 1.0
-            by_point = self._by_points().by_point.copy()  # the next projection overwrites it
             return Outcome(
-                self.problem,
-                found,
-                self.residual,
-                self.weight,
-                self.use,
-                self.noise,
-                self.passes,
-                self.observations.told_by(self.use / (self.observations.sigma * noise)),
-                tested,
-                smooth,
-                by_point,
+                **vars(found),
+                problem=self.problem,
+                residual=self.residual,
+                weight=self.weight,
+                inlier=self.use,
+                noise=self.noise,
+                passes=self.passes,
+                told=self.observations.told_by(self.use / (self.observations.sigma * noise)),
+                prior=tested,
+                smooth=smooth,
+                by_point=self._by_points().by_point.copy(),  # the next projection overwrites it
             )
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None

@@ -52,7 +52,7 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
         found = [one for one in found if one.by_share or one.gain > by_neighbours]
     if not any(one.by_share for one in found):
         return found
-    state, weight = outcome.minimum.state, block.use / block.sigma
+    state, weight = outcome.state, block.use / block.sigma
     residual = retriangulate_rejected(outcome.problem, state, outcome.residual, outcome.inlier, weight)[1]
     off = np.hypot(*residual)
     cut = (block.point < block.num_tracks) & block.use & ~outcome.inlier & np.isfinite(off)

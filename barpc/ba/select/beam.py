@@ -59,7 +59,6 @@ class _SearchState:
     """A combination of terms."""
 
     seen: Residuals
-    followed: MixtureFit  # with the terms that are estimated with the cameras
     taken: tuple[_Taken, ...] = ()
     ended: bool = False  # nothing may be taken beside them
 
@@ -67,6 +66,12 @@ class _SearchState:
     def gain(self) -> float:
         """Evidence gained by all terms."""
         return sum(row.gain for row in self.taken)
+
+    @property
+    def followed(self) -> MixtureFit:
+        """The fit with the terms that are estimated with the cameras: all, or all but the last."""
+        last = self.taken[-1]
+        return self.seen.base if last.term.FOLLOWED else last.before.base
 
     @property
     def moves(self) -> bool:
@@ -103,14 +108,13 @@ class _SearchState:
         taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
         extra = np.concatenate([self.seen.extra, one.columns], axis=1)
         seen = replace(self.seen, base=made, extra=extra, sigma=np.append(self.seen.sigma, one.sigma))
-        followed = made if one.FOLLOWED else self.followed
-        return _SearchState(seen, followed, taken, not one.FOLLOWED or len(taken) == TRIED)
+        return _SearchState(seen, taken, not one.FOLLOWED or len(taken) == TRIED)
 
     def without_noise(self) -> _SearchState:
         """Return the state with the first terms alone, where correlated noise explains as much as all after them."""
         for n, row in enumerate(self.taken):
             if sum(one.gain for one in self.taken[n:]) <= _noise_evidence(row.before):
-                return _SearchState(row.before, row.before.base, self.taken[:n])
+                return _SearchState(row.before, self.taken[:n])
         return self
 
     def replaces(self, best: _SearchState) -> bool:
@@ -144,7 +148,7 @@ class _SearchState:
             found = fit_mixture(seen.linear, extra, seen.sigma, seen.base)
             if found.evidence - plain.price > seen.base.evidence - row.term.price:
                 taken = (*state.taken[:n], replace(row, term=plain), *state.taken[n + 1 :])
-                state = replace(state, seen=replace(seen, base=found, extra=extra), followed=found, taken=taken)
+                state = replace(state, seen=replace(seen, base=found, extra=extra), taken=taken)
         return state
 
     def findings(self, margin: float, or_of: list[tuple[int, ...]]) -> Iterator[Finding]:
@@ -200,7 +204,7 @@ class TermSearch:
 
     def run(self) -> Selection:
         """Return all terms that are taken."""
-        first, ended = self._grown([_SearchState(self.start, self.start.base)])
+        first, ended = self._grown([_SearchState(self.start)])
         states = first
         while not ended:
             states, ended = self._grown(states)
@@ -217,8 +221,7 @@ class TermSearch:
         best = best.simplified()
         if not best.taken:
             return Selection()
-        base = best.seen.base if all(row.term.FOLLOWED for row in best.taken) else best.followed
-        return Selection(tuple(best.findings(margin, or_of)), base.step, base.right)
+        return Selection(tuple(best.findings(margin, or_of)), best.followed.step, best.followed.right)
 
     def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best combinations with one more term, and whether they are the last."""

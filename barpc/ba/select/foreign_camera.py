@@ -29,7 +29,6 @@ from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import GEOMETRIC, AdjustOptions
 from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SMALL, SURE, TRIED
-from barpc.scene import connected_groups
 
 logger = logging.getLogger(__name__)
 
@@ -196,27 +195,17 @@ def _leave_one_view_out(
     """Yield the block without one view after the other, where the rest is tied together and agrees."""
     for v in views:
         others = block.without(block.view == v)
-        if not _is_tied(others, v):
+        groups = others.groups(others.use & (others.point < others.num_tracks))
+        if [v] not in groups or len(groups) != 2:
             continue
         try:
             found = solve(others, outer.without(outer.view == v), options)
         except (AdjustError, np.linalg.LinAlgError) as error:
             logger.info("without %s: %s", block.names[v], error)
             continue
-        if np.delete(lost_shares(found, others), v).max() < 0.5 and agrees(
-            found
-        ):  # the few left of many agree by choice
+        # the few left of many agree by choice
+        if np.delete(lost_shares(found, others), v).max() < 0.5 and agrees(found):
             yield v, others, found
-
-
-def _is_tied(block: Block, without: int) -> bool:
-    """Return whether the views of a block are tied to each other but for one."""
-    order = np.lexsort((block.view, block.point))
-    order = order[(block.use & (block.point < block.num_tracks))[order]]
-    view, point = block.view[order], block.point[order]
-    pairs = np.unique(np.stack([view[:-1], view[1:]])[:, point[1:] == point[:-1]], axis=1)
-    groups = connected_groups(len(block.views), [(int(i), int(j)) for i, j in pairs.T])
-    return len(groups) == 2 and any(list(group) == [without] for group in groups)
 
 
 def _by_prior(left: list[LeaveOneOut], scale: float, block: Block) -> tuple[ForeignCamera | None, Solution | None]:

@@ -109,9 +109,8 @@ def _at_selection(found: Solution, selected: Selection, block: Block) -> Solutio
     """Return the block at a search's end: its cameras, and the observations that are right with them."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
     inlier = np.where(is_tie, block.use & (selected.right > 0.5), outcome.inlier)
-    ended = outcome.minimum.state
-    moved = replace(ended, params=ended.params + selected.step)
-    return replace(found, outcome=replace(outcome, inlier=inlier, minimum=replace(outcome.minimum, state=moved)))
+    moved = replace(outcome.state, params=outcome.state.params + selected.step)
+    return replace(found, outcome=replace(outcome, inlier=inlier, state=moved))
 
 
 def _layout_of(terms: list[Finding], views: int) -> _Layout:
@@ -173,7 +172,7 @@ def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> lis
 def _solve_with(found: Solution, parts: Parts, options: AdjustOptions, layout: _Layout, once: bool = False) -> Solution:
     """Return the block solved with additional parameters from where it ended; every observation may come back."""
     block, waves, start = parts.inner, layout.waves, layout.start
-    outcome, ended, unknowns = found.outcome, found.outcome.minimum.state, found.problem.cameras.unknowns
+    outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
     if unknowns.waves is not None:  # terms that were found stay
         waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
@@ -190,4 +189,4 @@ def _solve_with(found: Solution, parts: Parts, options: AdjustOptions, layout: _
         weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
     there, _ = retriangulate_rejected(bent, replace(ended, params=params), outcome.residual, known, weight)
     outcome = Rounds(bent, block, there, found.heights, block.use, outcome).run(once)
-    return finished(found, bent, block, parts.outer, options, outcome)
+    return finished(found, bent, block, parts.outer, outcome)

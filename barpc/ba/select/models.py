@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc.ba.constraints.block import Block
 from barpc.ba.parameters.priors import NOISE_FLOOR
-from barpc.ba.robust.heldout import is_admitted, measure
+from barpc.ba.robust.heldout import is_admitted, is_better, measure
 from barpc.ba.select.anomalies import standing_out
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, find_foreign_camera
@@ -117,6 +117,19 @@ def _is_calm(found: Solution, block: Block, floor: float) -> bool:
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
 
 
+def _at_lower_degree(
+    found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
+) -> tuple[Solution, Parts, Selection] | None:
+    """Return the block without moving ground at one degree of the drift less; None where it is not clearly better.
+
+    Ground that moves may be what the further degree follows: then no group is found beside it.
+    """
+    less = replace(options, drift=found.problem.cameras.unknowns.drift - 1)
+    plain = _without_moving_ground(solve(parts.inner, parts.outer, less), parts, less, solve)
+    outer = plain[1].outer
+    return plain if is_better(plain[0].after, measure(found.problem, found.final.params, outer), outer) else None
+
+
 def _without_moving_ground(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection]:
@@ -148,5 +161,8 @@ def _without_moving_ground(
             break
         found, parts = tried, less
         groups.append(last)
+    unexplained = found.has_trend and not (groups or findings)
+    if unexplained and "drift" in found.asked and (plain := _at_lower_degree(found, parts, options, solve)):
+        return plain
     selected = replace(selected, findings=tuple(findings))
     return replace(found, findings=(*groups, *findings)), parts, selected

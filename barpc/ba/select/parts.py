@@ -13,7 +13,7 @@ from barpc.ba.solution import Solution
 from barpc.ba.terms.moving_ground import Motion, MovingGroup, members
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.statistics import LEVEL, SURE
-from barpc.scene import BoolArray, IntArray, connected_groups
+from barpc.scene import BoolArray, IntArray
 
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
@@ -62,7 +62,7 @@ class Parts:
         block, inner = self.block, self.inner
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
-        return enough and _groups(inner) == _groups(block)
+        return enough and len(inner.groups(inner.use)) == len(block.groups(block.use))
 
     def keeps(self, found: Solution, view: int) -> bool:
         """Return whether a solution keeps half as many of a view's tie points as of another's, and no group moves.
@@ -108,15 +108,6 @@ class Parts:
         names = tuple(self.block.gcps.names[g - self.block.num_tracks] for g in gcps.tolist())
         first, second = (self.block.views[v].date for v in one.between)
         return Motion(one.metres, one.between, share, box, side, names, (first, second))
-
-
-def _groups(block: Block) -> int:
-    """Count the groups into which views fall."""
-    rows = np.flatnonzero(block.use)
-    rows = rows[np.lexsort((block.view[rows], block.point[rows]))]
-    same = np.flatnonzero(np.diff(block.point[rows]) == 0)
-    pairs = np.unique(np.column_stack([block.view[rows[same]], block.view[rows[same + 1]]]), axis=0)
-    return len(connected_groups(len(block.views), [(int(i), int(j)) for i, j in pairs]))
 
 
 def lost_shares(found: Solution, block: Block) -> Array:

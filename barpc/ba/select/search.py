@@ -103,8 +103,6 @@ def linearised_among(outcome: Outcome, block: Block, views: IntArray) -> tuple[L
     unknowns = problem.free.size // len(block.views) * len(views)
     if unknowns > SMALL or array_elements(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
         return None
-    state, _ = retriangulate_rejected(
-        problem, outcome.minimum.state, outcome.residual, outcome.inlier, block.use / block.sigma
-    )
+    state, _ = retriangulate_rejected(problem, outcome.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range
     return linearise(problem, state, use, block.sigma, high - low), state

@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from barpc.ba.solving.linear import Blocks, Factor
 from barpc.ba.solving.normal import Reduced, solve_transposed
+from barpc.ba.solving.structure import unknowns_of
 from barpc.base.geodesy import Array, parts
 from barpc.base.statistics import FEW, KEPT
 from barpc.scene import BoolArray, IntArray
@@ -93,7 +94,7 @@ class Covariance:
         """Return the covariance (m q, m q) of the unknowns of some views."""
         of_full = not self.is_large or "full" in self.__dict__
         if of_full or self.factor.inverse is None:
-            place = self._places(views)
+            place = unknowns_of(views, self.num_unknowns)
             return self._columns(place, of_full)[place]
         return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
 
@@ -105,7 +106,8 @@ class Covariance:
                 return np.asarray(self._near.diagonal[i] + more)
             if (at := self._near.pair(min(i, j), max(i, j))) is not None:
                 return np.asarray((self._near.pairs[at] if i < j else self._near.pairs[at].T) + more)
-        return self._columns(self._places(np.array([j])), of_full)[self._places(np.array([i]))]
+        own, other = (unknowns_of(np.array([view]), self.num_unknowns) for view in (i, j))
+        return self._columns(other, of_full)[own]
 
     def _of_shared(self, view: int | None = None) -> Array:
         """Return the rows (q, k) of a view in common errors; without a view the covariances (N, q, q) by these."""
@@ -118,10 +120,6 @@ class Covariance:
         """The covariance of every view, and of those that share points."""
         assert self.factor.inverse is not None
         return self.factor.inverse()
-
-    def _places(self, views: IntArray) -> IntArray:
-        q = self.num_unknowns
-        return (views[:, None] * q + np.arange(q)).ravel()
 
     def _columns(self, place: IntArray, of_full: bool) -> Array:
         """Return the covariance (N q, m) of all unknowns with those at `place` (m,)."""

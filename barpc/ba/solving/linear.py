@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg.blas import dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf, dpotri
 
-from barpc.ba.solving.structure import Dissection, Front
+from barpc.ba.solving.structure import Dissection, Front, unknowns_of
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -164,7 +164,7 @@ class Cholesky:
         for number, front in enumerate(self.order.fronts):
             matrix, split = self._assembled(number, front, damping), len(front.pivots) * self._size
             for views, rest in left.pop(number, ()):
-                _add(matrix, _spread(self._local(front, views), self._size), rest)
+                _add(matrix, unknowns_of(self._local(front, views), self._size), rest)
             upper, failed = dpotrf(matrix[:split, :split], lower=1, clean=0)
             if failed:
                 raise np.linalg.LinAlgError(f"{failed}-th leading minor not positive definite")
@@ -201,7 +201,7 @@ class Cholesky:
         eliminated, as given.
         """
         q, rank = self._size, self.order.rank
-        chosen = _spread(np.argsort(rank[rank >= 0], kind="stable"), q)
+        chosen = unknowns_of(np.argsort(rank[rank >= 0], kind="stable"), q)
         # rank of the m-th view in use -> place in b
         y = np.ascontiguousarray(b.reshape(len(b), -1)[chosen])
         for number, front in enumerate(self.order.fronts):
@@ -226,7 +226,7 @@ class Cholesky:
         """Return the unknowns of a front's pivots and its border, in the order of elimination."""
         first = int(self.order.rank[front.pivots[0]])
         q = self._size
-        return slice(first * q, (first + len(front.pivots)) * q), _spread(self.order.rank[front.border], q)
+        return slice(first * q, (first + len(front.pivots)) * q), unknowns_of(self.order.rank[front.border], q)
 
     def inverse(self) -> Blocks:
         """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
@@ -257,7 +257,7 @@ class Cholesky:
         if not len(front.border):
             return own
         whole = np.empty((split + len(front.border) * self._size,) * 2)
-        place = _spread(self._local(self.order.fronts[front.parent], front.border), self._size)
+        place = unknowns_of(self._local(self.order.fronts[front.parent], front.border), self._size)
         beyond = known[front.parent][np.ix_(place, place)]
         weights = dtrsm(1.0, upper, lower, side=1, lower=1)
         across = beyond @ weights
@@ -274,11 +274,6 @@ class Cholesky:
         pairs, row, col, flipped = self._entries(number, front)
         found = blocks[row, :, col, :]
         out.pairs[pairs] = np.where(flipped[:, None, None], found.transpose(0, 2, 1), found)
-
-
-def _spread(index: IntArray, size: int) -> IntArray:
-    """Return the unknowns of views."""
-    return np.asarray((index[:, None] * size + np.arange(size)).ravel())
 
 
 def _add(matrix: Array, place: IntArray, rest: Array) -> None:

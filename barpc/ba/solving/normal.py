@@ -175,15 +175,7 @@ def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: 
     whitened = np.stack([solve_lower(lower[:, index], by_point[:, :, j].T).T for j in range(m)], axis=2)
     flat = whitened.reshape(-1, m)
     upper = la.cholesky(prior.information() - flat.T @ flat)
-    place = np.full(structure.num_points, -1)
-    place[index] = np.arange(len(index))
-    rows = np.flatnonzero(place[structure.point] >= 0)
-    bounds, q = np.searchsorted(rows, structure.bounds), cross.shape[2]
-    by_view = np.empty((m, structure.num_views, q))
-    for v, of_view in enumerate(np.split(rows, bounds[1:-1])):
-        of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
-        by_view[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
-    by_camera = by_view.reshape(m, -1)
+    by_camera = by_cameras(structure, cross, index, whitened)
     gradient = -np.einsum("qim,iq->m", whitened, half[:, index])
     return Common(
         index,
@@ -192,6 +184,21 @@ def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: 
         la.solve_triangular(upper, by_camera, trans="T"),
         la.solve_triangular(upper, gradient, trans="T"),
     )
+
+
+def by_cameras(structure: Structure, cross: Array, index: IntArray, whitened: Array) -> Array:
+    """Return the derivatives (m, N q) by the cameras of functions of points `index` (Q,).
+
+    `whitened` (Q, 3, m) is L^-1 times their derivatives by the points, `cross` (K, 3, q) the coupling Y.
+    """
+    place = np.full(structure.num_points, -1)
+    place[index] = np.arange(len(index))
+    rows, (q, m) = np.flatnonzero(place[structure.point] >= 0), (cross.shape[2], whitened.shape[2])
+    out = np.empty((m, structure.num_views, q))
+    for v, of_view in enumerate(np.split(rows, np.searchsorted(rows, structure.bounds[1:-1]))):
+        of_points = whitened[place[structure.point[of_view]]].reshape(-1, m)
+        out[:, v] = -of_points.T @ cross[of_view].reshape(-1, q)
+    return out.reshape(m, -1)
 
 
 def point_products(by_point: Array, residual: Array, weight: Array | None = None) -> Array:

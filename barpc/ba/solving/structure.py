@@ -266,6 +266,11 @@ def make_structure(
     )
 
 
+def unknowns_of(views: IntArray, size: int) -> IntArray:
+    """Return the places (n q,) of the unknowns of views (n,), of `size` q each."""
+    return np.asarray((views[:, None] * size + np.arange(size)).ravel())
+
+
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
     """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size + 1,).
 

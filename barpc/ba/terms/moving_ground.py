@@ -186,9 +186,7 @@ def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
 
 def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureFit) -> MovingGroup:
     """Return the motion of a group by a fit with it."""
-    rows = np.zeros(len(group.cell), dtype=bool)
-    for tracks in linear.tracks:
-        rows[tracks.rows] = True
+    rows = linear.taking_part
     member = rows & (found.moving > 0.5)
     moved = np.vstack([np.zeros(2), found.move.reshape(-1, 2)]) * ground.pixel
     seen = np.flatnonzero(np.bincount(linear.view[member], minlength=linear.views))
