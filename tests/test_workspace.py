@@ -17,7 +17,7 @@ import pytest
 from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
-from barpc.base.memory import give_back, peak_memory
+from barpc.base.memory import peak_memory
 from barpc.report.runfiles import table_path
 from barpc.workspace import (
     Homes,
