@@ -1,4 +1,4 @@
-"""Memory of this process: its peak, and what is given back of it."""
+"""Peak memory of this process, and freed memory returned to the system."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def peak_memory() -> int:
 
 
 def give_back() -> None:
-    """Return freed memory to the system: glibc keeps what lies below anything in use, of large blocks the most."""
+    """Return freed memory to the system: glibc keeps pages between blocks that are in use."""
     with suppress(AttributeError, OSError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
