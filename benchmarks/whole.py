@@ -24,14 +24,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 HIDE = "import sys; sys.modules.update(dict.fromkeys(('boto3', 'rpcm', 'shareloc', 'orthority')))"
 FLOOR = "import cv2, numpy, rasterio, scipy.linalg, scipy.optimize, scipy.sparse.csgraph, scipy.spatial"
+RUN = f"{HIDE}; from barpc.cli import main; main()"
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def turn(checkout: Path, compiled: str, arguments: list[str]) -> dict[str, float]:
     """CPU seconds of one run by stage, "start" and "whole"."""
     with tempfile.TemporaryDirectory() as folder:
-        run = f"{HIDE}; from barpc.cli import main; main()"
-        command = [sys.executable, "-c", run, "-q", "adjust", *arguments, "-o", f"{folder}/out"]
+        command = [sys.executable, "-c", RUN, "-q", "adjust", *arguments, "-o", f"{folder}/out"]
         places = {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
         environment = os.environ | THREADS | places
         floor = cpu([sys.executable, "-c", f"{HIDE}; {FLOOR}"], environment, folder)
