@@ -314,13 +314,16 @@ def middle_altitude(views: Sequence[View]) -> float:
 
 def connected_labels(num: int, links: npt.ArrayLike) -> IntArray:
     """Return the connected component (num,) of each node, numbered by its first; links (M, 2) join two."""
-    from scipy.sparse import coo_array  # a fifth of a second, with what it loads, which no camera needs
-    from scipy.sparse.csgraph import connected_components
-
     first, second = np.asarray(links, dtype=np.int64).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
-    label: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
-    return label
+    label = np.arange(num)
+    while True:  # the least of both for both and where they point to, and from there on: as often as log2 of the chain
+        least, now = np.minimum(label[first], label[second]), label.copy()
+        for place in (first, second, label[first], label[second]):
+            np.minimum.at(now, place, least)
+        now = now[now]
+        if (now == label).all():
+            return np.unique(label, return_inverse=True)[1].astype(np.int64)
+        label = now
 
 
 def connected_groups(num_views: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:

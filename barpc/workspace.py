@@ -41,6 +41,7 @@ from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Arrays, load_npz
 from barpc.base.manifest import SUMS
+from barpc.base.memory import give_back, peak_memory
 from barpc.base.remote import is_url
 from barpc.base.safe_io import MAX_XML
 from barpc.rpcio import hidden_by
@@ -90,17 +91,6 @@ def _key_form(value: object) -> object:
     raise TypeError(f"a {type(value).__name__} cannot be part of a stage's key")
 
 
-def peak_memory() -> int:
-    """Return the peak resident memory [bytes] of this process and its children so far; 0 where unknown."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return 0
-    scale = 1 if os.uname().sysname == "Darwin" else 1024
-    usage = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return max(resource.getrusage(who).ru_maxrss for who in usage) * scale
-
-
 @contextmanager
 def timed(name: str, stages: list[dict[str, Any]]) -> Iterator[list[float]]:
     """Time a stage; its seconds and the peak memory so far go to the log and to `stages`.
@@ -111,6 +101,7 @@ def timed(name: str, stages: list[dict[str, Any]]) -> Iterator[list[float]]:
     logger.info("%s ...", name)
     workers: list[float] = []
     yield workers
+    give_back()
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu + sum(workers)
     memory = peak_memory() / 1e6
     rounded = {"seconds": round(seconds, 3), "cpu_seconds": round(cpu, 3), "peak_memory_mb": round(memory, 1)}

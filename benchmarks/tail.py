@@ -31,6 +31,7 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from scipy.interpolate import RectBivariateSpline
+from whole import RUN
 
 from barpc.base.geodesy import metres_per_unit
 from barpc.pointio.matches import write_matches
@@ -143,7 +144,7 @@ def _write_blank(folder: Path, view: View, side: int) -> Path:
 def run(listed: Path, out: Path, jobs: int, only: bool = True) -> Trial:
     """`barpc adjust` in a process of its own."""
     matches = listed.parent / "matches.npz"
-    command = [sys.executable, "-m", "barpc", "-q", "adjust", "--image-list", listed]
+    command = [sys.executable, "-c", RUN, "-q", "adjust", "--image-list", listed]
     command += ["--matches", matches, *["--matches-only"] * only] * matches.exists()
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     words = [str(word) for word in (*command, "-o", out, "--overwrite", "-j", jobs)]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from barpc.base.errors import InputError
 from barpc.scene import (
@@ -188,6 +192,12 @@ def test_the_middle_altitude_of_views_is_the_mean_of_theirs():
 def test_labels_are_numbered_by_the_first_node():
     assert connected_labels(5, [(3, 1), (4, 0)]).tolist() == [0, 1, 2, 1, 0]
     assert connected_labels(3, []).tolist() == [0, 1, 2]
+    rng = np.random.default_rng(1)
+    for num in (1, 2, 7, 30, 400):  # sparse, and the longest chain, in any order
+        for links in (*(rng.integers(0, num, (m, 2)) for m in (num // 3, num)), pairwise(rng.permutation(num))):
+            pairs = np.array([*links], dtype=np.int64).reshape(-1, 2)
+            graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num, num))
+            np.testing.assert_array_equal(connected_labels(num, pairs), connected_components(graph, directed=False)[1])
     assert connected_groups(5, [(0, 1), (2, 3)]) == [[0, 1], [2, 3], [4]]
     assert connected_groups(5, [(3, 4), (4, 2)]) == [[2, 3, 4], [0], [1]]
 

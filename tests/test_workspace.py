@@ -17,6 +17,7 @@ import pytest
 from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
+from barpc.base.memory import peak_memory
 from barpc.report.runfiles import table_path
 from barpc.workspace import (
     Homes,
@@ -25,7 +26,6 @@ from barpc.workspace import (
     key_of,
     noted_outputs,
     own_files,
-    peak_memory,
     portable,
     timed,
 )

@@ -12,8 +12,8 @@ displaced observations.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 
 import numpy as np
 import scipy.linalg as la
@@ -127,6 +127,7 @@ class Calibration:
     sha256: str
 
     @classmethod
+    @cache
     def prior(cls, sensor: str, width: int) -> Calibration:
         """Return the prior of a sensor whose images have `width` columns: mean 0, a covariance of published figures."""
         curve = LineCurve(width, np.zeros(0))
@@ -195,7 +196,8 @@ class CommonErrors:
         """Return the response of an adjustment, of weights (K,) [1/px], to one standard deviation of each error."""
         structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
         projected = problem.linearise(state.params, state.points)
-        whitened = whiten(projected.by_point * weight, reduced.lower[:, structure.point])
+        projected.by_point[:] *= weight
+        whitened = whiten(projected.by_point, reduced.lower[:, structure.point])
         pull, common = np.zeros((structure.num_views, q, self.count)), reduced.common
         axes = structure.num_points * np.arange(3)
         of_common = np.zeros((0 if common is None else len(common.half), self.count))
@@ -216,7 +218,7 @@ class CommonErrors:
         if common is not None:
             of_common = la.solve_triangular(common.upper, of_common, trans="T")
             flat = flat - common.by_camera.T @ of_common
-        known = problem, state, weight, reduced
+        known = replace(problem, _room=[]), state, weight, reduced  # which are kept as long as the result
         return SharedErrors(covariance.solve(flat), partial(self._point_moves, known, of_common))
 
     def _point_moves(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from barpc.ba.constraints.block import Block
@@ -15,7 +14,7 @@ from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solution import Solution
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES
+from barpc.base.statistics import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES, kd_tree
 from barpc.scene import BoolArray
 from barpc.sensor.image_corrections import bsplines
 
@@ -58,7 +57,7 @@ class Placed:
         if far.sum() < FEW:
             return False
         left = self.left[:, far].T
-        nearest = np.asarray(cKDTree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
+        nearest = np.asarray(kd_tree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
         apart, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
         return bool(np.median(apart) < np.median(size))
 

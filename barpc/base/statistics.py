@@ -113,6 +113,13 @@ SMALL = 400
 """Most unknowns of a block that is solved again for every hypothesis."""
 
 
+def kd_tree(places: Array) -> Any:
+    """Return scipy's k-d tree of places (n, d)."""
+    from scipy.spatial import cKDTree  # a tenth of a second, which runs with matches given do not need
+
+    return cKDTree(places)
+
+
 def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
     """Return the robust standard deviation: `MAD` times the median over the last axis of the distances from a centre.
 

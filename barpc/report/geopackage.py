@@ -9,6 +9,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import shapely
 
 from barpc.base.geodesy import Array
@@ -44,14 +46,14 @@ class Layer:
     """Geometries in lon, lat [deg], points with altitude [m above the ellipsoid], and columns with their SQL types."""
 
     name: str
-    shapes: Sequence[Any]
+    shapes: Sequence[Any] | npt.NDArray[np.object_]
     columns: Sequence[str]
     rows: Iterable[Sequence[Any]]
 
 
-def point_shapes(lonlatalt: Array) -> Sequence[Any]:
+def point_shapes(lonlatalt: Array) -> npt.NDArray[np.object_]:
     """Return points (n, 3) as geometries."""
-    return [shapely.Point(place) for place in lonlatalt.tolist()]
+    return np.asarray(shapely.points(lonlatalt))
 
 
 def geopackage(layers: Sequence[Layer]) -> bytes:

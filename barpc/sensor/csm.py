@@ -14,11 +14,10 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError, plain
 from barpc.base.geodesy import WGS84_A, WGS84_B, Array, ecef_from_ground, ground_from_ecef
@@ -28,6 +27,9 @@ from barpc.sensor.corrected import Corrected
 from barpc.sensor.document import LINE_TIME_TOLERANCE, XmlFields, padded
 from barpc.sensor.linescan import ATTITUDE_STEP, Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Frame, Pushbroom
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 STATE_END = ".adjusted_state.json"
 """End of the name of a state, as ASP writes it."""
@@ -146,6 +148,8 @@ class _StateFields(XmlFields):
 
 
 def _linescan(state: _StateFields) -> Pushbroom:
+    from scipy.spatial.transform import Rotation  # a tenth of a second, of physical models alone
+
     size, name = state.image_size, state.name
     if np.any(state.numbers("m_currentParameterValue")):
         raise InputError(f"{name}: adjustable parameters that are not 0, which are not read")
@@ -203,6 +207,8 @@ def _look_polynomial(state: _StateFields, width: int) -> tuple[Array, float]:
 
 
 def _frame_camera(state: _StateFields) -> Frame:
+    from scipy.spatial.transform import Rotation
+
     pose = state.numbers("m_currentParameterValue", 7)
     if np.any(state.content.get("m_lineTimes") or 0):
         raise InputError(f"{state.name}: a rolling shutter with jitter, which is not read")
@@ -298,6 +304,8 @@ def _row_rotations(
     model: SensorModel, base: Pushbroom, rows: Array, positions: Array, seen: tuple[int, float]
 ) -> Rotation:
     """Return the rotation ecef_from_camera, z away from the ground, nearest to the lines of sight of each row."""
+    from scipy.spatial.transform import Rotation
+
     cols = np.linspace(0.0, seen[0] - 1.0, _ATTITUDE_COLUMNS)
     image = np.stack(np.broadcast_arrays(cols, rows[:, None]), axis=-1)
     away = ecef_from_ground(model.localize(image, np.full(image.shape[:2], seen[1]))) - positions[:, None]

@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.polynomial.polynomial import polyfit, polyval
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import Array, ecef_from_ground
@@ -214,6 +213,8 @@ def read_linescan(
 
 def camera_of_isd(root: XmlFields, band: str | None = None) -> tuple[Linescan, Light]:
     """Return the model of an ISD, and how light bends; InputError where `band` is none of its bands."""
+    from scipy.spatial.transform import Rotation
+
     level = root.text("IMD/PRODUCTLEVEL")
     if "1B" not in level.upper():
         raise RpcFormatError(f"{root.name}: a product of level {level}, resampled: only 1B has a physical model")

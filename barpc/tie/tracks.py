@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TIE_DEFAULTS, TieOptions
-from barpc.base.statistics import FEW, MANY
+from barpc.base.statistics import FEW, MANY, kd_tree
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
 from barpc.sensor.geometry import triangulate
 from barpc.tie.detail import Seen, seen_detail
@@ -354,7 +353,7 @@ def _merge_registered(views: Sequence[View], tracks: Tracks, others: Tracks) -> 
     """Merge registered and other tracks: observations beside a registered one are the same point."""
     reach = MAX_PATCH_SHIFT + float(np.hypot(0.5, 0.5))  # registration, and rounding, may move a point by so much
     known, asked = (np.array([2 * reach * part.view, *part.xy.T]).T for part in (tracks, others))
-    near, row = map(np.asarray, cKDTree(known).query(asked, distance_upper_bound=reach))
+    near, row = map(np.asarray, kd_tree(known).query(asked, distance_upper_bound=reach))
     same = np.flatnonzero(np.isfinite(near))
     point, which = np.unique(others.point[same], return_index=True)
     anchor = np.full(others.num_points, -1)  # the row of each track that says where it stands, if one does

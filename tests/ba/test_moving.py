@@ -254,6 +254,8 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     assert [len(part.view) for part in asked[1::2]] == [0, 0]  # no control points
 
 
+@pytest.mark.few(1)
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
     """Their places are of another date than some of their images: named, and the scene stands by the others."""

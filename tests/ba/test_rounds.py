@@ -158,6 +158,11 @@ def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> 
     assert (left[:, ~of_lost] == 0.25).all()
     np.testing.assert_allclose(left[:, of_lost], problem.residuals(good.params, again.points)[:, of_lost])
     assert np.abs(left[:, of_lost]).max() < 1.0
+    projected = replace(problem, _room=[]).linearise(good.params, points)
+    rounds.retriangulate_rejected(problem, state, residual, use, np.full(len(use), 10.0), projected)
+    for name in ("image", "by_point", "by_unknown"):  # what is kept of a state follows it
+        fresh = getattr(replace(problem, _room=[]).linearise(good.params, again.points), name)
+        np.testing.assert_allclose(getattr(projected, name), fresh, rtol=1e-9, atol=1e-9)
 
 
 def test_a_better_agreement_takes_the_place_of_a_compromise(clean) -> None:

@@ -302,8 +302,9 @@ def test_help_imports_nothing_heavy():
     [
         ("main()", "scipy.linalg scipy.sparse scipy.spatial scipy.special cv2 shapely jinja2 boto3 barpc.ba barpc.tie"),
         ("_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading", "barpc.ba barpc.report boto3"),
+        ("sys.argv[1:] = ['adjust', 'none.tif', 'no.tif', '-o', 'out']; main()", "scipy.spatial scipy.optimize jinja2"),
     ],
-    ids=["info", "worker"],
+    ids=["info", "worker", "adjust"],
 )
 def test_what_is_not_needed_is_not_loaded(command, unwanted, tmp_path):
     (tmp_path / "boto3.py").write_text("")

@@ -99,10 +99,10 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
 
     def framed(a: np.ndarray, b: np.ndarray, alt: np.ndarray) -> Any:
         asked.append((a, b, alt))
-        return SimpleNamespace(num=2 * 128 * 4 - 1, across=0.0)
+        return SimpleNamespace(num=2 * 64 * 4 - 1, across=0.0)
 
     monkeypatch.setattr(stereo, "epipolar_frame", framed)
-    monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, frame, band: sizes.append(size))
+    monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, *more: sizes.append(size))
     project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
     pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
     assert stereo._tile_points(pair, tile, 1) == []

@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from barpc.tie.patches import dense
 from barpc.tie.patches.dense import (
     _NOISE_VARIANCE,
     _SLOPE_VARIANCE,
     COLUMNS_PER_PIXEL,
+    _both_ways,
     _refined_disparity,
     dense_matches,
     epipolar_frame,
@@ -60,6 +62,31 @@ def test_a_part_of_two_images_is_matched_where_it_was_asked_and_not_beside(tmp_p
     assert np.median(np.abs(found.b - found.a - [20.0, 0.0]), axis=0) == pytest.approx(0.0, abs=0.1)
     assert np.median(found.alt) == pytest.approx(100.0, abs=1.0)
     assert frame.metres == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(("off", "met"), [(0.0, True), (-5.0, True), (5.0, True), (-40.0, False), (40.0, False)])
+def test_a_slope_is_found_about_a_coarser_surface(tmp_path, monkeypatch, off, met):
+    """Every pixel is a quarter of one farther in the second image; one coarse match of 199 is wrong by far."""
+    rng = np.random.default_rng(7)
+    ground = cv2.GaussianBlur(rng.standard_normal((240, 320)).astype(np.float32), (0, 0), 1.5) * 300.0 + 1000.0
+    col, row = np.meshgrid(np.arange(380, dtype=np.float32), np.arange(240, dtype=np.float32))
+    write_image(tmp_path / "a.tif", ground.astype(np.uint16))
+    write_image(tmp_path / "b.tif", cv2.remap(ground, (col - 10.0) / 1.25, row, cv2.INTER_CUBIC).astype(np.uint16))
+    places = np.stack(np.meshgrid([80.0, 140.0, 200.0], [60.0, 110.0, 160.0]), axis=-1).reshape(-1, 2)
+    alt, a = np.repeat([0.0, 200.0, 400.0], 9), np.tile(places, (3, 1))
+    frame = epipolar_frame(a, a + np.column_stack([0.2 * alt, np.zeros(27)]), alt)
+    near = np.stack(np.meshgrid(np.arange(60.0, 220.0, 2.0), np.arange(40.0, 180.0, 2.0)), axis=-1).reshape(-1, 2)
+    shift = 10.0 + 0.25 * near[:, 0] + rng.normal(0.0, 0.5, len(near)) + off
+    shift[::199] += 30.0
+    coarse = near, near + np.column_stack([shift, np.zeros(len(near))]), 2.0
+    searched = []
+    monkeypatch.setattr(dense, "_both_ways", lambda *given: (searched.append(given[3]), _both_ways(*given))[1])
+    paths, sizes = [str(tmp_path / name) for name in ("a.tif", "b.tif")], [(320, 240), (380, 240)]
+    found = dense_matches(paths, sizes, frame, coarse=coarse)
+    assert searched[0] <= 64 < 160 <= frame.num
+    right = np.abs(found.b - found.a - np.column_stack([10.0 + 0.25 * found.a[:, 0], np.zeros(len(found.a))])) < 0.3
+    share = right.all(axis=1).sum() / (120 * 100)
+    assert (share > 0.8) if met else (share < 0.1)
 
 
 @pytest.mark.parametrize("off", [-2.0, 2.0])

@@ -9,9 +9,9 @@ errors-in-variables regression (Fuller, "Measurement error models", 1987).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from barpc.base.geodesy import Array
@@ -26,6 +26,7 @@ from barpc.base.statistics import (
     STATED_FREEDOM,
     SURELY,
     TIMES,
+    kd_tree,
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
@@ -49,12 +50,12 @@ class TieSurface:
     scatter: Array  # (P,) standard deviation of the ground about the patch [m]
     reach: Array  # (P,) where the patch's farthest neighbour lies [m]
     whole: BoolArray  # (P,) whether the patch scatters as most do: edges of houses and cliffs are no patches
-    tree: cKDTree
+    tree: Any  # of its places
 
     @classmethod
     def of(cls, points: Array) -> TieSurface:
         """Fit the surface of at least `PATCH_POINTS` points (P, 3)."""
-        tree = cKDTree(points[:, :2])
+        tree = kd_tree(points[:, :2])
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=PATCH_POINTS))
         reach = np.maximum(distance[:, -1], 1e-3)
         delta = points[near] - points[:, None]

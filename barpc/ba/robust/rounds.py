@@ -16,6 +16,7 @@ from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_pri
 from barpc.ba.robust.weights import MEDIAN, Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import TOLERANCE, Minimum, State, gauss_newton, minimise
+from barpc.ba.solving.structure import make_structure
 from barpc.base.geodesy import Array
 from barpc.base.statistics import (
     BACKFITTING,
@@ -136,9 +137,9 @@ class Rounds:
         if self.robust and self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = retriangulate_rejected(
-                self.problem, self.state, self.residual, self.use, weight
+                self.problem, self.state, self.residual, self.use, weight, self.projected
             )
-            self.scatter = self.projected = None
+            self.scatter = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
         self._cut()
@@ -295,21 +296,30 @@ def _observation_weights(observations: Observations, use: BoolArray, squared: Ar
 
 
 def retriangulate_rejected(
-    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array
+    problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array, projected: Projected | None = None
 ) -> tuple[State, Array]:
     """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
-    (2, K).
+    (2, K); `projected`, of the state, is brought up to it in place.
 
     Nothing moved them since; with what they were cut for mended, they may come back.
     """
     structure = problem.structure
     dead = structure.sum_points(use[None].astype(np.float64))[0] == 0
-    points = state.points.copy()
+    rows = np.flatnonzero(dead[structure.point])
+    if not len(rows):
+        return state, residual
+    points, residual, xy = state.points.copy(), residual.copy(), problem.xy[:, rows]
+    seen = make_structure(structure.view[rows], structure.point[rows], structure.num_views, structure.num_points)
+    part = replace(problem, cameras=problem.cameras.seeing(xy), structure=seen, xy=xy, _room=[])
     for _ in range(STEPS):
-        moved = problem.triangulate(points, problem.project_points(state.params, points), weight)
+        moved = part.triangulate(points, part.project_points(state.params, points), weight[rows])
         points[dead] = moved[dead]
-    again = problem.residuals(state.params, points)
-    return replace(state, points=points), np.where(dead[structure.point], again, residual)
+    again = part.linearise(state.params, points)
+    residual[:, rows] = again.image - xy
+    if projected is not None:
+        for name in ("image", "by_point", "by_unknown"):
+            getattr(projected, name)[..., rows] = getattr(again, name)
+    return replace(state, points=points), residual
 
 
 def _weighted_median(values: Array, weights: Array) -> float:

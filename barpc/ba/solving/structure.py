@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
@@ -108,6 +107,8 @@ def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
     """Yield the orders of n views that a cut may part in two: by their parts, or along the ground and along
     the ties.
     """
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # of blocks that are cut alone
+
     count, part = connected_components(graph, connection="strong")  # ties go both ways
     if count > 1:
         yield np.argsort(part, kind="stable")
@@ -169,6 +170,8 @@ def _matching(across: sp.csr_array) -> IntArray:
 
     scipy's `maximum_bipartite_matching` takes time exponential in the depth of such graphs (scipy issue 26147).
     """
+    from scipy.sparse.csgraph import maximum_flow
+
     (rows, cols), ties = across.shape, across.nnz
     # nodes: the source, rows, columns, the sink
     indices = np.concatenate([1 + np.arange(rows), 1 + rows + across.indices, np.full(cols, 1 + rows + cols)])

@@ -16,11 +16,10 @@ from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
-from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, robust_spread
+from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
@@ -403,7 +402,7 @@ class _PairSearch:
     def _beside(self, found: Matches) -> _Peak | None:
         """Return a blind pass over the points without matches near them, about the offset of the matches found."""
         places, offset = found.xy[:, 0], float(np.median(self.errors(found)[:, 1]))
-        tree = cKDTree(places)
+        tree = kd_tree(places)
 
         def nearest(xy: Array, count: int) -> Array:
             return np.asarray(tree.query(xy, k=[count])[0])[:, 0]
@@ -458,7 +457,7 @@ class _PairSearch:
     def local(self, tight: Matches) -> Prediction:
         """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
         errors, places = self.errors(tight), tight.xy[:, 0]
-        tree, every = cKDTree(places), self._frame
+        tree, every = kd_tree(places), self._frame
         slope, spread = gradient(places, errors[:, 1]), robust_spread(coherent(places, errors[:, 1])[1])
         level = errors[:, 1] - places @ slope
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import Array
-from barpc.base.statistics import BIWEIGHT, FEW, SURELY, robust_spread
+from barpc.base.statistics import BIWEIGHT, FEW, SURELY, kd_tree, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 
 LEAST_REACH = 5.0
@@ -143,7 +142,7 @@ def gradient(xy: Array, values: Array) -> Array:
     """
     if len(values) <= FEW:
         return np.zeros(2)
-    far = np.asarray(cKDTree(xy).query(xy, k=[FEW])[1])[:, 0]
+    far = np.asarray(kd_tree(xy).query(xy, k=[FEW])[1])[:, 0]
     fitted = robust_affine(xy[far] - xy, values[far] - values)
     out: Array = fitted.coefficients[1:] / fitted.scale
     return out
@@ -159,7 +158,7 @@ def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
     if len(values) < 2:
         return np.ones(len(values), dtype=bool), np.zeros(len(values))
     level = values - xy @ gradient(xy, values)
-    near = cKDTree(xy).query(xy, k=min(FEW + 1, len(xy)))[1]
+    near = kd_tree(xy).query(xy, k=min(FEW + 1, len(xy)))[1]
     others = level[near]
     residual = level - np.median(others, axis=1)
     agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), floor)

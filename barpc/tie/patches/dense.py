@@ -18,6 +18,8 @@ ACROSS = 0.02
 """A part in which an affine frame misses the epipolar lines by more [px] is too large for one."""
 COLUMNS_PER_PIXEL = 2
 """Columns of the frame a pixel: heights of a Pleiades triplet differ by 0.62 m (NMAD), with one by 0.83 m."""
+ALLOWANCE = 4.0
+"""Pixels of a coarser picture that a surface may lie beyond what that shows."""
 WINDOW = 7
 """Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
 _SGBM = {
@@ -106,7 +108,11 @@ def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
 
 
 def dense_matches(
-    images: Sequence[str], sizes: Sequence[tuple[int, int]], frame: EpipolarFrame, band: int = 1
+    images: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    frame: EpipolarFrame,
+    band: int = 1,
+    coarse: tuple[Array, Array, float] | None = None,
 ) -> DenseMatches | None:
     """Match a part of two images; None where they do not show enough of it.
 
@@ -115,6 +121,8 @@ def dense_matches(
     images : paths of both; pictures of them of `sizes` (width, height) are matched, means of whole pixels
     frame : EpipolarFrame, of places in these pictures
     band : int, the band that is read, from 1
+    coarse : two arrays (n, 2), matches of coarser pictures as places [px] in these, and the side of their pixels: the
+        surface is looked for about them
     """
     window = _frame_window(sizes, frame)
     if window is None:
@@ -127,7 +135,11 @@ def dense_matches(
     if any(part is None for part in parts):
         return None
     (left, shown_left), (right, shown_right) = parts  # type: ignore[misc]
-    disparity, good = _both_ways(left, right, frame.num)
+    about = None if coarse is None else _coarse_disparity(coarse, frame, low, shape)
+    if about is None or about[2] >= frame.num:
+        disparity, good = _both_ways(left, right, 0, frame.num)
+    else:
+        disparity, good = _about_coarse(left, right, *about)
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
     disparity, sigma = _refined_disparity(left, right, disparity, good)
@@ -201,15 +213,54 @@ def _resampled(
     return np.asarray(moved, np.uint8), np.asarray(shown == 255)
 
 
-def _both_ways(left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], num: int) -> tuple[FloatImage, BoolArray]:
-    """Match both ways: disparities of `left`, kept where the way back from `right` ends at most a pixel beside."""
-    matcher = cv2.StereoSGBM.create(minDisparity=0, numDisparities=num, **_SGBM)
+def _coarse_disparity(
+    coarse: tuple[Array, Array, float], frame: EpipolarFrame, low: Array, shape: tuple[int, int]
+) -> tuple[FloatImage, int, int]:
+    """Return smooth disparities (rows, columns) through coarser matches, and the first and number of those about it."""
+    a, b = (place @ one[:, :2].T + one[:, 2] - low for place, one in zip(coarse, frame.maps, strict=False))
+    side = int(np.ceil(COLUMNS_PER_PIXEL * coarse[2]))  # columns of a coarser pixel, and as many rows: a cell
+    disparity, octaves = a[:, 0] - b[:, 0], int(np.ceil(np.log2(max(shape) / side + 1.0)))
+    count = 1 << octaves
+    col, row = np.clip((a / side).astype(np.int64), 0, count - 1).T
+    sums = [
+        np.stack([np.bincount(row * count + col, one, count**2).reshape(count, count) for one in (None, disparity)])
+    ]
+    for octave in range(octaves - 1, -1, -1):
+        sums.append(sums[-1].reshape(2, 1 << octave, 2, 1 << octave, 2).sum(axis=(2, 4)))
+    level = np.full((1, 1), float(np.median(disparity)))
+    for known, total in reversed(sums):  # what is far counts where nothing is near
+        near, of = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (known, total))
+        level = cv2.resize(level, known.shape, interpolation=cv2.INTER_LINEAR)
+        level += near / (near + 1.0) * (of / np.maximum(near, np.finfo(np.float64).tiny) - level)
+    level = cv2.resize(level, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)[: shape[1], : shape[0]]
+    place = np.clip(np.rint(a).astype(np.int64), 0, np.array(shape) - 1)
+    beside = disparity - level[place[:, 1], place[:, 0]]
+    first, last = np.percentile(beside, [1.0, 99.0]) + np.array([-1.0, 1.0]) * ALLOWANCE * coarse[2] * COLUMNS_PER_PIXEL
+    first = int(np.floor(first))
+    return level.astype(np.float32), first, 16 * int(np.ceil((last - first) / 16))
+
+
+def _about_coarse(
+    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], level: FloatImage, first: int, num: int
+) -> tuple[FloatImage, BoolArray]:
+    """Match as `_both_ways`, right where it is bent so that the coarse surface has no disparity."""
+    beside, good = _both_ways(left, np.asarray(_warped(right, level, cv2.INTER_CUBIC), np.uint8), first, num)
+    return np.asarray(beside + _warped(level, beside, cv2.INTER_LINEAR), np.float32), good
+
+
+def _both_ways(
+    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], first: int, num: int
+) -> tuple[FloatImage, BoolArray]:
+    """Match both ways: `num` disparities of `left` from the first on, kept where the way back from `right` ends at most
+    a pixel beside.
+    """
+    matcher = cv2.StereoSGBM.create(minDisparity=first, numDisparities=num, **_SGBM)
     there = matcher.compute(left, right).astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
     at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
-    good: BoolArray = (there >= 0) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)
+    good: BoolArray = (there >= first) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)
     return there, good
 
 

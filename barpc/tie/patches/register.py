@@ -14,11 +14,10 @@ from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
-from barpc.base.statistics import FEW, robust_spread
+from barpc.base.statistics import FEW, kd_tree, robust_spread
 from barpc.scene import BoolArray, IntArray, Tracks, View
 from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
@@ -461,7 +460,7 @@ class _Registrations:
 
 def _usual(places: Array, sigma: Array) -> Array:
     """Return the median of the sigmas (N,) of the nearest places (N, 2)."""
-    near = cKDTree(places).query(places, k=min(FEW, len(places)))[1]
+    near = kd_tree(places).query(places, k=min(FEW, len(places)))[1]
     out: Array = np.median(sigma[near.reshape(len(places), -1)], axis=1)
     return out
 
