@@ -166,9 +166,6 @@ class Stub:
     def read(self, size: int) -> bytes:
         return bytes(size)
 
-    def pipe_file(self, _url: str, _data: bytes) -> None:
-        raise FileNotFoundError("http://inner/upload")
-
 
 @pytest.mark.parametrize(("scheme", "noticed"), [("gs", True), ("az", True), ("s3", False)])
 def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(
@@ -196,11 +193,3 @@ def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("fsspec.filesystem", missing)
     with pytest.raises(ImageError, match=r"pip install 'barpc\[remote\]' \(gcsfs is missing\)"):
         versioned(located("gs://scenes/a.tif", ["gs://scenes"]), IMAGE)
-
-
-def test_what_a_store_says_is_cut_to_its_first_line() -> None:
-    def ask() -> None:
-        raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")
-
-    with pytest.raises(OSError, match=r"^its store answers ValueError: refused$"):
-        hosts._store_answer(ask)
