@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcFormatError
-from barpc.base.geodesy import ecef_from_ground, enu_basis
+from barpc.base.geodesy import ecef_from_ground
 from barpc.sensor.linescan import Detector, Samples, _check_times, camera_of_samples, read_linescan, unit
 from tests.sensor.linescan_files import SIZE, Flight, Truth, dimap, isd, stamp
 
@@ -487,12 +487,3 @@ def test_a_short_image_may_miss_by_two_rows(tmp_path) -> None:
         else:
             with pytest.raises(RpcFormatError, match="in no unit"):
                 read(tmp_path, end)
-
-
-def test_the_camera_is_above_its_image() -> None:
-    """Of the helper: the flight looks down by 25 degrees."""
-    model = camera_of_samples(samples(), detector()).model
-    ground = model.localize((np.array(SIZE) - 1) / 2, np.zeros(()))
-    up = enu_basis(ground)[2]
-    sight = model.position((SIZE[1] - 1) / 2) - ecef_from_ground(ground)
-    assert np.degrees(np.arccos(sight @ up / np.linalg.norm(sight))) == pytest.approx(25.0, abs=0.1)
