@@ -19,12 +19,13 @@ from barpc.fit import refit as fit_module
 from barpc.fit.certificate import Localisation, localisation_errors
 from barpc.fit.methods import normalization, solve, tidy
 from barpc.fit.points import SAMPLE_CELLS, Errors, Sample, control_points
-from barpc.fit.poles import Region, smallest_denominator
+from barpc.fit.poles import Region
 from barpc.fit.refit import _plainer, innermost, localisation_problem
 from barpc.fit.system import PRECISIONS, FitProblem, solution
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
+from tests.fit.models import made
 
 # --- the least squares of a quotient -------------------------------------------------------------------------
 
@@ -206,16 +207,6 @@ def test_what_rpcm_prints_has_twelve_decimals() -> None:
 # --- which fit is taken ----------------------------------------------------------------------------------------
 
 
-def made(**changes: Any) -> RpcFit:
-    one = np.ones(2)
-    values: dict[str, Any] = {
-        "rpc": synthetic_rpc(), "rmse_cnp": one * 1e-3, "max_cnp": one * 2e-3, "rmse_ckp": one * 3e-3,
-        "max_ckp": one * 5e-3, "beyond": 1e-3, "min_denominator": 0.9, "roundtrip": 1e-9, "coverage": 1.0, "h": one,
-        "iterations": 1, "num_cnp": 100, "num_ckp": 50, "method": "ridge",
-    }  # fmt: skip
-    return RpcFit(**{**values, **changes})
-
-
 @pytest.mark.parametrize(("largest", "methods"), [(0.9e-6, ["ridge"]), (1.1e-6, ["ridge", "gauss-newton"])])
 def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(largest, methods) -> None:
     tried: list[str] = []
@@ -376,23 +367,6 @@ def test_rounding_is_not_looked_into(size: float, rounds: int) -> None:
 
     assert sample.sought(level)[1].tolist() == [size, size]
     assert len(asked) == 1 + rounds
-
-
-def test_a_lower_bound_is_that_of_the_worst_cubic_over_the_box_and_a_quarter_around_it() -> None:
-    """2 + x over [-1, 1] and 3 - y over [0, 2]: what they are at the centre is 2, and 2."""
-    cubics = np.zeros((2, 20))
-    cubics[0, [0, 1]], cubics[1, [0, 2]] = [2.0, 1.0], [3.0, -1.0]
-    box = np.array([[-1.0, 1.0], [0.0, 2.0], [0.0, 1.0]])
-
-    def smallest_value(cubics: Array, box: Array) -> float:
-        coeffs = np.stack([np.eye(20)[1], cubics[0], np.eye(20)[2], cubics[-1]])
-        return smallest_denominator(RPC(coeffs, [0.0] * 3, [1.0] * 3, [0.0] * 2, [1.0] * 2), *box.T)
-
-    assert smallest_value(cubics[:1], box) == pytest.approx((2 - 1.25) / 2)
-    assert smallest_value(cubics[1:], box) == pytest.approx((3 - 2.25) / 2)
-    assert smallest_value(cubics, box[:, ::-1]) == pytest.approx(0.375)
-    cubics[1, 2] = -1.2
-    assert smallest_value(cubics, box) == pytest.approx((3 - 1.2 * 2.25) / (3 - 1.2))
 
 
 def test_errors_of_nothing_and_of_no_number() -> None:

@@ -182,6 +182,8 @@ def test_tags_without_an_altitude_or_a_name(tmp_path) -> None:
 
     tagged(*(GroundControlPoint(row=k, col=1, x=5.4, y=43.2, z=100.0, id=name) for k, name in enumerate("ab")))
     found = read_gcps(path, NAMES)
+    assert found.view.tolist() == [0, 0]
+    assert found.lonlatalt.tolist() == [[5.4, 43.2, 100.0]] * 2
     assert found.xy.tolist() == [[1.0, 0.0], [1.0, 1.0]]
     assert (found.sigma == 1.0).all()
     assert (found.xy_sigma == 0.5).all()

@@ -481,13 +481,18 @@ def test_a_yaml_of_two_images_or_without_numbers() -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1.5", 1.5), ("+.5", 0.5), ("-2.", -2.0), ("1d3", 1000.0), ("1E-2 m", 0.01), ("7°", 7.0), ("7%", 7.0)],
-)
+    [
+        ("1.5", 1.5), ("+.5", 0.5), ("-2.", -2.0), ("1d3", 1000.0), ("1E-2 m", 0.01), ("7°", 7.0), ("7%", 7.0),
+        ("+005124.00 pixels", 5124.0), ("-1.5D-03", -0.0015), ("1e3\tm", 1000.0),
+    ],
+)  # fmt: skip
 def test_a_number_begins_its_text(text: str, value: float) -> None:
     assert number(text, "a", "K") == value
 
 
-@pytest.mark.parametrize("text", ["", "x", "1x", "1,2", ".", "1e", "--1"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "1x", "1,2", ".", "1e", "--1", "0x10", "1_000", "12abc", "1.2.3", "nan", "inf", "-inf"]
+)
 def test_what_is_no_number_is_refused_by_name(text: str) -> None:
     with pytest.raises(RpcFormatError, match="a: K is not a number"):
         number(text, "a", "K")

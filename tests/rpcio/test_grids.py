@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from scipy.interpolate import RegularGridInterpolator
 
-from barpc.base.errors import BarpcError, OutputError, RpcError, RpcFormatError
+from barpc.base.errors import BarpcError, RpcError, RpcFormatError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cameras import open_camera
 from barpc.fit.points import Sample
@@ -175,17 +175,6 @@ def test_only_tools_that_are_not_installed_are_missed(folder, monkeypatch):
     (sentence,) = unverified([folder / f"a{GRID_SUFFIX}"])
     assert sentence.endswith("a_grid.tif: only barpc itself has read it (.tif: shareloc would, and is not installed)")
     assert unverified([folder / f"a{CORRECTION}"]) == []  # GDAL has
-
-
-def test_a_grid_that_is_there_is_replaced_only_when_that_is_asked_for(folder, camera, tmp_path):
-    path = tmp_path / f"a{GRID_SUFFIX}"
-    path.write_text("mine")
-    grid = open_camera(folder / f"a{GRID_SUFFIX}").model
-    with pytest.raises(OutputError, match="exists"):
-        write_grid(grid, path)
-    assert path.read_text() == "mine"
-    write_grid(grid, path, overwrite=True)
-    assert open_camera(path).model.lonlat.shape == grid.lonlat.shape
 
 
 def test_uneven_nodes_are_not_written(tmp_path):
