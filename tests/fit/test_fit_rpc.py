@@ -157,6 +157,8 @@ def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> No
         fit_rpc(camera.model, camera.size, (1e7, 2e7))
     with pytest.raises(FitError, match="not an interval"):
         fit_rpc(camera.model, camera.size, (500.0, 0.0))
+    with pytest.raises(FitError, match="nothing to fit over"):
+        fit_rpc(camera.model, (0, 5), camera.alt_range)
 
 
 @pytest.mark.slow

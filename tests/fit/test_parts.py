@@ -279,6 +279,8 @@ def test_a_model_without_ground_for_a_tenth_of_its_image_is_refused() -> None:
 
     with pytest.warns(BarpcWarning, match=r"^8\.9% of the image has no ground point"):
         fit = fit_rpc(Holed(4), camera.size, camera.alt_range)  # type: ignore[arg-type]
+    assert fit.coverage < 1.0
+    assert fit.max_ckp.max() < 1e-6
     assert fit.num_ckp == 41 * 45
     with pytest.raises(FitError, match=r"no ground point for 11% of the image over altitudes 0 to 1000 m"):
         fit_rpc(Holed(5), camera.size, camera.alt_range)  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import os
 import ssl
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -445,6 +446,17 @@ def test_a_part_of_an_object_ends_where_it_does(shelf):
     shelf.kind = "directory"
     with pytest.raises(OSError, match="a folder"):
         hosts.fetch(STORED, 0, 4)
+
+
+@pytest.mark.parametrize(("scheme", "noticed"), [("gs", True), ("az", True), ("s3", False)])
+def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(shelf, scheme, noticed):
+    at, tags = f"{scheme}://b/x", iter("11112")
+    shelf.objects[at], shelf.info = bytes(20), lambda _: {"size": 20, "etag": next(tags)}
+    assert hosts.fetch(Remote(at), 0, 10).tag == "1"
+    known = Remote(at, 20, "1")
+    assert hosts.fetch(known, 0, 10).data == bytes(10)
+    with pytest.raises(OSError, match="changed in its store") if noticed else nullcontext():
+        assert hosts.fetch(known, 10, 20).data == bytes(10)
 
 
 def test_an_object_that_is_cut_short_is_noticed(shelf):
