@@ -122,3 +122,20 @@ def test_points_far_outside_the_box_are_found_with_care(curved) -> None:
     found, ok = curved.solve(curved.value(x), x[2])
     assert ok.all()
     np.testing.assert_allclose(found, x, atol=1e-6)
+
+
+def test_a_step_is_halved_until_the_error_falls_and_never_crosses_a_pole() -> None:
+    steep = make(slope=0.9)
+    target = steep.value(np.array([[0.5], [0.5], [0.0]]))
+    for times, halvings in ((1.0, 0), (4.0, 1), (100.0, 6)):
+        x = np.array([[0.45], [0.5], [0.0]])
+        step = np.array([[0.05 * times], [0.0]])
+        assert steep._line_search(target, x, step, np.ones((2, 1))).all()
+        assert x[0, 0] == pytest.approx(0.45 + 0.05 * times / 2**halvings)
+    x = np.array([[0.45], [0.5], [0.0]])
+    assert not steep._line_search(target, x, np.array([[-0.1], [0.0]]), np.ones((2, 1))).any()
+    assert x[0, 0] == 0.45
+    across = np.array([[-1.0], [0.0], [0.0]])  # from just before the pole a step to the other side
+    goal = steep.value(np.array([[-1.3], [0.0], [0.0]]))
+    steep._line_search(goal, across, np.array([[-0.3], [0.0]]), np.ones((2, 1)))
+    assert across[0, 0] > -1 / 0.9
