@@ -559,21 +559,6 @@ def correction() -> CorrectionGrid:
     return CorrectionGrid(cols, rows, shift)
 
 
-def test_a_correction_grid_reads_back_with_its_nodes_at_the_centres_of_its_pixels(tmp_path: Path) -> None:
-    path, rpc = tmp_path / "a_correction.tif", make_rpc()
-    write_correction(correction(), rpc, path)
-    found, lacking = read_correction(path)
-    assert found == rpc
-    np.testing.assert_allclose(lacking.cols, correction().cols, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(lacking.rows, correction().rows, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(lacking.shift, correction().shift)
-    with rasterio.open(path) as dataset:
-        assert dataset.descriptions == ("dcol", "drow")
-        # GDAL counts from the corner of the first pixel: node (-0.5, -0.5) is at (0, 0) there
-        assert dataset.xy(0, 0) == pytest.approx((0.0, 0.0))
-        assert dataset.xy(4, 5) == pytest.approx((1000.0, 800.0))
-
-
 @pytest.mark.parametrize(("off", "ok"), [(0.8e-6, True), (1.3e-6, False)])
 def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path: Path) -> None:
     cols = np.linspace(-0.5, 999.5, 6)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.corrected import Corrected, Correction, correction_of
-from barpc.sensor.curve import rotation_left_jacobian, rotation_matrix
+from barpc.sensor.curve import rotation_matrix
 
 from .conftest import make_rpc
 
@@ -20,24 +20,6 @@ CENTER = ecef_from_ground([7.0, 42.0, 7e5])
 def test_the_rotation_matrix_is_scipys(angle):
     vector = angle * np.array([0.6, -0.48, 0.64])
     np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 9e-3, 1.1e-2, 1.0])
-def test_the_left_jacobian_is_the_derivative_of_the_rotation(angle):
-    vector = angle * np.array([0.6, -0.48, 0.64])
-    v, step = np.array([1.0, 2.0, 3.0]), 1e-5
-    for axis in range(3):
-        d = step * np.eye(3)[axis]
-        difference = (rotation_matrix(vector + d) @ v - rotation_matrix(vector - d) @ v) / (2 * step)
-        analytic = np.cross(rotation_left_jacobian(vector)[:, axis], rotation_matrix(vector) @ v)
-        np.testing.assert_allclose(analytic, difference, rtol=0, atol=1e-9)
-
-
-def test_no_correction_changes_nothing():
-    rpc = make_rpc()
-    ground = rpc.localize(np.array([[100.0, 200.0], [15000.0, 9000.0]]), np.array([10.0, 900.0]))
-    same = Corrected(rpc, Correction(np.zeros(3), np.zeros(3), CENTER))
-    np.testing.assert_allclose(same.project(ground), rpc.project(ground), rtol=0, atol=2e-7)
 
 
 @pytest.mark.parametrize("bad", [[1.0, 2.0], [np.nan, 0.0, 0.0]])
