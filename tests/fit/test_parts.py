@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -207,35 +207,46 @@ def test_what_rpcm_prints_has_twelve_decimals() -> None:
 # --- which fit is taken ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("largest", "methods"), [(0.9e-6, ["ridge"]), (1.1e-6, ["ridge", "gauss-newton"])])
-def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(largest, methods) -> None:
+POLES = [{"min_denominator": least, "max_ckp": np.full(2, 0.02)} for least in (-0.1, 0.0, float("nan"))]
+WORSE = {"max_ckp": np.full(2, 0.03)}
+
+
+@pytest.mark.parametrize(
+    ("ridge", "newton", "how", "taken"),
+    [
+        # the least squares are looked for where a ridge leaves a millionth of a pixel of a model, and only there
+        ({"max_ckp": np.array([0.9e-6, 1e-9])}, None, {}, "ridge"),
+        ({"max_ckp": np.array([1.1e-6, 1e-9])}, {"rmse_ckp": np.full(2, 1.0)}, {}, "ridge"),
+        ({}, None, {"exact": False}, "ridge"),
+        ({}, None, {"method": "ridge"}, "ridge"),
+        # of accepted fits the one with the least error
+        ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([4.5e-3, 1e-3])}, {}, "gauss-newton"),
+        ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([5.1e-3, 0.0])}, {}, "ridge"),
+        ({"max_ckp": np.full(2, 0.1), "rmse_ckp": np.zeros(2)}, {}, {}, "gauss-newton"),
+        ({"max_ckp": np.full(2, 0.1)}, None, {"exact": False}, r"0\.1 px"),
+        ({"max_ckp": np.full(2, 0.1)}, None, {"method": "ridge"}, r"0\.1 px"),
+        # one with a pole gives way to one without, if that is accepted or nobody asks
+        *((pole, WORSE, {"tolerance": 0.1}, "gauss-newton") for pole in POLES),
+        *((pole, WORSE, {"tolerance": 0.01, "strict": False}, "gauss-newton") for pole in POLES),
+        *((pole, WORSE, {"tolerance": 0.01}, r"0\.03 px") for pole in POLES),
+        ({"max_ckp": np.full(2, 0.02)}, WORSE, {"tolerance": 0.01, "strict": False}, "ridge"),
+    ],
+)
+def test_of_several_fits_the_best_is_taken(ridge, newton, how, taken) -> None:
+    fits = {"ridge": made(**ridge)} | (
+        {} if newton is None else {"gauss-newton": made(method="gauss-newton", **newton)}
+    )
     tried: list[str] = []
+    given = dict(how)
+    strict, exact = given.pop("strict", True), given.pop("exact", True)
 
     def attempt(method: str) -> RpcFit:
         tried.append(method)
-        return made(method=method, max_ckp=np.array([largest, 1e-9]), rmse_ckp=np.full(2, 1e-7))
+        return fits[method]
 
-    fit_module._best_method(attempt, FitOptions(), True, exact=True)
-    assert tried == methods
-    tried.clear()
-    fit_module._best_method(attempt, FitOptions(), True, exact=False)
-    assert tried == ["ridge"]
-    tried.clear()
-    fit_module._best_method(attempt, FitOptions(method="lcurve-joint"), True, exact=True)
-    assert tried == ["lcurve-joint"]
-
-
-def test_of_accepted_fits_the_one_with_the_least_error_is_taken() -> None:
-    fits = {
-        "ridge": made(rmse_ckp=np.array([3e-3, 4e-3])),
-        "gauss-newton": made(method="gauss-newton", rmse_ckp=np.array([4.5e-3, 1e-3])),
-    }
-    choose = partial(fit_module._best_method, exact=True)
-    assert choose(fits.__getitem__, FitOptions(), True).method == "gauss-newton"
-    fits["gauss-newton"] = replace(fits["gauss-newton"], rmse_ckp=np.array([5.1e-3, 0.0]))
-    assert choose(fits.__getitem__, FitOptions(), True).method == "ridge"
-    fits["ridge"] = replace(fits["ridge"], max_ckp=np.full(2, 0.1))  # not accepted
-    assert choose(fits.__getitem__, FitOptions(), True).method == "gauss-newton"
+    with pytest.raises(FitError, match=taken) if " px" in taken else nullcontext():
+        assert fit_module._best_method(attempt, FitOptions(**given), strict, exact).method == taken
+    assert tried == list(fits)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 from barpc.base.errors import FitError, InputError, RpcError
 from barpc.base.geodesy import metres_per_unit
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit import refit as fit_module
 from barpc.fit.certificate import coverage, roundtrip
 from barpc.fit.methods import solve_lcurve
 from barpc.fit.points import (
@@ -316,28 +314,6 @@ def test_a_verdict_names_what_is_wrong(changes: dict[str, Any], tolerance: float
     verdict = made(**changes).verdict(tolerance)
     assert message in verdict
     assert bool(verdict) == bool(message)
-
-
-@pytest.mark.parametrize("least", [-0.1, 0.0, float("nan")])
-def test_a_fit_with_a_pole_gives_way_to_one_without(least: float) -> None:
-    fits = {
-        "ridge": made(min_denominator=least, max_ckp=np.full(2, 0.02)),
-        "gauss-newton": made(max_ckp=np.full(2, 0.03), method="gauss-newton"),
-    }
-    choose = partial(fit_module._best_method, exact=True)
-    assert choose(fits.__getitem__, FitOptions(tolerance=0.1), True).method == "gauss-newton"
-    assert choose(fits.__getitem__, FitOptions(tolerance=0.01), False).method == "gauss-newton"
-    with pytest.raises(FitError, match=r"0\.03 px"):
-        choose(fits.__getitem__, FitOptions(tolerance=0.01), True)
-    fits["ridge"] = made(max_ckp=np.full(2, 0.02))
-    assert choose(fits.__getitem__, FitOptions(tolerance=0.01), False).method == "ridge"
-    fits = {name: replace(fit, max_ckp=np.full(2, 0.2)) for name, fit in fits.items()}
-    fits["gauss-newton"] = made(method="gauss-newton")
-    assert choose(fits.__getitem__, FitOptions(), True).method == "gauss-newton"
-    with pytest.raises(FitError):
-        partial(choose, exact=False)(fits.__getitem__, FitOptions(), True)
-    with pytest.raises(FitError):
-        choose(fits.__getitem__, FitOptions(method="ridge"), True)
 
 
 def test_the_round_trip_is_measured_in_pixels() -> None:
