@@ -39,7 +39,7 @@ from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
-from tests.rpcio.conftest import dimap_v2, grid, make_rpc, write_image, yaml
+from tests.rpcio.conftest import dimap_v2, grid, make_rpc, pixels, write_image, yaml
 
 # --- TIFF ------------------------------------------------------------------------------------------------------
 
@@ -210,11 +210,6 @@ def mosaic(folder: Path) -> Path:
     write_image(folder / "scene.tif")
     write_rpc_vrt(make_rpc(), folder / "scene.tif", folder / "scene.vrt")
     return folder / "scene.vrt"
-
-
-def pixels(path: Path) -> np.ndarray:
-    with open_raster(path) as dataset:
-        return np.asarray(dataset.read())
 
 
 def test_a_vrt_is_copied_with_its_pixels(tmp_path: Path) -> None:

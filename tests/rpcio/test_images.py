@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,13 +27,7 @@ from barpc.rpcio import (
     write_rpc_vrt,
 )
 from barpc.rpcio.images import printable, put_tag, read_tag
-from tests.rpcio.conftest import grid, make_rpc, write_image, write_nitf
-
-
-def pixels(path: Path) -> np.ndarray:
-    with open_raster(path) as dataset:
-        return np.asarray(dataset.read())
-
+from tests.rpcio.conftest import grid, make_rpc, pixels, write_image, write_nitf
 
 KINDS = {
     "uint16": {},
