@@ -10,7 +10,6 @@ import pytest
 
 from barpc.base.errors import RpcError
 from barpc.cameras import open_camera
-from barpc.sensor import geometry
 from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
 from barpc.simulate import Look, fly
 
@@ -155,7 +154,7 @@ def test_the_centre_of_a_matrix_is_the_same_whatever_the_unit_of_the_image() -> 
 
         return Seen()
 
-    one = geometry._center_projective(moved(10.0), size, ALTITUDES)
-    other = geometry._center_projective(moved(0.01), tuple(1000 * (side - 1) + 1 for side in size), ALTITUDES)
+    one = camera_center(moved(10.0), size, ALTITUDES, "projective").ecef
+    other = camera_center(moved(0.01), tuple(1000 * (n - 1) + 1 for n in size), ALTITUDES, "projective").ecef
     np.testing.assert_allclose(one, other, rtol=1e-6)
     assert np.linalg.norm(one - Pinhole().center) < 0.2 * 7e5
