@@ -156,14 +156,6 @@ def test_given_points_say_nothing_of_the_rest_of_the_image():
     assert fit_rpc_points(ground, image).beyond == 1.0
 
 
-def test_smooth_cameras_are_fitted_by_the_ridge_alone():
-    camera = synthetic()
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
-    assert fit.method == "ridge"
-    assert fit.iterations <= 2
-    assert fit.rmse_ckp.max() < 2e-8
-
-
 def test_a_least_value_is_never_above_and_hardly_below_what_a_dense_lattice_finds():
     rng, t = np.random.default_rng(0), np.linspace(0.0, 1.0, 31)
     for _ in range(20):
