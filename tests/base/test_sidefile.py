@@ -252,12 +252,6 @@ def test_sniffers_and_readers_take_time_in_proportion_to_the_text(fill, prefix):
         assert last < max(8 * first, 0.1), name  # a square takes 16 times as long, a cube 64
 
 
-def test_twenty_thousand_blank_lines_are_nothing():
-    assert cpu(lambda: parse_rpc(b"\n" * 20_000 + b"x", "x")) < 0.1
-    for row in FORMATS.values():
-        assert cpu(partial(row.sniff, "\n" * 20_000)) < 0.1
-
-
 @pytest.mark.nightly
 @pytest.mark.parametrize("fill", rest_slow(["<", "\n", " ", "(", "7", "<a>", "a"], mark=pytest.mark.nightly))
 def test_the_largest_rpc_file_that_is_read_ends_in_sensible_time(fill):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.export import TARGETS, _link_image, export_run, pinholes
+from barpc.export import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
@@ -138,12 +138,6 @@ def in_one_folder(run: Path, tmp_path: Path, folder: str = "/images") -> Path:
     return copy
 
 
-def test_images_of_one_folder_are_called_by_their_names(southern, tmp_path):
-    run = in_one_folder(southern, tmp_path)
-    for name in exported(run, "satnerf", tmp_path).glob("*.json"):
-        assert read(name)["img"] == f"{name.stem}.tif"
-
-
 @pytest.mark.slow
 def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
@@ -207,10 +201,12 @@ def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path, 
     assert "c.tif: no link to a.tif (Operation not permitted): copy the image there" in caplog.text
 
 
-def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path, monkeypatch):
-    monkeypatch.setattr(pinholes, "_called", lambda scene: [f"{shot.name} a.tif" for shot in scene.shots])
+def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
+    run = in_one_folder(southern, tmp_path)
+    summary = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(summary.replace('.tif"', ' a.tif"'))
     with pytest.raises(InputError, match="space"):
-        export_run(southern, "colmap", tmp_path / "out")
+        export_run(run, "colmap", tmp_path / "out")
 
 
 def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
@@ -246,25 +242,6 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     origin = [float(rows[7][key]) for key in ("lon", "lat", "alt")]
     scatter = np.cov(((found - ecef_from_ground(origin)) @ enu_basis(origin).T).T)
     np.testing.assert_allclose(np.diag(scatter), np.diag(matrix[7]), rtol=0.15)
-
-
-def test_stereo_configurations_parse_and_name_files_relative_to_themselves(southern, tmp_path):
-    yaml = pytest.importorskip("yaml")
-    config = read(exported(southern, "s2p", tmp_path) / "config.json")
-    views = read(southern / "summary.json")["views"]
-    where = [(tmp_path / "s2p" / image["img"]).resolve() for image in config["images"]]
-    assert where == [Path(view["path"]).resolve() for view in views]
-    assert not any(Path(image["img"]).is_absolute() for image in config["images"])
-    out = exported(southern, "cars", tmp_path)
-    given = yaml.safe_load((out / "inputs.yaml").read_text(encoding="utf-8"))["input"]
-    assert list(given["sensors"]) == [view["name"] for view in views]
-    assert all(len(pair) == 2 and set(pair) <= set(given["sensors"]) for pair in given["pairing"])
-    out_asp = exported(southern, "asp", tmp_path)
-    cameras = (out_asp / "cameras.txt").read_text().split()
-    for view, camera in zip(views, cameras, strict=True):
-        truth = read_rpc(southern / f"{view['name']}_RPC.TXT")
-        assert truth.off(read_rpc(out / given["sensors"][view["name"]]["geomodel"]["path"])).max() < 1e-6
-        assert truth.off(read_rpc(out_asp / camera)).max() < 1e-6
 
 
 def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, tmp_path):
@@ -303,8 +280,6 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
 def test_altitudes_may_be_given(southern, tmp_path):
     out = exported(southern, "colmap", tmp_path, alt_range=(-200.0, 2000.0))
     assert read(out / "world.json")["alt_range"] == [-200.0, 2000.0]
-    with pytest.raises(InputError, match="lower one first"):
-        export_run(southern, "colmap", tmp_path / "x", alt_range=(5.0, 5.0))
 
 
 @pytest.mark.parametrize("target", rest_slow(sorted(TARGETS, key=["s2p", "asp"].__contains__, reverse=True), 2))
@@ -378,12 +353,10 @@ def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
         main(["export", str(southern), str(tmp_path / "a b"), "--to", "s2p", "--json"])
     assert stop.value.code in (0, None)
     assert json.loads(capsys.readouterr().out) == [str(tmp_path / "a b" / "config.json")]
-
-
-def test_the_verb_offers_every_target():
-    from barpc.cli.run_commands import _TARGET_NAMES
-
-    assert tuple(TARGETS) == _TARGET_NAMES
+    with pytest.raises(SystemExit):
+        main(["export", "--help"])
+    words = capsys.readouterr().out.translate(str.maketrans("[]|,", "    ")).split()
+    assert set(TARGETS) <= set(words)  # the verb offers every target
 
 
 @pytest.mark.parametrize(

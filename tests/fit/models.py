@@ -10,7 +10,9 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.fit import RpcFit
 from barpc.simulate import Look, fly
+from tests.fit.cameras import synthetic_rpc
 
 
 @dataclass(frozen=True)
@@ -172,3 +174,14 @@ def hard() -> dict[str, tuple[object, tuple[int, int], tuple[float, float]]]:
         "bump in a corner": (Bent(pushbroom(45.0), bump(SIZE, 250.0, 0.5, (0.01, 0.99))), SIZE, RANGE),
     }
     return found
+
+
+def made(**changes: object) -> RpcFit:
+    """A fit of these figures: a good one, but for what is changed."""
+    one = np.ones(2)
+    values: dict[str, object] = {
+        "rpc": synthetic_rpc(), "rmse_cnp": one * 1e-3, "max_cnp": one * 2e-3, "rmse_ckp": one * 3e-3,
+        "max_ckp": one * 5e-3, "beyond": 1e-3, "min_denominator": 0.9, "roundtrip": 1e-9, "coverage": 1.0, "h": one,
+        "iterations": 1, "num_cnp": 100, "num_ckp": 50, "method": "ridge",
+    }  # fmt: skip
+    return RpcFit(**{**values, **changes})  # type: ignore[arg-type]

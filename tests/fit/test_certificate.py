@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from barpc.base.errors import BarpcWarning, FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import SAMPLE_CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator
@@ -157,14 +156,6 @@ def test_given_points_say_nothing_of_the_rest_of_the_image():
     assert fit_rpc_points(ground, image).beyond == 1.0
 
 
-def test_smooth_cameras_are_fitted_by_the_ridge_alone():
-    camera = synthetic()
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range)
-    assert fit.method == "ridge"
-    assert fit.iterations <= 2
-    assert fit.rmse_ckp.max() < 2e-8
-
-
 def test_a_least_value_is_never_above_and_hardly_below_what_a_dense_lattice_finds():
     rng, t = np.random.default_rng(0), np.linspace(0.0, 1.0, 31)
     for _ in range(20):
@@ -186,30 +177,6 @@ def test_a_pole_between_the_points_of_a_lattice_is_not_missed():
     slit = RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
     low, high = rpc.ground_offset - rpc.ground_scale, rpc.ground_offset + rpc.ground_scale
     assert smallest_denominator(slit, low, high) < 0
-
-
-class Holed:
-    """A model without ground under a strip of its rows."""
-
-    def __init__(self, model, start: float, stop: float) -> None:
-        self.model, self.rows = model, (start, stop)
-        self.project = model.project
-
-    def localize(self, image, alt):
-        ground = self.model.localize(image, alt)
-        out = (image[..., 1] > self.rows[0]) & (image[..., 1] < self.rows[1])
-        return np.where(out[..., None], np.nan, ground)
-
-
-def test_what_is_missing_is_stated_by_area_and_five_percent_are_fitted():
-    camera = synthetic()
-    rows = camera.size[1]
-    with pytest.warns(BarpcWarning, match=r"^(4\.[6-9]|5\.[0-4])% of the image has no ground point and is left out"):
-        fit = fit_rpc(Holed(camera.model, -1.0, 0.05 * rows), camera.size, camera.alt_range)
-    assert fit.max_ckp.max() < 1e-6
-    assert 0.93 * SAMPLE_CELLS**2 < fit.num_ckp < 0.97 * SAMPLE_CELLS**2
-    with pytest.raises(FitError, match=r"no ground point for (19|20|21)% of the image"):
-        fit_rpc(Holed(camera.model, 0.4 * rows, 0.6 * rows), camera.size, camera.alt_range)
 
 
 def test_points_are_all_over_the_image_and_its_altitudes():

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.base.errors import BarpcWarning, FitError
-from barpc.base.geodesy import Array
+from barpc.base.errors import FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
 from barpc.fit.system import PRECISIONS
@@ -65,6 +64,8 @@ def test_the_certificate_holds_on_points_that_neither_grid_contains(camera: Came
     ground, image = random_points(camera, 5000, np.random.default_rng(1))
     error = fit.rpc.project(ground) - image
     assert miss(camera) >= 1.0
+    assert (fit.method, fit.rmse_ckp.max() < 2e-8) == ("ridge", True)  # a smooth camera
+    assert fit.iterations <= 2
     assert fit.max_ckp.max() <= 5e-8  # edges and corners included; its own rounding of coordinates
     assert np.abs(error).max() <= 3 * fit.max_ckp.max()
     assert np.all(np.sqrt((error**2).mean(axis=0)) <= 3 * fit.rmse_ckp)
@@ -158,29 +159,6 @@ def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> No
         fit_rpc(camera.model, camera.size, (1e7, 2e7))
     with pytest.raises(FitError, match="not an interval"):
         fit_rpc(camera.model, camera.size, (500.0, 0.0))
-
-
-class Holed:
-    """A camera that has no ground point in a corner of its image."""
-
-    def __init__(self, camera: Camera, share: float) -> None:
-        self.camera, self.share = camera, share
-        self.project, self.project_jacobian = camera.model.project, camera.model.project_jacobian
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        ground = self.camera.model.localize(image, alt)
-        hole = (image < self.share * np.array(self.camera.size)).all(axis=-1)
-        return np.where(hole[..., None], np.nan, ground)
-
-
-def test_a_small_hole_is_said_and_a_large_one_refused(camera: Camera) -> None:
-    with pytest.warns(BarpcWarning, match=r"^0\.[12]% of the image has no ground point and is left out"):
-        fit = fit_rpc(Holed(camera, 0.05), camera.size, camera.alt_range)
-    assert fit.max_ckp.max() <= 1e-7
-    assert fit.num_cnp < 12 * 12 * 7
-    assert fit.coverage < 1.0
-    with pytest.raises(FitError, match="no ground point for"):
-        fit_rpc(Holed(camera, 0.6), camera.size, camera.alt_range)
     with pytest.raises(FitError, match="nothing to fit over"):
         fit_rpc(camera.model, (0, 5), camera.alt_range)
 

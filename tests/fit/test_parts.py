@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,13 @@ from barpc.fit import refit as fit_module
 from barpc.fit.certificate import Localisation, localisation_errors
 from barpc.fit.methods import normalization, solve, tidy
 from barpc.fit.points import SAMPLE_CELLS, Errors, Sample, control_points
-from barpc.fit.poles import Region, smallest_denominator
+from barpc.fit.poles import Region
 from barpc.fit.refit import _plainer, innermost, localisation_problem
 from barpc.fit.system import PRECISIONS, FitProblem, solution
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
+from tests.fit.models import made
 
 # --- the least squares of a quotient -------------------------------------------------------------------------
 
@@ -206,45 +207,46 @@ def test_what_rpcm_prints_has_twelve_decimals() -> None:
 # --- which fit is taken ----------------------------------------------------------------------------------------
 
 
-def made(**changes: Any) -> RpcFit:
-    one = np.ones(2)
-    values: dict[str, Any] = {
-        "rpc": synthetic_rpc(), "rmse_cnp": one * 1e-3, "max_cnp": one * 2e-3, "rmse_ckp": one * 3e-3,
-        "max_ckp": one * 5e-3, "beyond": 1e-3, "min_denominator": 0.9, "roundtrip": 1e-9, "coverage": 1.0, "h": one,
-        "iterations": 1, "num_cnp": 100, "num_ckp": 50, "method": "ridge",
-    }  # fmt: skip
-    return RpcFit(**{**values, **changes})
+POLES = [{"min_denominator": least, "max_ckp": np.full(2, 0.02)} for least in (-0.1, 0.0, float("nan"))]
+WORSE = {"max_ckp": np.full(2, 0.03)}
 
 
-@pytest.mark.parametrize(("largest", "methods"), [(0.9e-6, ["ridge"]), (1.1e-6, ["ridge", "gauss-newton"])])
-def test_the_least_squares_are_looked_for_where_a_ridge_leaves_a_millionth_of_a_pixel(largest, methods) -> None:
+@pytest.mark.parametrize(
+    ("ridge", "newton", "how", "taken"),
+    [
+        # the least squares are looked for where a ridge leaves a millionth of a pixel of a model, and only there
+        ({"max_ckp": np.array([0.9e-6, 1e-9])}, None, {}, "ridge"),
+        ({"max_ckp": np.array([1.1e-6, 1e-9])}, {"rmse_ckp": np.full(2, 1.0)}, {}, "ridge"),
+        ({}, None, {"exact": False}, "ridge"),
+        ({}, None, {"method": "ridge"}, "ridge"),
+        # of accepted fits the one with the least error
+        ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([4.5e-3, 1e-3])}, {}, "gauss-newton"),
+        ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([5.1e-3, 0.0])}, {}, "ridge"),
+        ({"max_ckp": np.full(2, 0.1), "rmse_ckp": np.zeros(2)}, {}, {}, "gauss-newton"),
+        ({"max_ckp": np.full(2, 0.1)}, None, {"exact": False}, r"0\.1 px"),
+        ({"max_ckp": np.full(2, 0.1)}, None, {"method": "ridge"}, r"0\.1 px"),
+        # one with a pole gives way to one without, if that is accepted or nobody asks
+        *((pole, WORSE, {"tolerance": 0.1}, "gauss-newton") for pole in POLES),
+        *((pole, WORSE, {"tolerance": 0.01, "strict": False}, "gauss-newton") for pole in POLES),
+        *((pole, WORSE, {"tolerance": 0.01}, r"0\.03 px") for pole in POLES),
+        ({"max_ckp": np.full(2, 0.02)}, WORSE, {"tolerance": 0.01, "strict": False}, "ridge"),
+    ],
+)
+def test_of_several_fits_the_best_is_taken(ridge, newton, how, taken) -> None:
+    fits = {"ridge": made(**ridge)} | (
+        {} if newton is None else {"gauss-newton": made(method="gauss-newton", **newton)}
+    )
     tried: list[str] = []
+    given = dict(how)
+    strict, exact = given.pop("strict", True), given.pop("exact", True)
 
     def attempt(method: str) -> RpcFit:
         tried.append(method)
-        return made(method=method, max_ckp=np.array([largest, 1e-9]), rmse_ckp=np.full(2, 1e-7))
+        return fits[method]
 
-    fit_module._best_method(attempt, FitOptions(), True, exact=True)
-    assert tried == methods
-    tried.clear()
-    fit_module._best_method(attempt, FitOptions(), True, exact=False)
-    assert tried == ["ridge"]
-    tried.clear()
-    fit_module._best_method(attempt, FitOptions(method="lcurve-joint"), True, exact=True)
-    assert tried == ["lcurve-joint"]
-
-
-def test_of_accepted_fits_the_one_with_the_least_error_is_taken() -> None:
-    fits = {
-        "ridge": made(rmse_ckp=np.array([3e-3, 4e-3])),
-        "gauss-newton": made(method="gauss-newton", rmse_ckp=np.array([4.5e-3, 1e-3])),
-    }
-    choose = partial(fit_module._best_method, exact=True)
-    assert choose(fits.__getitem__, FitOptions(), True).method == "gauss-newton"
-    fits["gauss-newton"] = replace(fits["gauss-newton"], rmse_ckp=np.array([5.1e-3, 0.0]))
-    assert choose(fits.__getitem__, FitOptions(), True).method == "ridge"
-    fits["ridge"] = replace(fits["ridge"], max_ckp=np.full(2, 0.1))  # not accepted
-    assert choose(fits.__getitem__, FitOptions(), True).method == "gauss-newton"
+    with pytest.raises(FitError, match=taken) if " px" in taken else nullcontext():
+        assert fit_module._best_method(attempt, FitOptions(**given), strict, exact).method == taken
+    assert tried == list(fits)
 
 
 @pytest.mark.parametrize(
@@ -288,6 +290,8 @@ def test_a_model_without_ground_for_a_tenth_of_its_image_is_refused() -> None:
 
     with pytest.warns(BarpcWarning, match=r"^8\.9% of the image has no ground point"):
         fit = fit_rpc(Holed(4), camera.size, camera.alt_range)  # type: ignore[arg-type]
+    assert fit.coverage < 1.0
+    assert fit.max_ckp.max() < 1e-6
     assert fit.num_ckp == 41 * 45
     with pytest.raises(FitError, match=r"no ground point for 11% of the image over altitudes 0 to 1000 m"):
         fit_rpc(Holed(5), camera.size, camera.alt_range)  # type: ignore[arg-type]
@@ -376,23 +380,6 @@ def test_rounding_is_not_looked_into(size: float, rounds: int) -> None:
 
     assert sample.sought(level)[1].tolist() == [size, size]
     assert len(asked) == 1 + rounds
-
-
-def test_a_lower_bound_is_that_of_the_worst_cubic_over_the_box_and_a_quarter_around_it() -> None:
-    """2 + x over [-1, 1] and 3 - y over [0, 2]: what they are at the centre is 2, and 2."""
-    cubics = np.zeros((2, 20))
-    cubics[0, [0, 1]], cubics[1, [0, 2]] = [2.0, 1.0], [3.0, -1.0]
-    box = np.array([[-1.0, 1.0], [0.0, 2.0], [0.0, 1.0]])
-
-    def smallest_value(cubics: Array, box: Array) -> float:
-        coeffs = np.stack([np.eye(20)[1], cubics[0], np.eye(20)[2], cubics[-1]])
-        return smallest_denominator(RPC(coeffs, [0.0] * 3, [1.0] * 3, [0.0] * 2, [1.0] * 2), *box.T)
-
-    assert smallest_value(cubics[:1], box) == pytest.approx((2 - 1.25) / 2)
-    assert smallest_value(cubics[1:], box) == pytest.approx((3 - 2.25) / 2)
-    assert smallest_value(cubics, box[:, ::-1]) == pytest.approx(0.375)
-    cubics[1, 2] = -1.2
-    assert smallest_value(cubics, box) == pytest.approx((3 - 1.2 * 2.25) / (3 - 1.2))
 
 
 def test_errors_of_nothing_and_of_no_number() -> None:

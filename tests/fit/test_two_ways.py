@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from rasterio.transform import RPCTransformer
 
-from barpc.base.errors import BarpcWarning, FitError
+from barpc.base.errors import FitError
 from barpc.fit import fit_rpc, fit_rpc_points
 from barpc.rpcio import read_rpc
 from tests.fit.models import Frame
@@ -41,8 +41,6 @@ class Crooked:
         return image + {"half a pixel": 0.5, "2 px": 2.0, "less than wanted": 0.004}.get(self.fault, 0.0)
 
     def localize(self, image, alt):
-        if self.fault == "col and row exchanged, both ways":
-            image = image[..., SWAP]
         if self.fault == "altitude ignored":
             ground = self.camera.localize(image, 0.0 * alt + 300.0)
             return np.concatenate([ground[..., :2], np.asarray(alt)[..., None]], axis=-1)
@@ -74,24 +72,6 @@ def test_directions_of_two_cameras_are_refused_with_how_far_they_are_apart(fault
     assert largest[0] * (1 - 1e-6) <= fit.contradiction <= largest[1] * (1 + 1e-6)
     assert "contradicts itself" in fit.verdict(0.01)
     assert fit.summary()["contradiction"] == fit.contradiction
-
-
-@pytest.mark.parametrize("fault", ["lon and lat exchanged, both ways", "col and row exchanged, both ways"])
-def test_exchanged_axes_of_the_ground_are_refused_and_of_points_any_mirrored_image_is_said(fault):
-    model = Crooked(fault)
-    size = SIZE[::-1] if fault.startswith("col") else SIZE
-    if fault.startswith("lon"):
-        with pytest.raises(FitError, match="only with longitude and latitude exchanged"):
-            fit_rpc(model, size, ALTS)
-    fit = fit_rpc(model, size, ALTS, strict=False)
-    assert fit.contradiction < 1e-7
-    assert fit.verdict(0.01) == fit.summary()["axes"]
-    assert bool(fit.axes) == fault.startswith("lon")
-    image = np.random.default_rng(0).uniform(0, 1, (300, 2)) * size
-    ground = model.localize(image, np.linspace(*ALTS, 300))
-    with pytest.warns(BarpcWarning, match="mirrored"):
-        given = fit_rpc_points(ground, image)
-    np.testing.assert_allclose(given.rpc.project(ground), image, rtol=0, atol=1e-6)
 
 
 def test_axes_out_of_range_are_named():

@@ -62,30 +62,6 @@ def test_a_point_of_geojson_seen_in_two_images_is_one_point(tmp_path):
     assert (found.xy_sigma == IMAGE_SIGMA).all()
 
 
-def test_geojson_may_give_col_and_row(tmp_path):
-    point = {"type": "Point", "coordinates": [5.4, 43.2, 120]}
-    properties = {"col": 10.5, "row": 20.5, "filename": "left.tif"}
-    feature = {"type": "Feature", "geometry": point, "properties": properties}
-    path = tmp_path / "a.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    found = read_gcps(path, NAMES)
-    assert found.names == ("gcp_1",)
-    np.testing.assert_array_equal(found.xy, [[10.5, 20.5]])
-
-
-def test_tags_of_an_image_belong_to_that_image(tmp_path):
-    path = tmp_path / "right.tif"
-    gcps = [GroundControlPoint(row=20.5, col=10.25, x=5.4, y=43.2, z=100.0, id="p")]
-    with rasterio.open(
-        path, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8", gcps=gcps, crs="EPSG:4326"
-    ):
-        pass
-    found = read_gcps(path, NAMES)
-    np.testing.assert_array_equal(found.view, [1])
-    np.testing.assert_array_equal(found.xy, [[10.25, 20.5]])
-    np.testing.assert_array_equal(found.lonlatalt, [[5.4, 43.2, 100.0]])
-
-
 def test_tags_in_a_map_projection_are_brought_to_wgs84(tmp_path):
     path = tmp_path / "left.tif"
     gcps = [GroundControlPoint(row=2, col=1, x=5e5, y=4.7e6, z=100.0, id="p")]

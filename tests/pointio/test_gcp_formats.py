@@ -59,31 +59,21 @@ SAME = {
     "qgis new": ("left.points", f"#CRS: {WKT}\nmapX,mapY,sourceX,sourceY,enable,dX,dY,residual\n"
                  f"{LON},{LAT},{COL + 0.5},{-ROW - 0.5},1,0,0,0\n5,43,1,-1,0,0,0,0\n"),
     "qgis old": ("LEFT.TIF.points", f"mapX,mapY,pixelX,pixelY,enable\n{LON},{LAT},{COL + 0.5},{-ROW - 0.5},1\n"),
-    "odm code": ("g.txt", f"EPSG:32631\n{MAP[0]} {MAP[1]} {ALT} {COL + 0.5} {ROW + 0.5} left.JPG gcp1 extra\n"),
-    "odm zone": ("g.txt", f"WGS84 UTM 31N\n{MAP[0]} {MAP[1]} {ALT} {COL + 0.5} {ROW + 0.5} left.JPG\n"),
     "odm proj": ("g.txt", f"+proj=utm +zone=31 +datum=WGS84 +units=m +no_defs\n{MAP[0]}\t{MAP[1]}\tNaN\t{COL + 0.5}\t"
                  f"{ROW + 0.5}\tleft.JPG\n"),
-    "odm degrees": ("g.txt", f"EPSG:4326\n# a comment\n{LON} {LAT} {ALT} {COL + 0.5} {ROW + 0.5} left.tif\n"),
     "envi degrees": ("left.pts", "; ENVI Image to Map GCP File\n; projection info = {Geographic Lat/Lon, WGS-84, "
                      f"units=Degrees}}\n; Map (x,y), Image (x,y)\n;\n{LON} {LAT} {COL + 1.5} {ROW + 1.5}\n"),
-    "envi utm": ("left.pts", "; projection info = {UTM, 31, North, WGS-84, units=Meters}\n; Map (x,y), Image (x,y)\n"
-                 f"  {MAP[0]}   {MAP[1]}   {COL + 1.5}   {ROW + 1.5}\n"),
     "envi image first": ("left.pts", "; ENVI\n; Image (x,y), Map (x,y)\n" f"{COL + 1.5} {ROW + 1.5} {LON} {LAT}\n"),
     "metashape": ("m.csv", "# CoordinateSystem: EPSG:4979\n#Label,Camera,X/Longitude,Y/Latitude,Z/Altitude,px,py,"
                   f"Accuracy_(m),Error_(m)\np,left,{LON},{LAT},{ALT},{COL + 0.5},{ROW + 0.5},,0.3\n# Total Error\n"),
     "micmac": ("g.xml", micmac()),
     "old geojson": ("g.geojson", old_geojson([EAST, NORTH], col=COL, row=ROW)),
-    "old geojson 3-D": ("g.geojson", old_geojson([EAST, NORTH, ALT], ji=[COL, ROW])),
     "asp": ("g.gcp", f"p {LAT} {LON} {ALT} 1 1 1 left.tif {COL} {ROW} 0.5 0.5\n"),
-    "csv with its system": ("g.csv", f"# CRS: EPSG:32631\nname,E,N,h,image,col,row\np,{MAP[0]},{MAP[1]},{ALT},left,"
-                            f"{COL},{ROW}\n"),
-    "csv with a column of it": ("g.csv", f"epsg,x_map,y_map,z,image,col,row\n32631,{MAP[0]},{MAP[1]},{ALT},left,{COL},"
-                                f"{ROW}\n"),
     "csv dms": ("g.csv", "Lat;Lon;Alt [ft];photo;pixel x;pixel y\n43°18'00.0\"N;005° 24' 00\"E;"
                 f"{ALT / 0.3048:.9f};C:\\flight\\LEFT.JPG;263,25;889,75\n"),
 }  # fmt: skip
 """The same point in the syntax of each tool, its pixels counted as that tool does."""
-NO_ALTITUDE = ("qgis new", "qgis old", "odm proj", "envi degrees", "envi utm", "envi image first", "old geojson")
+NO_ALTITUDE = ("qgis new", "qgis old", "odm proj", "envi degrees", "envi image first", "old geojson")
 
 
 @pytest.mark.parametrize("name", SAME)

@@ -60,12 +60,6 @@ def test_asp_pairs_that_share_a_keypoint_are_one_track(tmp_path):
     assert len(read_matches(tmp_path / "run-a__b.txt", NAMES)) == 4
 
 
-def test_a_track_that_meets_itself_in_one_view_is_left_out(tmp_path):
-    _asp(tmp_path / "a__b.txt", [(1, 2), (5, 6)], [(3, 4), (3, 4)])
-    _asp(tmp_path / "b__c.txt", [(30, 40)], [(9, 9)])
-    assert len(read_matches(tmp_path, NAMES)) == 2
-
-
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [

@@ -270,6 +270,11 @@ REFUSED = {
     "a service": (band(source("wms.xml")), "not a raster"),
     "a grid of text": (band(source("grid.asc")), "not a raster"),
     "a name of nothing": (band(source("")), "no plain local file"),
+    "an address": (band(source("http://127.0.0.1:9/x.tif", relative=0)), "no plain local file"),
+    "an address by GDAL's name": (band(source("/vsicurl/http://127.0.0.1:9/x.tif", relative=0)), "no plain local file"),
+    "a path from where it runs": (band(source("a.tif", relative=0)), "no plain local file"),
+    "a file that is not there": (band(source("nowhere.tif")), "no such file"),
+    "options beside bands": ("<OpenOptions/>" + SIMPLE, "OpenOptions"),
     "an open tag": (SIMPLE.replace("</VRTRasterBand>", ""), "not an XML document"),
 }
 

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
+from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 
-from barpc.base.remote import hosts
+from barpc.base.remote import REQUEST_BYTES, Part, Remote, hosts
+
+WIRED = Remote("http://a.org/x.tif")
 
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
     web: ClassVar[Web]
+
+    def setup(self) -> None:
+        self.web.counts["connections"] += 1
+        super().setup()
 
     def log_message(self, *_args: object) -> None:
         pass
@@ -97,3 +106,63 @@ def drip(handler: _Handler, part: bytes, *_span: int) -> bool:
         handler.wfile.write(b"x")
         time.sleep(0.2)
     return True
+
+
+class Sent(io.RawIOBase):
+    """What comes over a wire, part by part, as it is asked for."""
+
+    def __init__(self, parts: Iterable[bytes]) -> None:
+        self._parts, self._rest = iter(parts), b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self._rest = self._rest or next(self._parts, b"")
+        data, self._rest = self._rest[: len(buffer)], self._rest[len(buffer) :]
+        buffer[: len(data)] = data
+        return len(data)
+
+
+class Wire:
+    """A socket that answers with given bytes, whatever is asked, which it notes."""
+
+    def __init__(self, parts: Iterator[bytes], asked: list[str]) -> None:
+        self._parts, self._asked = parts, asked
+
+    def sendall(self, data: bytes) -> None:
+        self._asked.append(data.decode())
+
+    def shutdown(self, how: int) -> None: ...
+    def close(self) -> None: ...
+
+    def makefile(self, _mode: str) -> io.BufferedReader:
+        return io.BufferedReader(Sent(self._parts))
+
+
+class Fetched:
+    """Fetches a part, the first block if none is named, from a server that sends these bytes; notes its requests."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self._sent: Iterator[bytes] = iter(())
+
+    def connection(self, _scheme: str, host: str) -> HTTPConnection:
+        made = HTTPConnection(host)
+        made.sock = Wire(self._sent, self.asked)  # type: ignore[assignment]
+        return made
+
+    def __call__(
+        self, *parts: bytes, more: Iterable[bytes] = (), at: Remote = WIRED, start: int = 0, stop: int = REQUEST_BYTES
+    ) -> Part:
+        self._sent = itertools.chain(parts, more)
+        return hosts.fetch(at, start, stop)
+
+
+@pytest.fixture
+def fetched(monkeypatch: pytest.MonkeyPatch) -> Fetched:
+    found = Fetched()
+    monkeypatch.setattr(hosts, "_connection", found.connection)
+    monkeypatch.setattr(hosts, "WAITS", ())
+    monkeypatch.setattr(hosts, "_idle", {})
+    return found

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -147,46 +146,6 @@ def test_a_wrong_key_is_said(azure: dict[str, str], monkeypatch: pytest.MonkeyPa
 # --- a store of no kind ------------------------------------------------------------------------------------
 
 
-class Stub:
-    """One object, of versions that follow each other as they are asked for; no server, no fsspec."""
-
-    def __init__(self, *tags: str) -> None:
-        self.tags, self.position = list(tags), 0
-
-    def open(self, _url: str, _mode: str, cache_type: str) -> Stub:
-        assert cache_type == "none"
-        return self
-
-    def info(self, _url: str) -> dict[str, Any]:
-        return {"size": 4 * REQUEST_BYTES, "etag": self.tags.pop(0) if len(self.tags) > 1 else self.tags[0]}
-
-    def seek(self, position: int) -> None:
-        self.position = position
-
-    def read(self, size: int) -> bytes:
-        return bytes(size)
-
-    def pipe_file(self, _url: str, _data: bytes) -> None:
-        raise FileNotFoundError("http://inner/upload")
-
-
-@pytest.mark.parametrize(("scheme", "noticed"), [("gs", True), ("az", True), ("s3", False)])
-def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(
-    scheme: str, noticed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stub = Stub("1", "1", "1", "1", "2")
-    monkeypatch.setattr(hosts, "_store", lambda _scheme: stub)
-    at = located(f"{scheme}://b/stub-{scheme}.tif", [f"{scheme}://b"])
-    assert hosts.fetch(at, 0, 10).tag == "1"
-    pinned = type(at)(str(at), 4 * REQUEST_BYTES, "1")
-    assert hosts.fetch(pinned, 0, 10).data == bytes(10)
-    if noticed:
-        with pytest.raises(OSError, match="changed in its store"):
-            hosts.fetch(pinned, 10, 20)
-    else:
-        assert hosts.fetch(pinned, 10, 20).data == bytes(10)
-
-
 def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("fsspec")
 
@@ -196,11 +155,3 @@ def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("fsspec.filesystem", missing)
     with pytest.raises(ImageError, match=r"pip install 'barpc\[remote\]' \(gcsfs is missing\)"):
         versioned(located("gs://scenes/a.tif", ["gs://scenes"]), IMAGE)
-
-
-def test_what_a_store_says_is_cut_to_its_first_line() -> None:
-    def ask() -> None:
-        raise ValueError("\nrefused\n<xml>\n  <RequestId>1</RequestId>")
-
-    with pytest.raises(OSError, match=r"^its store answers ValueError: refused$"):
-        hosts._store_answer(ask)

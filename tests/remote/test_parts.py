@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import ssl
 import sys
-from email.message import Message
-from http.client import HTTPException
+from collections.abc import Iterator
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from barpc.base import remote
-from barpc.base.remote import (
-    REQUEST_BYTES,
-    Part,
-    Remote,
-    RemoteFile,
-    _BlockCache,
-    _runs,
-    beside,
-    hosts,
-    is_url,
-    location,
-)
+from barpc.base.remote import REQUEST_BYTES, Part, Remote, RemoteFile, hosts, is_url, location
 
-AT = Remote("https://a.org/b/x.tif", 20 * REQUEST_BYTES + 5, "one")
+AT = Remote("https://a.org/b/x.tif", 70 * REQUEST_BYTES + 5, "one")
 
 
 # --- names ------------------------------------------------------------------------------------------------
@@ -60,7 +50,7 @@ def test_a_file_has_the_version_that_it_is_found_to_have(monkeypatch):
         asked.append((start, stop))
         return Part(b"x" * REQUEST_BYTES, 7 * REQUEST_BYTES, tag)
 
-    monkeypatch.setattr(remote, "_fetch_part", fetch)
+    monkeypatch.setattr(hosts, "fetch", fetch)
     tag = "v"
     found = remote.pinned(Remote("https://a.org/new.tif"))
     assert (found.size, found.tag, asked) == (7 * REQUEST_BYTES, "v", [(0, REQUEST_BYTES)])
@@ -74,402 +64,311 @@ def test_a_file_has_the_version_that_it_is_found_to_have(monkeypatch):
 
 # --- blocks -----------------------------------------------------------------------------------------------
 
+names = (f"https://a.org/{k}/x.tif" for k in itertools.count())
+
+
+def block(k: int, size: int = REQUEST_BYTES) -> bytes:
+    return bytes([k % 251]) * size
+
 
 @pytest.fixture
 def asked(monkeypatch) -> list[tuple[int, int]]:
-    """The parts, in blocks, that are asked of a file whose every byte says its block."""
+    """The parts, in blocks, that are asked of files whose every byte says its block."""
     parts: list[tuple[int, int]] = []
 
     def fetch(at, start, stop):
-        parts.append((start // REQUEST_BYTES, -(-stop // REQUEST_BYTES)))
-        data = b"".join(bytes([k]) * REQUEST_BYTES for k in range(start // REQUEST_BYTES, -(-stop // REQUEST_BYTES)))
-        return Part(data[: stop - start], AT.size or 0, "one")
+        first, last = start // REQUEST_BYTES, -(-stop // REQUEST_BYTES)
+        parts.append((first, last))
+        return Part(b"".join(map(block, range(first, last)))[: stop - start], at.size, "one")
 
-    monkeypatch.setattr(remote, "_fetch_part", fetch)
-    monkeypatch.setattr(remote, "_blocks", _BlockCache())
+    monkeypatch.setattr(hosts, "fetch", fetch)
     return parts
 
 
+def new(blocks: int = 70) -> Remote:
+    """A file of so many blocks and five bytes, of which nothing is kept yet."""
+    return Remote(next(names), blocks * REQUEST_BYTES + 5, "one")
+
+
+def read_blocks(file: RemoteFile, first: int, last: int) -> None:
+    file.seek(first * REQUEST_BYTES)
+    assert file.read((last - first) * REQUEST_BYTES) == b"".join(map(block, range(first, last)))
+
+
 def test_what_is_read_here_and_there_is_asked_for_block_by_block(asked):
-    file = RemoteFile(AT)
+    file = RemoteFile(new())
     assert (file.readable(), file.seekable()) == (True, True)
     for where in (9, 3, 15):
         assert file.seek(where * REQUEST_BYTES + 7) == where * REQUEST_BYTES + 7
-        assert file.read(2) == bytes([where]) * 2
+        assert file.read(2) == block(where, 2)
     assert asked == [(9, 10), (3, 4), (15, 16)]
-    assert file._ahead == 0
-    file.seek(2 * REQUEST_BYTES)
-    assert (
-        file.read(3 * REQUEST_BYTES)
-        == bytes([2]) * REQUEST_BYTES + bytes([3]) * REQUEST_BYTES + bytes([4]) * REQUEST_BYTES
-    )
+    read_blocks(file, 2, 5)
     assert asked[3:] == [(2, 3), (4, 5)]  # not the one that it has
     file.seek(2 * REQUEST_BYTES - 1)
     assert file.read(2) == b"\1\2"
     assert asked[5:] == [(1, 2)]
 
 
-def test_a_file_that_is_read_in_a_row_is_asked_for_twice_as_much_each_time(asked):
-    file = RemoteFile(AT)
-    data = [file.read(REQUEST_BYTES) for _ in range(20)]
-    assert data == [bytes([k]) * REQUEST_BYTES for k in range(20)]
-    assert file.read(99) == bytes([20]) * 5  # its end
+def test_a_file_that_is_read_in_a_row_is_asked_for_twice_as_much_each_time_and_a_mebibyte_ahead_at_most(asked):
+    file = RemoteFile(new())
+    assert [file.read(REQUEST_BYTES) for _ in range(70)] == [block(k) for k in range(70)]
+    assert file.read(99) == block(70, 5)  # its end
     assert file.read(99) == b""
-    assert asked == [(0, 2), (2, 6), (6, 14), (14, 21)]
+    assert asked == [(0, 2), (2, 6), (6, 14), (14, 30), (30, 47), (47, 64), (64, 71)]
 
 
-def test_no_more_than_a_mebibyte_is_read_ahead_and_nothing_that_is_there(asked, monkeypatch):
-    file = RemoteFile(AT)
-    file._ahead = remote._AHEAD
-    file.read(1)
-    assert asked == [(0, 17)]  # one, and sixteen ahead
-    blocks = _BlockCache()
-    monkeypatch.setattr(remote, "_blocks", blocks)
-    blocks.put((str(AT), AT.size, AT.tag, 4), b"\4" * REQUEST_BYTES)
-    file = RemoteFile(AT)
-    file._ahead = remote._AHEAD
-    assert file.read(5 * REQUEST_BYTES)[-1] == 4
-    assert asked[1:] == [(0, 4)]
+def test_nothing_is_read_ahead_that_is_there(asked):
+    at = new()
+    read_blocks(RemoteFile(at), 4, 5)
+    file = RemoteFile(at)
+    assert [file.read(REQUEST_BYTES) for _ in range(4)] == [block(k) for k in range(4)]
+    assert asked == [(4, 5), (0, 2), (2, 4)]
 
 
 def test_a_place_is_counted_from_the_start_from_here_or_from_the_end(asked):
-    file = RemoteFile(AT)
-    assert file.seek(-4, os.SEEK_END) == 20 * REQUEST_BYTES + 1
-    assert file.seek(2, os.SEEK_CUR) == 20 * REQUEST_BYTES + 3
-    assert file.read() == bytes([20]) * 2
+    at = new()
+    file = RemoteFile(at)
+    assert file.seek(-4, os.SEEK_END) == 70 * REQUEST_BYTES + 1
+    assert file.seek(2, os.SEEK_CUR) == 70 * REQUEST_BYTES + 3
+    assert file.read() == bytes([70]) * 2
     assert file.seek(-10) == 0
     assert file.seek(99 * REQUEST_BYTES) == 99 * REQUEST_BYTES
     assert file.read(5) == b""
-    assert file.tell() == 20 * REQUEST_BYTES + 5
-    assert io.BufferedReader(RemoteFile(AT)).read(3) == b"\0\0\0"
+    assert file.tell() == 70 * REQUEST_BYTES + 5
+    assert io.BufferedReader(RemoteFile(at)).read(3) == b"\0\0\0"
 
 
-def test_a_file_that_changed_is_noticed(asked):
+def test_a_file_that_changed_is_noticed(monkeypatch):
+    monkeypatch.setattr(hosts, "fetch", lambda *_: Part(block(0), AT.size or 0, "one"))
     for other in (Remote(str(AT), AT.size, "two"), Remote(str(AT), (AT.size or 0) + REQUEST_BYTES, "one")):
         with pytest.raises(OSError, match="changed on its host"):
             RemoteFile(other).read(1)
 
 
-def test_blocks_are_asked_for_together_but_not_more_than_eight_mebibytes():
-    assert list(_runs([3])) == [range(3, 4)]
-    assert list(_runs([1, 2, 4, 7, 8])) == [range(1, 3), range(4, 5), range(7, 9)]
-    assert [len(run) for run in _runs(list(range(300)))] == [128, 128, 44]
-    assert (remote.REQUEST_BYTES, remote._AHEAD, remote._MAX_REQUEST_BYTES, remote._CACHE_BYTES) == (
-        1 << 16,
-        1 << 20,
-        8 << 20,
-        64 << 20,
-    )
+def test_blocks_are_asked_for_together_but_not_more_than_eight_mebibytes(asked):
+    file = RemoteFile(new(400))
+    for first, last in ((3, 4), (5, 7)):
+        read_blocks(file, first, last)
+    read_blocks(file, 1, 9)
+    assert asked == [(3, 4), (5, 7), (1, 3), (4, 5), (7, 9)]
+    asked.clear()
+    read_blocks(file, 10, 310)
+    assert asked == [(10, 138), (138, 266), (266, 310)]
 
 
-def test_the_blocks_that_were_used_last_are_kept(monkeypatch):
-    monkeypatch.setattr(remote, "_CACHE_BYTES", 30)
-    blocks = _BlockCache()
-    keys: list[Any] = [("x", 1, "t", k) for k in range(5)]
-    for key in keys[:3]:
-        blocks.put(key, b"0123456789")
-    assert blocks.get(keys[0]) == b"0123456789"  # so it is newer than the second
-    blocks.put(keys[3], b"0123456789")
-    assert [blocks.get(key) is not None for key in keys[:4]] == [True, False, True, True]
-    blocks.put(keys[2], b"01234")  # in place of what was there
-    blocks.put(keys[4], b"01234")
-    assert [blocks.get(key) is not None for key in keys] == [True, False, True, True, True]
-    assert blocks._bytes == 30
-
-
-def test_web_servers_and_stores_are_asked_in_their_own_ways(monkeypatch):
-    monkeypatch.setattr(hosts, "_from_server", lambda *args: ("web", *args))
-    monkeypatch.setattr(hosts, "_from_store", lambda *args: ("store", *args))
-    monkeypatch.setattr(hosts, "_there", lambda at: at.endswith("a"))
-    monkeypatch.setattr(hosts, "_store_listing", lambda folder, _: ("A", "b"))
-    store = Remote("s3://b/x")
-    assert remote._fetch_part(AT, 1, 2) == ("web", AT, 1, 2)
-    assert remote._fetch_part(store, 1, 2) == ("store", store, 1, 2)
-    assert beside(AT, ["a"]) == {"a": "a"}
-    assert beside(store, ["a"]) == {"a": "A"}
+def test_the_64_mebibytes_that_were_used_last_are_kept(asked):
+    file = RemoteFile(new(1100))
+    read_blocks(file, 1, 1025)
+    read_blocks(file, 1, 2)  # so it is newer than the second
+    read_blocks(file, 1050, 1051)
+    asked.clear()
+    for kept in (1, 3, 1024, 1050):
+        read_blocks(file, kept, kept + 1)
+    assert asked == []
+    read_blocks(file, 2, 3)
+    assert asked == [(2, 3)]
 
 
 # --- answers of web servers -------------------------------------------------------------------------------
 
 
-class Answer:
-    """A server's answer."""
-
-    def __init__(self, status: int, body: bytes = b"", **headers: str) -> None:
-        self.status, self.headers, self._body = status, Message(), io.BytesIO(body)
-        self.asked: list[int] = []
-        for name, value in headers.items():
-            self.headers[name.replace("_", "-")] = value
-
-    def read(self, size: int) -> bytes:
-        self.asked.append(size)
-        return self._body.read(size)
+def http(status: int, body: bytes = b"", **headers: str) -> bytes:
+    lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in headers.items())
+    return f"HTTP/1.1 {status} x\r\n{lines}\r\n".encode() + body
 
 
-def told(answer: Answer, start: int = 10, stop: int = 14) -> Any:
-    return hosts._answered(answer, start, stop)  # type: ignore[arg-type]
-
-
-def test_the_figures_of_patience():
-    assert (hosts.WAITS, hosts.TIMEOUT, hosts._SLOWEST, hosts._MOVES) == ((0.0, 0.5, 2.0), 30.0, 10_000, 3)
-
-
-@pytest.mark.parametrize("status", [408, 425, 429, 500, 502, 503, 504])
-def test_what_may_pass_is_said_to(status):
-    with pytest.raises(hosts._PassingError, match=str(status)):
-        told(Answer(status))
-
-
-@pytest.mark.parametrize("status", [100, 204, 304, 400, 403, 405, 416, 451, 501, 505])
-def test_what_will_not_pass_is_no_such_error(status):
-    with pytest.raises(OSError, match=f"answers {status}") as caught:
-        told(Answer(status, Content_Range="bytes */9"))
-    assert not isinstance(caught.value, hosts._PassingError)
-
-
-@pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
-def test_a_move_is_told_by_its_address(status):
-    assert told(Answer(status, Location="/x")) == "/x"
-    assert told(Answer(status)) == ""
-
-
-@pytest.mark.parametrize("status", [404, 410])
-def test_a_missing_file_is_none_and_its_words_are_read(status):
-    answer = Answer(status, b"no such file")
-    assert told(answer) is None
-    assert answer.asked == [1 << 16]
-
-
-def test_a_part_is_what_was_asked_with_its_version():
-    whole = {"Content_Range": "bytes 10-13/20", "Content_Length": "4"}
-    assert told(Answer(206, b"abcdef", ETag="t", **whole)) == Part(b"abcd", 20, "t")
-    assert told(Answer(206, b"abcd", Last_Modified="d", **whole)) == Part(b"abcd", 20, "d")
-    assert told(Answer(206, b"abcd", ETag="t", Last_Modified="d", **whole)).tag == "t"
-    assert told(Answer(206, b"ab", Content_Range="bytes 10-11/12")) == Part(b"ab", 12, "")  # the end of the file
-    with pytest.raises(hosts._PassingError, match="3 of 4 bytes"):
-        told(Answer(206, b"abc", **whole))
+SPAN = {"Content_Range": "bytes 10-13/20"}
+WHOLE = {**SPAN, "Content_Length": "4"}
+GOOD = http(206, b"abcd", **WHOLE)
 
 
 @pytest.mark.parametrize(
-    ("span", "length"),
+    ("answer", "start", "found"),
     [
-        ("bytes 9-12/20", "4"), ("bytes 10-14/20", "4"), ("bytes 10-12/20", "3"), ("bytes 10-13/20", "5"),
-        ("bytes 10-13/10", "4"), ("bytes 10-9/10", "0"), ("bytes 10-13/*", "4"), ("10-13/20", "4"), ("", "4"),
-        ("bytes 10-13/" + "9" * 19, "4"), ("bytes  10-13/20", "4"),
+        (http(206, b"abcdef", ETag="t", **WHOLE), 10, Part(b"abcd", 20, "t")),
+        (http(206, b"abcd", Last_Modified="d", **WHOLE), 10, Part(b"abcd", 20, "d")),
+        (http(206, b"abcd", ETag="t", Last_Modified="d", **WHOLE), 10, Part(b"abcd", 20, "t")),
+        (http(206, b"abcd", Content_Encoding="identity", **SPAN), 10, Part(b"abcd", 20, "")),
+        (http(206, b"ab", Content_Range="bytes 10-11/12"), 10, Part(b"ab", 12, "")),  # the end of the file
+        (http(200, b"abcd", Content_Length="4", ETag="t"), 0, Part(b"abcd", 4, "t")),  # all that was asked
+        (http(200, b"ab", Content_Length="2"), 0, Part(b"ab", 2, "")),
+        (http(416, Content_Range="bytes */0", ETag="t"), 0, Part(b"", 0, "t")),  # an empty file
+    ],
+)
+def test_the_part_that_was_asked_comes_with_its_version(fetched, answer, start, found):
+    assert fetched(answer, start=start, stop=start + 4) == found
+
+
+@pytest.mark.parametrize(
+    ("answer", "start", "said"),
+    [
+        *((http(status), 10, f"answers {status}; asked 1 times") for status in (408, 425, 429, 500, 502, 503, 504)),
+        *((http(k, Content_Range="bytes */9"), 10, f"answers {k}$") for k in (204, 304, 400, 405, 416, 451, 501, 505)),
+        (http(416, Content_Range="bytes */1"), 0, "answers 416$"),
+        (http(206, b"abc", **SPAN), 10, "3 of 4 bytes; asked 1 times"),
+        (http(206, b"abcd", Content_Encoding="gzip", **SPAN), 10, "compressed"),
+        *(
+            (http(206, b"abcdef", Content_Range=span, Content_Length=length), 10, "other bytes")
+            for span, length in [
+                ("bytes 9-12/20", "4"), ("bytes 10-14/20", "4"), ("bytes 10-12/20", "3"), ("bytes 10-13/20", "5"),
+                ("bytes 10-13/10", "4"), ("bytes 10-9/10", "0"), ("bytes 10-13/*", "4"), ("10-13/20", "4"), ("", "4"),
+                ("bytes 10-13/" + "9" * 19, "4"), ("bytes  10-13/20", "4"),
+            ]
+        ),
+        *((http(206, b"abcd", Content_Length=length), 0, "other bytes") for length in ("", "1", "4")),
+        (http(206, b"abcd", Content_Range="bytes 0-0/0", Content_Length="4"), 0, "other bytes"),
+        *(
+            (http(200, b"abcde", Content_Length=length), start, "no parts of files")
+            for length, start in (("5", 0), ("4", 1), ("", 0), ("x", 0), ("0" * 10, 0))
+        ),
     ],
 )  # fmt: skip
-def test_other_bytes_than_were_asked_are_none(span, length):
-    with pytest.raises(OSError, match="other bytes"):
-        told(Answer(206, b"abcdef", Content_Range=span, Content_Length=length))
+def test_any_other_answer_is_an_error_and_asked_again_where_it_may_pass(fetched, answer, start, said):
+    with pytest.raises(OSError, match=said):
+        fetched(answer, start=start, stop=start + 4)
 
 
-def test_a_whole_file_does_where_it_is_not_longer_than_what_was_asked():
-    assert told(Answer(200, b"abcd", Content_Length="4", ETag="t"), 0, 4) == Part(b"abcd", 4, "t")
-    assert told(Answer(200, b"ab", Content_Length="2"), 0, 4) == Part(b"ab", 2, "")
-    for length, start in (("5", 0), ("4", 1), ("", 0), ("x", 0), ("0" * 10, 0)):
-        with pytest.raises(OSError, match="no parts of files"):
-            told(Answer(200, b"abcde", Content_Length=length), start, 4)
-
-
-def test_an_empty_file_is_told_by_its_range():
-    assert told(Answer(416, Content_Range="bytes */0", ETag="t"), 0, 9) == Part(b"", 0, "t")
-    with pytest.raises(OSError, match="answers 416"):
-        told(Answer(416, Content_Range="bytes */1"), 0, 9)
-
-
-def test_what_is_compressed_is_refused():
-    with pytest.raises(OSError, match="compressed"):
-        told(Answer(206, Content_Encoding="gzip", Content_Range="bytes 10-13/20"))
-    assert told(Answer(206, b"abcd", Content_Encoding="identity", Content_Range="bytes 10-13/20")).size == 20
+@pytest.mark.parametrize("status", [404, 410])
+def test_a_missing_file_is_told_apart(fetched, status):
+    with pytest.raises(FileNotFoundError):
+        fetched(http(status, b"no such file"))
 
 
 # --- asking again, moving, keeping connections ------------------------------------------------------------
 
 
-def test_it_is_asked_four_times_with_longer_waits(monkeypatch):
+def moved(to: str, status: int = 302) -> bytes:
+    return http(status, Location=to, Content_Length="0")
+
+
+def fails(error: BaseException) -> Iterator[bytes]:
+    """What is sent by a host of which a read fails."""
+    raise error
+    yield b""
+
+
+def test_it_is_asked_four_times_with_longer_waits(monkeypatch, fetched):
     waited: list[float] = []
+    monkeypatch.undo()
     monkeypatch.setattr(hosts.time, "sleep", waited.append)
-    monkeypatch.setattr(hosts, "_fetch_redirected", lambda *_: (_ for _ in ()).throw(hosts._PassingError("no")))
-    with pytest.raises(OSError, match="no; asked 4 times"):
+    monkeypatch.setattr("http.client.HTTPSConnection.connect", lambda _: next(fails(ConnectionRefusedError("no"))))
+    with pytest.raises(OSError, match=r"no answer from its host \(no\); asked 4 times"):
         hosts.fetch(AT, 0, 1)
     assert waited == [0.0, 0.5, 2.0]
 
 
-def test_three_moves_are_too_many_and_none_leads_to_another_host(monkeypatch):
-    seen: list[str] = []
+@pytest.mark.parametrize(
+    ("moves", "asked"),
+    [
+        ([("/1", 301), ("2", 303)], ["/b/x.tif", "/1", "/2"]),
+        ([("http://a.org/b.tif?key=a/b&n=1", 307), ("", 308)], ["/b/x.tif", *["/b.tif?key=a/b&n=1"] * 2]),
+    ],
+)
+def test_a_move_is_followed_within_its_host_and_takes_the_query_along(fetched, moves, asked):
+    at = Remote("http://a.org/b/x.tif")
+    assert fetched(*(moved(*one) for one in moves), GOOD, at=at, start=10, stop=14).data == b"abcd"
+    assert [words.split()[1] for words in fetched.asked] == asked
 
-    def once(url, *_):
-        seen.append(url)
-        return answers.pop(0)
 
-    monkeypatch.setattr(hosts, "_once", once)
-    part = Part(b"", 0, "")
-    answers: list[Any] = ["/1", "2", part]
-    assert hosts._fetch_redirected(AT, 0, 1) is part
-    assert seen == ["https://a.org/b/x.tif", "https://a.org/1", "https://a.org/2"]
-    answers = ["/1", "/2", "/3", part]
-    with pytest.raises(OSError, match="on and on"):
-        hosts._fetch_redirected(AT, 0, 1)
-    for address in ("http://a.org/x", "https://b.org/x", "//b.org/x"):
-        answers = [address, part]
-        with pytest.raises(OSError, match="not followed"):
-            hosts._fetch_redirected(AT, 0, 1)
-    answers = ["https://b.org/" + "x" * 900]
-    with pytest.raises(OSError, match="not followed") as caught:
-        hosts._fetch_redirected(AT, 0, 1)
+@pytest.mark.parametrize(
+    ("moves", "said"),
+    [
+        (["/1", "/2", "/3"], "on and on"), (["https://a.org/x"], "not followed"), (["http://b.org/x"], "not followed"),
+        (["//b.org/x"], "not followed"), (["http://[bad/"], r"sends us on to what is no address \(http://\[bad/\)"),
+        (["http://b.org/" + "x" * 900], "not followed"),
+    ],
+)  # fmt: skip
+def test_three_moves_are_too_many_and_none_leads_to_another_host(fetched, moves, said):
+    with pytest.raises(OSError, match=said) as caught:
+        fetched(*map(moved, moves), GOOD, start=10, stop=14)
     assert len(str(caught.value)) < 300
 
 
-class Connection:
-    """What connects to no host; answers as told."""
-
-    made: list[Connection]
-
-    def __init__(self, host: str, timeout: float) -> None:
-        self.host, self.timeout, self.sock, self.closed = host, timeout, None, False
-        self.asked: list[Any] = []
-        type(self).made.append(self)
-
-    def connect(self) -> None:
-        if isinstance(failure, BaseException):
-            raise failure
-
-    def request(self, *words: Any, headers: dict[str, str]) -> None:
-        self.asked.append((*words, headers))
-
-    def getresponse(self) -> Any:
-        if isinstance(failure, BaseException):
-            raise failure
-        found = Answer(206, b"abcd", Content_Range="bytes 10-13/20")
-        found.close = lambda: None  # type: ignore[attr-defined]
-        found.isclosed = lambda: read_out  # type: ignore[attr-defined]
-        found.will_close = will_close  # type: ignore[attr-defined]
-        return found
-
-    def close(self) -> None:
-        self.closed = True
+@pytest.mark.parametrize(
+    ("name", "target"),
+    [
+        ("b/my x(1).tif", "/b/my%20x(1).tif"), ("x y.tif?k=a/b&n=ü", "/x%20y.tif?k=a/b&n=%C3%BC"), ("x.tif", "/x.tif"),
+    ],
+)  # fmt: skip
+def test_a_request_asks_for_the_bytes_as_they_are(fetched, name, target):
+    assert fetched(GOOD, at=Remote(f"http://a.org/{name}"), start=10, stop=14).data == b"abcd"
+    assert fetched.asked == [
+        f"GET {target} HTTP/1.1\r\nHost: a.org\r\nRange: bytes=10-13\r\nAccept-Encoding: identity\r\n\r\n"
+    ]
 
 
-failure: BaseException | None = None
-read_out, will_close = True, False
+def test_a_connection_is_kept_that_was_read_out_and_stays_open(server, monkeypatch):
+    (server.folder / "x").write_bytes(b"abcdefgh")
 
+    def ask() -> int:
+        """Ask for a part; how many connections were made until then."""
+        assert hosts.fetch(Remote(server.url("x")), 0, 4).data == b"abcd"
+        return server.counts["connections"]
 
-@pytest.fixture
-def made(monkeypatch) -> list[Connection]:
-    """The connections that are made."""
-    here = globals()
-    monkeypatch.setitem(here, "failure", None)
-    monkeypatch.setitem(here, "read_out", True)
-    monkeypatch.setitem(here, "will_close", False)
-    Connection.made = []
-    for name in ("HTTPConnection", "HTTPSConnection"):
-        monkeypatch.setattr(hosts, name, type(name, (Connection,), {"made": Connection.made}))
-    monkeypatch.setattr(hosts, "_idle", {})
-    return Connection.made
-
-
-def test_a_request_asks_for_the_bytes_as_they_are(made):
-    assert hosts._once("https://a.org/b/my x(1).tif", 10, 14) == Part(b"abcd", 20, "")
-    (connection,) = made
-    assert (connection.host, connection.timeout, type(connection).__name__) == (
-        "a.org",
-        30.0,
-        "HTTPSConnection",
-    )
-    method, path, headers = connection.asked[0]
-    assert (method, path) == ("GET", "/b/my%20x(1).tif")
-    assert headers == {"Range": "bytes=10-13", "Accept-Encoding": "identity"}
-    hosts._once("http://a.org/x", 10, 14)
-    assert type(made[1]).__name__ == "HTTPConnection"
-
-
-@pytest.mark.parametrize(("read", "ends", "kept"), [(True, False, True), (True, True, False), (False, False, False)])
-def test_a_connection_is_kept_that_was_read_out_and_stays_open(made, monkeypatch, read, ends, kept):
-    monkeypatch.setitem(globals(), "read_out", read)
-    monkeypatch.setitem(globals(), "will_close", ends)
-    for _ in range(2):
-        hosts._once("https://a.org/x", 10, 14)
-    assert len(made) == (1 if kept else 2)
-    assert made[0].closed == (not kept)
-    assert list(hosts._idle) == ([(os.getpid(), "https", "a.org")] if kept else [])
-
-
-def test_nothing_of_another_process_is_used(made, monkeypatch):
-    hosts._once("https://a.org/x", 10, 14)
+    assert [ask(), ask()] == [1, 1]
     pid = os.getpid()
-    monkeypatch.setattr(hosts.os, "getpid", lambda: pid + 1)
-    hosts._once("https://a.org/x", 10, 14)
-    assert len(made) == 2
+    with monkeypatch.context() as fork:  # nothing of another process is used
+        fork.setattr(os, "getpid", lambda: pid + 1)
+        assert ask() == 2
+    headers = {"Content_Range": "bytes 0-3/8", "ETag": "x"}
+    for k, mood in enumerate((
+        lambda handler, part, *_: handler.answer(206, part, Connection="close", **headers) or True,
+        lambda handler, part, *_: handler.answer(206, part + b"efgh", Content_Length="8", **headers) or True,
+    )):  # fmt: skip
+        server.mood = mood
+        with pytest.raises(OSError, match="other bytes") if k else monkeypatch.context():
+            ask()
+        server.mood = None
+        assert [ask(), ask()] == [k + 3, k + 3]
 
 
-def test_all_that_is_kept_is_closed_at_the_end(made):
-    hosts._once("https://a.org/x", 10, 14)
-    hosts._once("https://b.org/x", 10, 14)
+def test_all_that_is_kept_is_closed_at_the_end(server, monkeypatch):
+    (server.folder / "x").write_bytes(b"abcd")
+    hosts.fetch(Remote(server.url("x")), 0, 4)
+    closed: list[str] = []
+    monkeypatch.setattr("http.client.HTTPConnection.close", lambda self: closed.append(f"{self.host}:{self.port}"))
     hosts._close()
-    assert [connection.closed for connection in made] == [True, True]
+    assert server.host.removeprefix("http://") in closed
 
 
-@pytest.mark.parametrize("error", [HTTPException("x"), TimeoutError(), ConnectionResetError(), ssl.SSLError("x")])
-def test_a_host_that_breaks_off_may_do_better_next_time(made, monkeypatch, error):
-    hosts._once("https://a.org/x", 10, 14)
-    monkeypatch.setitem(globals(), "failure", error)
-    with pytest.raises(hosts._PassingError, match="broke off"):
-        hosts._once("https://a.org/x", 10, 14)
-    assert made[0].closed
-    assert hosts._idle == {(os.getpid(), "https", "a.org"): []}
+@pytest.mark.parametrize("error", [TimeoutError(), ConnectionResetError(), ssl.SSLError("x")])
+def test_a_host_that_breaks_off_may_do_better_next_time(fetched, error):
+    with pytest.raises(OSError, match=rf"broke off \({type(error).__name__}\); asked 1 times"):
+        fetched(more=fails(error))
 
 
-def test_a_wrong_certificate_does_not_pass(made, monkeypatch):
+def test_a_wrong_certificate_does_not_pass(monkeypatch):
     wrong = ssl.SSLCertVerificationError("x")
     wrong.verify_message = "self-signed"
-    monkeypatch.setitem(globals(), "failure", wrong)
-    with pytest.raises(OSError, match="no certificate that holds") as caught:
-        hosts._connection("https", "a.org")
-    assert not isinstance(caught.value, hosts._PassingError)
-    monkeypatch.setitem(globals(), "failure", OSError(111, "Connection refused"))
-    with pytest.raises(hosts._PassingError, match="no answer from its host"):
-        hosts._connection("https", "a.org")
+    monkeypatch.setattr("http.client.HTTPSConnection.connect", lambda _: next(fails(wrong)))
+    with pytest.raises(OSError, match=r"no certificate that holds \(self-signed\)$"):
+        hosts.fetch(Remote("https://a.org/x"), 0, 4)
 
 
-def test_a_request_has_a_time_that_grows_with_its_bytes(made, monkeypatch):
+@pytest.mark.parametrize("shown", [ConnectionResetError(104, "reset"), TimeoutError(), None])
+def test_a_request_has_a_time_that_grows_with_its_bytes_however_its_end_shows(fetched, monkeypatch, shown):
     given: list[Any] = []
 
     class Timer:
         def __init__(self, seconds, function, arguments):
-            given.append((seconds, function, arguments))
+            self.function, self.arguments = function, arguments
+            given.append(seconds)
 
         def start(self):
             given.append("start")
+            if late:
+                self.function(*self.arguments)
 
         def cancel(self):
             given.append("cancel")
 
     monkeypatch.setattr(hosts.threading, "Timer", Timer)
-    hosts._once("https://a.org/x", 10, 14)
-    assert [given[0][0], *given[1:]] == [30.0 + 4 / 10_000, "start", "cancel"]
-    assert given[0][1] is hosts._shut_down
-    assert given[0][2][0] is None
-
-
-@pytest.mark.parametrize("shown", [ConnectionResetError(104, "reset"), TimeoutError(), None])
-def test_a_request_that_is_cut_is_said_to_be_late_however_the_cut_shows(made, monkeypatch, shown):
-    class Timer:
-        def __init__(self, _seconds, _function, arguments):
-            self.late = arguments[1]
-
-        def start(self):
-            self.late.set()
-
-        def cancel(self):
-            pass
-
-    def answered(answer, start, stop):
-        raise shown or hosts._PassingError("its host sent 0 of 4 bytes")
-
-    monkeypatch.setattr(hosts.threading, "Timer", Timer)
-    monkeypatch.setattr(hosts, "_answered", answered)
-    with pytest.raises(hosts._PassingError, match="takes more than 30 s for 4 bytes"):
-        hosts._once("https://a.org/x", 10, 14)
+    late = False
+    fetched(GOOD, start=10, stop=14)
+    late = True
+    with pytest.raises(OSError, match="takes more than 30 s for 4 bytes; asked 1 times"):
+        fetched(http(206, b"", **WHOLE), more=fails(shown) if shown else (), start=10, stop=14)
+    assert given == [30.0 + 4 / 10_000, "start", "cancel"] * 2
 
 
 def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(monkeypatch):
@@ -484,19 +383,12 @@ def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(m
         return Part(b"", 0, "")
 
     monkeypatch.setattr(hosts, "fetch", fetch)
-    found = hosts.present_beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
-    assert sorted(tried) == [
-        "img.RPB",
-        "img.rpb",
-        "img.xml",
-        "img_RPC.TXT",
-        "img_RPC.geom",
-        "img_rpc.geom",
-        "img_rpc.txt",
-    ]
+    found = remote.beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
+    every = ["img.RPB", "img.rpb", "img.xml", "img_RPC.TXT", "img_RPC.geom", "img_rpc.geom", "img_rpc.txt"]
+    assert sorted(tried) == every
     assert found == {"img_rpc.txt": "img_rpc.txt", "img.rpb": "img.RPB", "img_rpc.geom": "img_RPC.geom"}
     present.add("img.rpb")
-    assert hosts.present_beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
+    assert remote.beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
 
 
 # --- object stores ----------------------------------------------------------------------------------------
@@ -512,8 +404,6 @@ class Shelf:
 
     def info(self, url):
         self.asked.append(("info", url))
-        if url not in self.objects:
-            raise FileNotFoundError
         return {"size": len(self.objects[url]), "ETag": "e", "type": self.kind}
 
     def open(self, url, mode, cache_type):
@@ -526,22 +416,6 @@ class Shelf:
         self.asked.append(("ls", folder, detail))
         return [url.partition("://")[2] for url in self.objects]
 
-    def pipe_file(self, url, data):
-        if "full" in url:
-            raise PermissionError("no leave\nat all")
-        self.objects[url] = data
-
-    def cat_file(self, url):
-        if "shut" in url:
-            raise PermissionError("no leave")
-        if url not in self.objects:
-            raise FileNotFoundError
-        return self.objects[url]
-
-    def rm(self, folder, recursive):
-        self.asked.append(("rm", folder, recursive))
-        raise PermissionError
-
 
 @pytest.fixture
 def shelf(monkeypatch) -> Shelf:
@@ -552,11 +426,13 @@ def shelf(monkeypatch) -> Shelf:
     return found
 
 
+STORED = Remote("s3://b/x")
+
+
 def test_a_part_of_an_object_ends_where_it_does(shelf):
-    at = Remote("s3://b/x")
-    assert hosts.fetch(at, 2, 5) == Part(b"234", 10, "e")
-    assert hosts.fetch(at, 8, 99) == Part(b"89", 10, "e")
-    assert hosts.fetch(at, 10, 99) == hosts.fetch(at, 12, 99) == Part(b"", 10, "e")
+    assert hosts.fetch(STORED, 2, 5) == Part(b"234", 10, "e")
+    assert hosts.fetch(STORED, 8, 99) == Part(b"89", 10, "e")
+    assert hosts.fetch(STORED, 10, 99) == hosts.fetch(STORED, 12, 99) == Part(b"", 10, "e")
     shelf.asked.clear()
     known = Remote("s3://b/x", 10, "e")
     for _ in range(3):
@@ -569,44 +445,59 @@ def test_a_part_of_an_object_ends_where_it_does(shelf):
         hosts.fetch(Remote("s3://b/none"), 0, 4)
     shelf.kind = "directory"
     with pytest.raises(OSError, match="a folder"):
-        hosts.fetch(at, 0, 4)
+        hosts.fetch(STORED, 0, 4)
 
 
-def test_an_object_that_is_cut_short_is_noticed(shelf, monkeypatch):
-    monkeypatch.setattr(shelf, "info", lambda _: {"size": 99, "ETag": "e"})
+@pytest.mark.parametrize(("scheme", "noticed"), [("gs", True), ("az", True), ("s3", False)])
+def test_a_version_is_looked_at_after_each_read_where_the_store_does_not_hold_it(shelf, scheme, noticed):
+    at, tags = f"{scheme}://b/x", iter("11112")
+    shelf.objects[at], shelf.info = bytes(20), lambda _: {"size": 20, "etag": next(tags)}
+    assert hosts.fetch(Remote(at), 0, 10).tag == "1"
+    known = Remote(at, 20, "1")
+    assert hosts.fetch(known, 0, 10).data == bytes(10)
+    with pytest.raises(OSError, match="changed in its store") if noticed else nullcontext():
+        assert hosts.fetch(known, 10, 20).data == bytes(10)
+
+
+def test_an_object_that_is_cut_short_is_noticed(shelf):
+    shelf.info = lambda _: {"size": 99, "ETag": "e"}
     with pytest.raises(OSError, match="its store sent 8 of 18 bytes"):
-        hosts.fetch(Remote("s3://b/x"), 2, 20)
+        hosts.fetch(STORED, 2, 20)
 
 
 @pytest.mark.parametrize(
     ("found", "version"),
     [
-        ({"size": "7", "ETag": "a", "etag": "b"}, (7, "a")), ({"size": 7, "ETag": "", "etag": "b"}, (7, "b")),
-        ({"size": 7, "generation": 5, "mtime": 9}, (7, "5")), ({"size": 7, "mtime": 9}, (7, "9")),
-        ({"size": 7, "LastModified": "d"}, (7, "d")), ({"size": 7, "last_modified": "d"}, (7, "d")),
-        ({"size": 7}, (7, "")),
+        ({"size": "7", "ETag": "a", "etag": "b"}, "a"), ({"size": 7, "ETag": "", "etag": "b"}, "b"),
+        ({"size": 7, "generation": 5, "mtime": 9}, "5"), ({"size": 7, "mtime": 9}, "9"),
+        ({"size": 7, "LastModified": "d"}, "d"), ({"size": 7, "last_modified": "d"}, "d"), ({"size": 7}, ""),
     ],
 )  # fmt: skip
-def test_a_version_has_many_names(found, version):
-    assert hosts._version(found) == version
+def test_a_version_has_many_names(shelf, found, version):
+    shelf.info = lambda _: found
+    assert hosts.fetch(STORED, 0, 2) == Part(b"01", 7, version)
 
 
 def test_the_files_beside_an_object_are_listed_once_a_minute(shelf, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(hosts.time, "monotonic", lambda: now[0])
-    at = Remote("s3://b/x")
-    assert hosts.present_beside(at, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
+    assert remote.beside(STORED, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
     now[0] = 59.0
-    hosts.present_beside(at, ["z"])
+    remote.beside(STORED, ["z"])
     assert shelf.asked == [("ls", "s3://b", False)]
     now[0] = 61.0
-    assert hosts.present_beside(at, ["z"]) == {"z": "Z"}
+    assert remote.beside(STORED, ["z"]) == {"z": "Z"}
     assert len(shelf.asked) == 2
 
 
-def test_what_a_store_says_has_300_letters_at_most_and_may_be_nothing():
-    assert str(hosts._one_line(ValueError("x" * 999))) == f"its store answers ValueError: {'x' * 300}"
-    assert str(hosts._one_line(ValueError(""))) == "its store answers ValueError: "
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [("x" * 999, "x" * 300), ("", ""), ("\nrefused\n<xml>\n  <RequestId>1</RequestId>", "refused")],
+)
+def test_what_a_store_says_is_its_first_line_of_300_letters_at_most_and_may_be_nothing(shelf, words, said):
+    shelf.info = lambda _: next(fails(ValueError(words)))
+    with pytest.raises(OSError, match=f"^its store answers ValueError: {said}$"):
+        hosts.fetch(STORED, 0, 4)
 
 
 def test_a_store_is_made_with_limits_of_time_and_without_a_list_of_its_own(monkeypatch):
@@ -617,7 +508,7 @@ def test_a_store_is_made_with_limits_of_time_and_without_a_list_of_its_own(monke
     try:
         hosts._store("s3")
         hosts._store("gs")
-        fake.filesystem = lambda *_, **__: (_ for _ in ()).throw(RuntimeError("no credentials\nat all"))
+        fake.filesystem = lambda *_, **__: next(fails(RuntimeError("no credentials\nat all")))
         with pytest.raises(OSError, match=r"its store answers RuntimeError: no credentials$"):
             hosts._store("az")
     finally:
@@ -627,48 +518,3 @@ def test_a_store_is_made_with_limits_of_time_and_without_a_list_of_its_own(monke
         ("s3", {"use_listings_cache": False, "config_kwargs": limits}),
         ("gs", {"use_listings_cache": False}),
     ]
-
-
-@pytest.mark.parametrize("length", ["", "1", "4"])
-def test_a_part_that_does_not_say_where_it_is_from_is_none_at_the_start_either(length):
-    with pytest.raises(OSError, match="other bytes"):
-        told(Answer(206, b"abcd", Content_Length=length), 0, 4)
-    with pytest.raises(OSError, match="other bytes"):
-        told(Answer(206, b"abcd", Content_Range="bytes 0-0/0", Content_Length=length), 0, 4)
-
-
-def test_who_is_sent_on_within_a_host_takes_the_query_along(monkeypatch) -> None:
-    asked: list[str] = []
-
-    def once(url: str, _start: int, _stop: int) -> object:
-        asked.append(url)
-        return "/b.tif?key=a/b&n=1" if len(asked) == 1 else hosts.Part(b"1", 1, "tag")
-
-    monkeypatch.setattr(hosts, "_once", once)
-    assert hosts.fetch(Remote("https://a.org/a.tif"), 0, 1).data == b"1"
-    assert asked == ["https://a.org/a.tif", "https://a.org/b.tif?key=a/b&n=1"]
-
-
-def test_an_address_that_is_none_is_one_line(monkeypatch) -> None:
-    monkeypatch.setattr(hosts, "_once", lambda *_: "http://[bad/")
-    with pytest.raises(OSError, match=r"sends us on to what is no address \(http://\[bad/\)"):
-        hosts.fetch(Remote("https://a.org/a.tif"), 0, 1)
-
-
-def test_a_query_is_part_of_what_is_asked(monkeypatch) -> None:
-    asked: list[str] = []
-
-    class Connection:
-        sock = None
-
-        def request(self, _method: str, target: str, headers: object) -> None:
-            asked.append(target)
-            raise ConnectionError
-
-        def close(self) -> None: ...
-
-    monkeypatch.setattr(hosts, "_connection", lambda *_: Connection())
-    for url in ("https://a.org/x y.tif?k=a/b&n=ü", "https://a.org/x.tif"):
-        with pytest.raises(OSError, match="broke off"):
-            hosts._once(url, 0, 1)
-    assert asked == ["/x%20y.tif?k=a/b&n=%C3%BC", "/x.tif"]

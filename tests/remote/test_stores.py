@@ -51,13 +51,21 @@ def server() -> Iterator[str]:
         found.stop()
 
 
+def forget() -> None:
+    """What was known of stores, and of where they are."""
+    import s3fs
+
+    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
+        cached.cache_clear()
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
 @pytest.fixture
-def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
+def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     names = {"AWS_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "y"}
     for name, value in {**names, "AWS_DEFAULT_REGION": "us-east-1"}.items():
         monkeypatch.setenv(name, value)
-    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
-        cached.cache_clear()
+    forget()
     client = boto3.client("s3")
     if not any(bucket["Name"] == "scenes" for bucket in client.list_buckets()["Buckets"]):
         client.create_bucket(Bucket="scenes")
@@ -76,7 +84,8 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Store:
     found = Store(client, counts)
     for name in NAMES:
         found.put(f"a/{name}", (SAMPLES / name).read_bytes())
-    return found
+    yield found
+    forget()
 
 
 @pytest.mark.slow
@@ -130,12 +139,6 @@ def test_what_cannot_be_read_costs_one_line(store: Store, url: str, hosts: tuple
 
 def test_a_store_that_does_not_answer_costs_one_line(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    hosts._store.cache_clear()
-    import s3fs
-
-    s3fs.S3FileSystem.clear_instance_cache()
     with pytest.raises(ImageError, match="its store answers") as caught:
         read_bytes(located("s3://scenes/a/x.tif", HOSTS), IMAGE)
     assert "\n" not in str(caught.value)
-    hosts._store.cache_clear()
-    s3fs.S3FileSystem.clear_instance_cache()

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import random
 import shutil
 import tracemalloc
 from collections.abc import Iterable
-from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from barpc.base.remote import REQUEST_BYTES, Part, Remote, hosts
+from barpc.base.remote import REQUEST_BYTES, Part
 from barpc.pipeline import load_views
 from tests.remote.conftest import Web
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
-AT = Remote("http://a.org/x.tif")
 HEAD = b'HTTP/1.1 206 OK\r\nETag: "a"\r\nContent-Range: bytes 0-65535/1000000\r\n'
 CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
 DATA = bytes(range(256)) * 256
@@ -28,54 +25,6 @@ END = b"0\r\n\r\n"
 
 def endless(first: bytes, unit: bytes) -> Iterable[bytes]:
     return itertools.chain([first], itertools.repeat(unit))
-
-
-class Sent(io.RawIOBase):
-    """What comes over a wire, part by part, as it is asked for."""
-
-    def __init__(self, parts: Iterable[bytes]) -> None:
-        self._parts, self._rest = iter(parts), b""
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        self._rest = self._rest or next(self._parts, b"")
-        data, self._rest = self._rest[: len(buffer)], self._rest[len(buffer) :]
-        buffer[: len(data)] = data
-        return len(data)
-
-
-class Wire:
-    """A socket that answers with given bytes, whatever is asked."""
-
-    def __init__(self, parts: Iterable[bytes]) -> None:
-        self._parts = parts
-
-    def sendall(self, data: bytes) -> None: ...
-    def shutdown(self, how: int) -> None: ...
-    def close(self) -> None: ...
-
-    def makefile(self, _mode: str) -> io.BufferedReader:
-        return io.BufferedReader(Sent(self._parts))
-
-
-@pytest.fixture
-def fetched(monkeypatch):
-    """Fetch the first block of a file from a server that sends these bytes, once or whenever it is asked."""
-
-    def fetch(*parts: bytes, more: Iterable[bytes] = ()) -> Part:
-        def connection(_scheme: str, host: str) -> HTTPConnection:
-            made = HTTPConnection(host)
-            made.sock = Wire(itertools.chain(parts, more))  # type: ignore[assignment]
-            return made
-
-        monkeypatch.setattr(hosts, "_connection", connection)
-        return hosts.fetch(AT, 0, REQUEST_BYTES)
-
-    monkeypatch.setattr(hosts, "WAITS", ())
-    monkeypatch.setattr(hosts, "_idle", {})
-    return fetch
 
 
 FOUL: dict[str, Iterable[bytes]] = {

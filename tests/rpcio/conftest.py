@@ -44,6 +44,11 @@ def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile
     return path
 
 
+def pixels(path: Path) -> np.ndarray:
+    with open_raster(path) as dataset:
+        return np.asarray(dataset.read())
+
+
 def nitf_record(rpc: RPC) -> str:
     """The record of RPC00B (STDI-0002) of numbers that it holds; an unknown accuracy is zero."""
     fields = fields_from_rpc(rpc)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import re
 import struct
@@ -17,7 +16,7 @@ from barpc.base.errors import BarpcError, ImageError, RpcFormatError
 from barpc.base.safe_io import RPC_FILE
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.formats import parse_rpc
-from barpc.rpcio.images import RPC_TAG, Directory, Entry, read_directory, read_values, tag_values
+from barpc.rpcio.images import RPC_TAG, read_directory, tag_values
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 
 RPC = make_rpc()
@@ -99,11 +98,6 @@ def test_nineteen_and_twenty_one_coefficients_are_refused():
     assert "expected 20" in outcome((text + f"LINE_NUM_COEFF_{'1' * 5000}: 1\n").encode())
     assert "given twice" in outcome((text + "LINE_NUM_COEFF_01: 3\n").encode())
     assert "19 numbers" in outcome(re.sub(r"lineNumCoef = \(\n[^\n]*\n", "lineNumCoef = (\n", SAMPLES["rpb"]).encode())
-
-
-def test_a_field_that_is_given_twice_with_two_values_is_refused():
-    assert "given twice" in outcome((SAMPLES["txt"] + "LINE_OFF: 3\n").encode())
-    assert outcome((SAMPLES["txt"] + "LINE_OFF: 950.7\n").encode()) == "read"
 
 
 @pytest.mark.parametrize(
@@ -225,16 +219,3 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ImageError, match="a pipe"):
         read_rpc(tmp_path / "pipe")
-
-
-def test_values_of_a_tag_stand_in_the_entry_or_wholly_in_the_file():
-    directory = Directory("<", False, (), b"\0" * 4)
-    file = io.BytesIO(bytes(range(100)))
-    assert read_values(file, directory, Entry(1, 3, 2, b"abcd"), "f") == b"abcd"
-    assert read_values(file, directory, Entry(1, 1, 3, b"abcd"), "f") == b"abc"
-    at = (90).to_bytes(4, "little")
-    assert read_values(file, directory, Entry(1, 1, 10, at), "f") == bytes(range(90, 100))
-    with pytest.raises(RpcFormatError, match="beyond the end"):
-        read_values(file, directory, Entry(1, 1, 11, at), "f")
-    with pytest.raises(RpcFormatError, match="claims"):
-        read_values(file, directory, Entry(1, 12, 1 << 30, at), "f")

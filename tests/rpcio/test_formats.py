@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.base.errors import ImageError, OutputError, RpcFormatError
+from barpc.base.errors import ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.formats import parse_rpc
-from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, number, write_rpb, write_txt
+from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, write_rpb, write_txt
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
 
 WRITABLE = [row for row in FORMATS.values() if row.write is not None]
@@ -39,16 +39,6 @@ def test_an_unknown_accuracy_is_never_written_as_perfect(row):
 def test_an_accuracy_of_zero_in_a_file_is_unknown(rpc):
     text = write_rpb(rpc).replace("errBias = 3.1", "errBias = 0.0")
     assert parse_rpc(text.encode(), "memory")[0].err_bias is None
-
-
-def test_an_existing_file_is_kept_unless_overwriting_is_asked_for(rpc, tmp_path):
-    path = tmp_path / "a_RPC.TXT"
-    path.write_text("mine")
-    with pytest.raises(OutputError, match="exists already"):
-        write_rpc(rpc, path)
-    assert path.read_text() == "mine"
-    write_rpc(rpc, path, overwrite=True)
-    assert read_rpc(path) == rpc
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.doc", "a"])
@@ -198,20 +188,6 @@ def test_alos_columns_are_read(tmp_path):
     np.testing.assert_array_equal(source.rpc.image_offset, [3550.0, 6500.0])
     np.testing.assert_array_equal(source.rpc.image_scale, [3551.0, 6501.0])
     np.testing.assert_array_equal(source.rpc.coeffs[:, 2], [3.25e-2, 4.25e-2, 1.25e-2, 2.25e-2])
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("+005124.00 pixels", 5124.0), ("-1.5D-03", -0.0015), (".5", 0.5), ("7", 7.0), ("1e3\tm", 1000.0)],
-)
-def test_a_number_is_read_with_its_unit_left_out(text, value):
-    assert number(text, "file", "KEY") == value
-
-
-@pytest.mark.parametrize("text", ["", "nan", "inf", "-inf", "1e400", "0x10", "1_000", "12abc", "--1", "1.2.3"])
-def test_what_is_no_finite_number_is_refused_with_file_and_key(text):
-    with pytest.raises(RpcFormatError, match="file: KEY is not"):
-        number(text, "file", "KEY")
 
 
 # --- how other constellations write the known syntaxes ------------------------------------------------------

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.sensor.corrected import Corrected, Correction, correction_of
-from barpc.sensor.curve import rotation_left_jacobian, rotation_matrix
+from barpc.sensor.curve import rotation_matrix
 
 from .conftest import make_rpc
 
@@ -20,60 +20,6 @@ CENTER = ecef_from_ground([7.0, 42.0, 7e5])
 def test_the_rotation_matrix_is_scipys(angle):
     vector = angle * np.array([0.6, -0.48, 0.64])
     np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 9e-3, 1.1e-2, 1.0])
-def test_the_left_jacobian_is_the_derivative_of_the_rotation(angle):
-    vector = angle * np.array([0.6, -0.48, 0.64])
-    v, step = np.array([1.0, 2.0, 3.0]), 1e-5
-    for axis in range(3):
-        d = step * np.eye(3)[axis]
-        difference = (rotation_matrix(vector + d) @ v - rotation_matrix(vector - d) @ v) / (2 * step)
-        analytic = np.cross(rotation_left_jacobian(vector)[:, axis], rotation_matrix(vector) @ v)
-        np.testing.assert_allclose(analytic, difference, rtol=0, atol=1e-9)
-
-
-def test_no_correction_changes_nothing():
-    rpc = make_rpc()
-    ground = rpc.localize(np.array([[100.0, 200.0], [15000.0, 9000.0]]), np.array([10.0, 900.0]))
-    same = Corrected(rpc, Correction(np.zeros(3), np.zeros(3), CENTER))
-    np.testing.assert_allclose(same.project(ground), rpc.project(ground), rtol=0, atol=2e-7)
-
-
-def test_a_correction_moves_points_as_equation_1_says():
-    rpc = make_rpc()
-    correction = Correction([1e-5, -2e-5, 3e-5], [5.0, 6.0, -7.0], CENTER)
-    ground = np.array([5.41, 43.21, 300.0])
-    x = ecef_from_ground(ground)
-    rotation = Rotation.from_rotvec(np.array(correction.rotation)).as_matrix()
-    moved = rotation @ (x - correction.translation - CENTER) + CENTER
-    expected = rpc.project(ground_from_ecef(moved))
-    np.testing.assert_allclose(Corrected(rpc, correction).project(ground), expected, rtol=0, atol=1e-7)
-    assert np.linalg.norm(expected - rpc.project(ground)) > 10
-
-
-def test_derivatives_by_point_rotation_and_translation_are_central_differences():
-    rpc = make_rpc()
-    rotation, translation = np.array([1e-3, -2e-3, 1.5e-3]), np.array([40.0, -60.0, 20.0])
-    model = Corrected(rpc, Correction(rotation, translation, CENTER))
-    ecef = ecef_from_ground(rpc.localize(np.array([[3000.0, 4000.0], [12000.0, 800.0]]), np.array([100.0, 700.0])))
-    image, by_ecef, by_rotation, by_translation = model.project_ecef(ecef)
-    np.testing.assert_allclose(image, model.project(ground_from_ecef(ecef)), rtol=0, atol=1e-7)
-    for axis in range(3):
-        e = np.eye(3)[axis]
-
-        def at(d_x=0.0, d_r=0.0, d_t=0.0, e=e):
-            changed = Corrected(rpc, Correction(rotation + d_r * e, translation + d_t * e, CENTER))
-            return changed.project_ecef(ecef + d_x * e)[0]
-
-        for analytic, name, step in (
-            (by_ecef, "d_x", 10.0),
-            (by_rotation, "d_r", 1e-5),
-            (by_translation, "d_t", 10.0),
-        ):
-            difference = (at(**{name: step}) - at(**{name: -step})) / (2 * step)
-            tolerance = 1e-6 * np.abs(analytic).max()
-            np.testing.assert_allclose(analytic[..., axis], difference, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("bad", [[1.0, 2.0], [np.nan, 0.0, 0.0]])

@@ -83,15 +83,6 @@ def test_a_step_between_detectors_is_met_as_near_as_nodes_may_stand():
 
 
 @pytest.mark.slow
-def test_a_grid_of_millions_of_nodes_is_not_made():
-    def noise(points):
-        return np.sin(1e4 * points[..., :1] * points[..., 1:2]) * np.sin(77.0 * points[..., 2:])
-
-    axes = linear_axes(noise, np.zeros(3), np.full(3, 8000.0), np.full(3, 1000.0), 1e-6)
-    assert np.prod([len(axis) for axis in axes]) < 4.2e6
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("period", [2700.0, 1024.0])
 def test_a_localisation_grid_is_the_camera_for_those_who_interpolate_linearly(period):
     from scipy.interpolate import RegularGridInterpolator

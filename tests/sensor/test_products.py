@@ -389,6 +389,8 @@ def test_a_stripmap_and_another_satellite_are_no_part_of_a_mosaic(first):
         mosaic_offsets([first, read_annotation(STRIPMAP.xml())])
     with pytest.raises(InputError, match="not of the same product"):
         mosaic_offsets([first, replace(first, mission="S1B")])
+    with pytest.raises(InputError, match="no swaths"):
+        mosaic([])
 
 
 # --- times and pixels ------------------------------------------------------------------------------------------

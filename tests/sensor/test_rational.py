@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from barpc.sensor import rational
 from barpc.sensor.rational import Rational, monomials
 from tests.fit.cameras import synthetic_rpc
 
@@ -38,20 +37,6 @@ def test_values_and_derivatives_are_those_of_the_formula(curved) -> None:
         numeric = (curved.value(x + step) - curved.value(x - step)) / 2e-5
         np.testing.assert_allclose(gradient[axis], numeric, atol=1e-8)
     np.testing.assert_array_equal(curved.value_and_gradient(x, axes=2)[1], gradient[:2])
-
-
-def test_a_newton_step_is_the_solution_of_the_linear_equations(curved) -> None:
-    rng = np.random.default_rng(2)
-    x, target = rng.uniform(-1, 1, (3, 30)), rng.uniform(-1, 1, (2, 30))
-    value, gradient = curved.value_and_gradient(x, axes=2)
-    expected = np.stack([
-        np.linalg.solve(gradient[:, :, n].T, target[:, n] - value[:, n]) for n in range(30)
-    ], axis=1)  # fmt: skip
-    moved = x.copy()
-    length = curved._step(target, moved)
-    np.testing.assert_allclose(moved[:2] - x[:2], expected, rtol=1e-9)
-    np.testing.assert_array_equal(moved[2], x[2])
-    np.testing.assert_allclose(length, np.abs(expected).max(axis=0), rtol=1e-9)
 
 
 def test_what_one_safe_step_leaves_is_below_the_accuracy_asked_for(curved) -> None:
@@ -154,20 +139,3 @@ def test_a_step_is_halved_until_the_error_falls_and_never_crosses_a_pole() -> No
     goal = steep.value(np.array([[-1.3], [0.0], [0.0]]))
     steep._line_search(goal, across, np.array([[-0.3], [0.0]]), np.ones((2, 1)))
     assert across[0, 0] > -1 / 0.9
-
-
-def test_the_careful_way_takes_few_steps_of_at_most_a_box_width(curved, monkeypatch) -> None:
-    calls = []
-    line_search = Rational._line_search
-
-    def counted(self, target, x, step, sign):
-        calls.append(float(np.abs(step).max()))
-        return line_search(self, target, x, step, sign)
-
-    monkeypatch.setattr(Rational, "_line_search", counted)
-    x = np.array([[5.0], [0.0], [0.0]])
-    left = curved._damped_newton(curved.value(x), np.zeros((3, 1)))
-    assert (left < 1e-9).all()
-    assert max(calls) == 1.0
-    assert 5 <= len(calls) <= 12
-    assert rational.TRUSTED_REACH > 1.0

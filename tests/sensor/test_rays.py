@@ -242,6 +242,8 @@ def test_a_point_behind_the_camera_and_one_beyond_the_horizon_are_not_seen() -> 
     ("change", "words"),
     [
         ({"look": LOOK[:, :1]}, "look has no slope"),
+        ({"look": LOOK * [1.0, np.nan, 1.0, 1.0]}, "finite"),
+        ({"mount": np.eye(2)}, "shape"),
         ({"look_origin": np.nan}, "finite"),
         ({"line_period": np.inf}, "finite"),
         ({"first_line": np.nan}, "finite"),

@@ -53,7 +53,8 @@ def test_the_first_guess_is_where_it_is_asked_for_and_steps_are_counted() -> Non
     far = triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 2000.0, steps=1)
     assert np.linalg.norm(far.points - ecef_from_ground(truth), axis=1).min() > 1e-3
     enough = triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 2000.0)
-    assert np.linalg.norm(enough.points - ecef_from_ground(truth), axis=1).max() < 1e-4
+    assert np.abs(enough.points - ecef_from_ground(truth)).max() < 1e-5
+    assert np.abs(enough.residuals).max() < 1e-6
 
 
 @pytest.mark.parametrize(("degrees", "usable"), [(3e-4, False), (0.01, True), (1.0, True)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.pointio.correspondences import correspondence_kind, read_correspondences
+from barpc.pointio.correspondences import read_correspondences
 
 ROWS = np.array([[5.4, 43.2, 100.0, 10.5, 20.25], [5.5, 43.3, 120.5, 11.0, 21.0]])
 
@@ -74,29 +74,15 @@ def test_geojson_points_that_are_no_places_on_wgs84_are_refused(tmp_path: Path, 
     assert "\n" not in str(told.value)
 
 
-def test_a_localisation_grid_counts_from_the_corner_of_the_first_pixel(tmp_path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
-    path = tmp_path / "grid.tif"
-    bands = np.arange(4 * 3 * 2, dtype=np.float64).reshape(4, 3, 2)
-    profile = {"driver": "GTiff", "width": 2, "height": 3, "count": 4, "dtype": "float64"}
-    with rasterio.open(path, "w", transform=rasterio.Affine(10, 0, 5, 0, 20, 7), **profile) as file:
-        file.write(bands)
-    assert correspondence_kind(path) is None
-    points = read_correspondences(path, altitudes=[0.0, 500.0])
-    assert points.image[:3].tolist() == [[4.5, 6.5], [14.5, 6.5], [4.5, 26.5]]
-    assert points.ground[0].tolist() == [0.0, 6.0, 0.0]
-    assert points.ground[-1].tolist() == [17.0, 23.0, 500.0]
-    with pytest.raises(InputError, match="one altitude a layer"):
-        read_correspondences(path, altitudes=[0.0])
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("a.csv", b"lon,lat,alt,col\n1,2,3,4\n", "no column row"),
         ("a.csv", b"lon,lat,alt,col,row\n1,2,3,4,x\n", "line 2"),
         ("a.csv", b"lon,lat,alt,col,row\n1,2,3\n", "line 2"),
+        ("a.txt", b"5.4 43.2 100 10 20\n1 2 3 4\n", "line 2: expected lon, lat, alt, col, row"),
         ("a.csv", b"lon,lat,alt,col,row\n", "no points"),
+        ("a.csv", b"lon lat alt col row\n# 5.4 43.2 100 10 20\n", r"a\.csv: no points in it$"),
         ("a.npz", b"PK\x03\x04 nothing", "not an archive of arrays"),
         ("a.json", b'{"type": "FeatureCollection", "features": [{}]}', "not a GeoJSON"),
         ("a.txt", b"LINE_OFF: 5\n", "neither a table"),
