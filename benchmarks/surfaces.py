@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from rasterio.transform import from_origin
+from rasterio.transform import Affine
 from rasterio.warp import Resampling, reproject
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -98,7 +98,7 @@ def by_cars(python: str) -> Tool:
 def level(path: Path, middle: tuple[float, float], height: float) -> Path:
     """A raster of one height [m] for a degree around a place: for CARS, which finds no disparities without any."""
     side, step = 100, 0.01
-    place = from_origin(middle[0] - side * step / 2, middle[1] + side * step / 2, step, step)
+    place = Affine(step, 0.0, middle[0] - side * step / 2, 0.0, -step, middle[1] + side * step / 2)
     with rasterio.open(path, "w", "GTiff", side, side, 1, "EPSG:4326", place, "float32") as file:
         file.write(np.full((side, side), height, np.float32), 1)
     return path

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
+from rasterio.transform import Affine
 
 from benchmarks.real import features, matched
 from benchmarks.surfaces import between, heights
@@ -33,7 +33,7 @@ def test_check_points_are_at_the_same_place_in_a_turned_image(turns: int) -> Non
 def surface(path: Path, values: np.ndarray, west: float, north: float) -> Path:
     path.parent.mkdir(exist_ok=True)
     size = {"width": values.shape[1], "height": values.shape[0], "count": 1, "dtype": values.dtype}
-    place = {"crs": "EPSG:32631", "transform": from_origin(west, north, 1.0, 1.0), "nodata": -999.0}
+    place = {"crs": "EPSG:32631", "transform": Affine(1.0, 0.0, west, 0.0, -1.0, north), "nodata": -999.0}
     with rasterio.open(path, "w", "GTiff", **size, **place) as file:
         file.write(values, 1)
     return path

@@ -364,6 +364,13 @@ def _(s, degree, rest):
         assert found[1] == ", ".join(map(metres, s.scene.drift_sigma_m))
 
 
+@says(rf"The cameras are {NUM} times less accurate than stated: their standard deviations were widened, .*")
+def _(summary, times):
+    scale = min(view.prior_scale for view in summary.views)
+    assert float(times) == round(scale, 1) > 2.0
+    assert not summary.passed
+
+
 @says(rf"The squares of the corrections are {NUM} times .* stated accuracies: (.*)\.")
 def _(s, ratio, rest):
     assert float(ratio) == pytest.approx(s.scene.prior_ratio, rel=0.06)
