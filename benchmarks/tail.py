@@ -26,6 +26,8 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where barpc is installed as a package
+
 import cv2
 import numpy as np
 import rasterio

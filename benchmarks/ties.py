@@ -27,6 +27,8 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where barpc is installed as a package
+
 import cv2  # noqa: E402  (the thread counts come first)
 import numpy as np  # noqa: E402
 import rasterio  # noqa: E402

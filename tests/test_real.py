@@ -50,3 +50,13 @@ def test_surfaces_are_compared_at_the_same_ground(tmp_path: Path) -> None:
     middle, noise = (float(between(other, whole).split()[i]) for i in (0, 2))
     assert middle == pytest.approx(0.5, abs=0.02)
     assert 0.001 < noise < 0.02  # 0.3 m over 10,000 cells, of medians
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).resolve().parents[1] / "benchmarks").glob("*.py")), ids=lambda path: path.name
+)
+def test_a_command_finds_these_tests_before_those_of_other_packages(path: Path) -> None:
+    """Some packages install a folder `tests`, and a command starts with its own folder alone."""
+    text = path.read_text(encoding="utf-8")
+    at = [text.find(start) for start in ("\nfrom tests", "\n    from tests") if start in text]
+    assert not at or 0 <= text.find("sys.path.insert(0, ") < min(at)
