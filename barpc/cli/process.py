@@ -102,11 +102,16 @@ class Interrupt:
         self.end()
         self._code, self._said = code, b""
 
+    @property
+    def ended(self) -> bool:
+        """Whether a signal ended the command."""
+        return self._code == EXIT_INTERRUPTED and not self._said
+
     def leave(self, numbers: Iterable[int]) -> None:
         """Ignore signals from now on, as the last exit handler: Python then restores their default actions."""
         for number in numbers:
             signal.signal(number, signal.SIG_IGN)
-        if self._code == EXIT_INTERRUPTED and not self._said:
+        if self.ended:
             os._exit(self._code)  # Python ends itself by SIGINT where one came to code that `exec` ran
 
 
@@ -128,5 +133,7 @@ def interruptible(own: bool) -> Iterator[Interrupt]:
     try:
         yield interrupt
     finally:
+        if own and interrupt.ended:  # Python's threads may find pipes of workers closed, and say so after that
+            sys.unraisablehook = lambda _: None
         for number, handler in () if own else before.items():
             signal.signal(number, handler)
