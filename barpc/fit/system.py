@@ -24,6 +24,7 @@ import scipy
 from barpc.base.errors import FitError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
+from barpc.base.statistics import SURELY
 from barpc.sensor.rational import POWERS, monomials
 
 Rounding = Callable[[Array], Array]
@@ -215,9 +216,10 @@ def noise_scaled(system: TriangularSystem, expected: Array) -> tuple[TriangularS
     """Return the system with each unknown penalised by sigma / its expected size, and sigma.
 
     The free solution lets noisy denominators shrink, and the residual with them; the residual of the
-    penalised one tells the noise better. What it shows to be larger than expected, against its penalty, is expected of
-    that size: of radar's columns a denominator's first degree is 55 times an optical one's, and the misfit of a model
-    without noise, taken for noise, would hold it down. Never quite singular: there is a floor at the rounding.
+    penalised one tells the noise better. What it shows to be surely larger than expected, against its penalty, is
+    expected of that size: of radar's columns a denominator's first degree is 55 times an optical one's, and the misfit
+    of a model without noise, taken for noise, would hold it down. Never quite singular: there is a floor at the
+    rounding.
     """
     floor = 16 * EPS * float(np.abs(system.matrix).max())
     sigma = system.sigma
@@ -226,7 +228,7 @@ def noise_scaled(system: TriangularSystem, expected: Array) -> tuple[TriangularS
         penalised = system.penalized(penalty)
         found = solution(penalised)
         sigma = float(np.sqrt(system.squares(found) / system.freedom))
-        expected = np.maximum(expected, np.abs(found))
+        expected = np.where(np.abs(found) > SURELY * expected, np.abs(found), expected)
     return penalised, sigma
 
 

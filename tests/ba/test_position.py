@@ -183,10 +183,10 @@ def test_what_the_user_states_of_the_cameras_is_taken_as_stated() -> None:
 
 @pytest.mark.slow
 def test_accuracies_that_are_shared_are_in_the_summary() -> None:
-    block = simulate_block(4, 100, seed=8, per_site=4)
+    block = simulate_block(6, 100, seed=8, per_site=4)
     views = tuple(replace(view, sensor=replace(view.sensor, err_bias=40.0)) for view in block.views)
     found = adjust_tracks(views, block.tracks, AdjustOptions(), centers=centers_of(block))
-    assert found.prior.shared > 1.1
+    assert found.prior.shared > 1.2
     summary = summarize(Run("adjust", views, (), block.tracks, adjustment=found, options=RunOptions()))
     assert summary.scene.prior_shared == found.prior.shared
     assert json_form(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)

@@ -114,7 +114,7 @@ def test_what_is_told_of_a_grid_is_its_error(once, camera):
         off = np.linalg.norm(open_camera(tmp_path / f"a{name}").model.project(ground) - image, axis=1).max()
         told = written[f"a{name}"]["barpc"]
         assert 0.3 * told < off < 1.2 * told
-        assert told < 1.2 * LINEAR  # the interpolation's, and what the denominators take of the jitter by altitude
+        assert told < LINEAR
     assert LINEAR / 10 < written["a" + GRID_SUFFIX]["linear"] < LINEAR
 
 
@@ -124,7 +124,7 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
     at = seen_by(camera)[1]
     for alt in ALTS:
         ground = rpc.localize(at, np.full(len(at), alt))
-        assert np.linalg.norm(lacking.apply(at) - camera.project(ground), axis=1).max() < 1.2 * LINEAR
+        assert np.linalg.norm(lacking.apply(at) - camera.project(ground), axis=1).max() < LINEAR
     assert rpc.err_bias == fit.rpc.err_bias
 
 
