@@ -42,6 +42,17 @@ class TrackGroup:
         count, n = self.rows.shape
         return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
 
+    def all_but(self, some: IntArray, view: int) -> tuple[Array, Array]:
+        """Return 1 or 0 (T, 2n, 1) for values of some tracks, 0 in a view, and what ground points follow (T, 3, 2n).
+
+        All count in tracks of two views.
+        """
+        n = self.rows.shape[1]
+        of_view = self.view[some] == view
+        subset = np.where(of_view.any(axis=1) & (n > 2), n - of_view.argmax(axis=1), 0)  # as `_subsets` has them
+        counts = np.repeat(self.subsets[subset], 2, axis=1)[..., None]
+        return counts, self.follow[some[:, None], 3 * subset[:, None] + np.arange(3)]
+
     def followed(self, values: Array) -> Array:
         """Return the coordinates (T, S, 3) of values (T, 2n) along the ground points' derivatives."""
         found: Array = self.follow @ values[..., None]

@@ -116,13 +116,14 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
 
 
 def first_guess(
-    linear: Linear, found: MixtureFit, extra: Array, new: Array, precision: Array
+    linear: Linear, found: MixtureFit, extra: Array, new: Array, precision: Array, wrong: int = -1
 ) -> tuple[Array, float, float]:
     """Estimate starting values (e,) of unknowns that move observations by `new` (2, e, K) [px], beside a fit
     with `extra` [px].
 
     They have the least sum of what all tracks are off by, not of its squares; also the median of that, and the sum less
-    that without them, over the noise. Their prior's precisions are the last of `precision`.
+    that without them, over the noise. Their prior's precisions are the last of `precision`. Observations of a view
+    that is `wrong` do not count in tracks of more than two.
     """
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     prior = np.diag(precision[len(precision) - new.shape[1] :])
@@ -133,8 +134,8 @@ def first_guess(
         rows, size = tracks.rows[some], 2 * tracks.rows.shape[1]
         columns = beside[:, :, rows].transpose(2, 3, 0, 1).reshape(len(some), size, new.shape[1])
         off = left[:, rows].transpose(1, 2, 0).reshape(len(some), size, 1)
-        follow = tracks.follow[some, :3]
-        parts.append(tuple(one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
+        met, follow = tracks.all_but(some, wrong)
+        parts.append(tuple(met * one - np.swapaxes(follow, 1, 2) @ (follow @ one) for one in (off, columns)))
     moved, far, sums = np.zeros(new.shape[1]), [np.zeros(0)], list[float]()
     for _ in range(BACKFITTING):
         matrix, gradient, far = prior.copy(), prior @ moved, []
@@ -284,10 +285,6 @@ class Mixture:
             known = warm.step.size + len(warm.extra)
             self.x[:known] = *warm.step.ravel(), *warm.extra
             self.noise, self.eps = warm.noise, warm.eps
-            if extra is not None and group is None and known < len(self.x):
-                old, new = np.split(extra, [len(warm.extra)], axis=1)
-                self.x[known:], far, _ = first_guess(linear, warm, old, new, own)
-                self.noise = max(self.noise, far)
         self.beside = [self.extra]  # of what stands still, and of what moves
         if group is not None:
             self.noise, self.eps = GROSS, np.full(linear.views, WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1])
@@ -299,6 +296,25 @@ class Mixture:
         self.touched = np.asarray(self.beside[-1].any(axis=(0, 1)))
         self.curvature: list[Array] = []
         self.summed: list[Array] = []
+        if warm is not None and extra is not None and group is None and known < len(self.x):
+            self._begin(warm, extra, own)
+
+    def _begin(self, warm: MixtureFit, extra: Array, precision: Array) -> None:
+        """Set the further unknowns to the best of their first guesses: from all views, or as if one were wrong.
+
+        Where rows of two views are displaced, the least sum may be that of one displacement for both; the larger
+        probability is that of one's own, with the other wrong.
+        """
+        known = warm.step.size + len(warm.extra)
+        old, new = np.split(extra, [len(warm.extra)], axis=1)
+        touched = self.linear.view[new.any(axis=(0, 1))]
+        starts = []
+        for view in (-1, *np.setdiff1d(self.linear.view, touched).tolist()):
+            guess, far, _ = first_guess(self.linear, warm, old, new, precision, view)
+            self.x[known:] = guess
+            starts.append((self._expected().log, -view, far, guess))
+        _, _, far, self.x[known:] = max(starts, key=lambda one: one[:2])
+        self.noise = max(self.noise, far)
 
     def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> MixtureFit:
         """Iterate until nothing changes, or a number of times; goes on where the last run ended."""

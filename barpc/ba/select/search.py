@@ -9,14 +9,14 @@ import numpy as np
 
 from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, array_elements, linearise
-from barpc.ba.evidence.mixture import fit_mixture
+from barpc.ba.evidence.mixture import MixtureFit, fit_mixture
 from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
 from barpc.ba.select.anomalies import image_sizes, periods_of, standing_out
 from barpc.ba.select.beam import Selection, TermSearch
 from barpc.ba.solving.solve import State
 from barpc.ba.terms.moving_ground import GroundMotion
 from barpc.ba.terms.term import Residuals
-from barpc.base.statistics import KEPT, LARGEST, SAMPLE, SMALL
+from barpc.base.statistics import KEPT, LARGEST, SAMPLE, SLIGHT, SMALL
 from barpc.scene import IntArray
 
 logger = logging.getLogger(__name__)
@@ -64,13 +64,25 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base, few = fit_mixture(linear), linear.thinned(SAMPLE)
+        base = fit_mixture(linear, warm=_as_solved(linear, outcome, rows))
+        few = linear.thinned(SAMPLE)
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
         logger.warning("the residuals of the tie points are not explained: %s", error)
         return Selection()
+
+
+def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
+    """Return the solution, of observations at `rows` (K,), as a mixture: its noise, and what was cut in each view.
+
+    One noise for all observations, cooled from gross errors, would take in many that are displaced, and hide which.
+    """
+    right, count = outcome.inlier[rows].astype(np.float64), np.bincount(linear.view, minlength=linear.views)
+    wrong = np.bincount(linear.view, 1.0 - right, linear.views) / np.maximum(count, 1)
+    nothing, eps = np.zeros(0), np.clip(wrong, SLIGHT, 1.0 - SLIGHT)
+    return MixtureFit(-np.inf, np.zeros(linear.shape), nothing, outcome.noise, eps, right)
 
 
 def _neighbour_views(block: Block, view: int) -> IntArray:
