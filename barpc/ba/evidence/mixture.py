@@ -307,13 +307,17 @@ class Mixture:
         """
         known = warm.step.size + len(warm.extra)
         old, new = np.split(extra, [len(warm.extra)], axis=1)
-        touched = self.linear.view[new.any(axis=(0, 1))]
-        starts = []
-        for view in (-1, *np.setdiff1d(self.linear.view, touched).tolist()):
-            guess, far, _ = first_guess(self.linear, warm, old, new, precision, view)
-            self.x[known:] = guess
-            starts.append((self._expected().log, -view, far, guess))
-        _, _, far, self.x[known:] = max(starts, key=lambda one: one[:2])
+        given = self.linear, warm, old, new, precision
+        guesses = [first_guess(*given)]
+        if guesses[0][1] > np.sqrt(2.0 * self.linear.views) * self.noise:  # else most tracks are met as well as may be
+            touched = self.linear.view[new.any(axis=(0, 1))]
+            guesses += [first_guess(*given, view) for view in np.setdiff1d(self.linear.view, touched).tolist()]
+
+        def log(guess: tuple[Array, float, float]) -> float:
+            self.x[known:] = guess[0]
+            return self._expected().log
+
+        self.x[known:], far, _ = max(guesses, key=log) if len(guesses) > 1 else guesses[0]
         self.noise = max(self.noise, far)
 
     def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> MixtureFit:
