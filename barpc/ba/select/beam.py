@@ -283,8 +283,9 @@ class TermSearch:
         self.group = self.group or list[Term](MovingObjects.of(self.seen))
         found = self._with([], self.group)
         rows = self.seen.linear.taking_part
-        members = [one for row in found if row[2] > SURE for one in self._members(row[1], rows)]
-        return self._refined(self._with(found, members))
+        members = [(one, row[1]) for row in found if row[2] > SURE for one in self._members(row[1], rows)]
+        fits = [(one, self._fit(one, base=still)) for one, still in members]  # from the cameras of what stands still
+        return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
 
     def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
         """Return the terms, best first, with ends, periods and lengths refined where these may gain most."""
