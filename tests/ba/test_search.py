@@ -493,7 +493,7 @@ def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(
 
 
 def test_a_mixture_that_cannot_be_solved_has_no_terms_and_says_so(monkeypatch, caplog) -> None:
-    def fails(*_: Any) -> None:
+    def fails(*_: Any, **__: Any) -> None:
         raise np.linalg.LinAlgError("not positive definite")
 
     monkeypatch.setattr(search, "fit_mixture", fails)
