@@ -61,6 +61,7 @@ class Subsets:
     of_row: IntArray  # (M,) their tracks
     of_subset: IntArray  # (S,) the subsets' tracks
     members: sp.csr_array  # (S, M) 1 for observations of a subset
+    member_of: sp.csc_array  # (M, S) the same, turned
     size: IntArray  # (S,) how many these are
     views: IntArray  # (T,) how many a track has
     begins: tuple[IntArray, IntArray]  # (T,) where the observations, and the subsets, of each track begin
@@ -81,6 +82,7 @@ class Subsets:
             np.repeat(every, views),
             np.repeat(every, subsets),
             members,
+            members.T,
             np.diff(members.indptr),
             views,
             (np.cumsum(views) - views, np.cumsum(subsets) - subsets),

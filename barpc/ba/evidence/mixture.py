@@ -196,7 +196,7 @@ def _expect(
     total = of_none + sum(np.add.reduceat(one, begins) for one in shares)
     shares = [one / total[subsets.of_subset] for one in shares]
     single = (of_none / total / (1.0 + of_odds))[subsets.of_row] * odds
-    return _Expected(top + np.log(total), subsets.members.T @ sum(shares) + single, shares, found)
+    return _Expected(top + np.log(total), subsets.member_of @ sum(shares) + single, shares, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +222,7 @@ class _OfSubsets:
 
     def expected(self, linear: Linear, share: Array) -> _Component:
         """Return the expectations where each subset is right with a probability (S,)."""
-        subsets, seen = linear.subsets, linear.subsets.members.T @ share
+        subsets, seen = linear.subsets, linear.subsets.member_of @ share
         pulls, weighed = seen[:, None] * self.values, share[:, None] * self.followed
         absorbed, weights = np.empty_like(pulls), list[Array]()
         for tracks, (rows, some) in zip(linear.tracks, subsets.parts, strict=True):
