@@ -39,11 +39,6 @@ class TrackGroup:
     volume: Array  # (T, S) log of what the integral over the ground point leaves
     by_unknown: Array  # (T, n, 2, q)
 
-    def of(self, values: Array) -> Array:
-        """Return values (2, K) of observations arranged by track (T, 2n)."""
-        count, n = self.rows.shape
-        return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
-
     def weight(self, weight: Array) -> Array:
         """Return the projectors (T, 2n, 2n) off the motions of ground points, weighted over subsets (T, S)."""
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
@@ -70,7 +65,7 @@ class Subsets:
 
     @classmethod
     def of(cls, tracks: Sequence[TrackGroup]) -> Subsets:
-        """Return those of groups of tracks."""
+        """Return the subsets of groups of tracks."""
         count, many, n = np.array([(len(one.rows), *one.subsets.shape) for one in tracks]).T
         views, subsets = np.repeat(n, count), np.repeat(many, count)
         every = np.arange(len(views))
@@ -133,7 +128,7 @@ class Linear:
 
     @cached_property
     def subsets(self) -> Subsets:
-        """What may be right together of all tracks."""
+        """Subsets of the observations of all tracks that may be right together."""
         return Subsets.of(self.tracks)
 
     @cached_property
@@ -168,8 +163,7 @@ class Linear:
     def taking_part(self) -> BoolArray:
         """Observations (K,) of tracks."""
         rows = np.zeros(len(self.view), dtype=bool)
-        for tracks in self.tracks:
-            rows[tracks.rows] = True
+        rows[self.subsets.rows] = True
         return rows
 
     def left(self, step: Array) -> Array:

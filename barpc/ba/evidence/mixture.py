@@ -103,7 +103,7 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
         weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
         matrix = weighted @ ground + RIDGE * np.eye(3)
         by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
-        values = tracks.of(residual)
+        values = residual.T[tracks.rows].reshape(count, -1)
         left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
         spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(axis=1)
         off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
@@ -175,7 +175,7 @@ class _Expected:
 def _expect(
     linear: Linear, residual: Array, noise: float, eps: Array, moved: _MovedObservations | None = None
 ) -> _Expected:
-    """Return what is expected of residuals (2, K), and of those of tracks that moved."""
+    """Return the expectations of all tracks at residuals (2, K) [stated deviations], and those of tracks that moved."""
     subsets, (rows, begins) = linear.subsets, linear.subsets.begins
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     view = linear.view[subsets.rows]
@@ -208,7 +208,7 @@ class _OfSubsets:
 
     @classmethod
     def at(cls, linear: Linear, residual: Array, noise: float, area: float) -> _OfSubsets:
-        """Return those of residuals (2, K)."""
+        """Return the likelihoods of all subsets at residuals (2, K) [stated deviations]."""
         subsets = linear.subsets
         values, followed = residual.T.take(subsets.rows, axis=0), np.empty((len(subsets.size), 3))
         for tracks, (rows, some) in zip(linear.tracks, subsets.parts, strict=True):
@@ -378,7 +378,7 @@ class Mixture:
         assert self.group is not None
         share, scatter = self.group.share, noise
         if cold:
-            rows = np.concatenate([tracks.rows[:, 0] for tracks in self.linear.tracks])
+            rows = self.linear.subsets.rows[self.linear.subsets.begins[0]]
             cell, moved = self.group.cell, seen.kinds[1]
             weights = seen.moving[rows], np.ones(len(rows))
             gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
