@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
+from pyproj import Transformer
 from rasterio.warp import transform
 from scipy.ndimage import maximum_filter
 
@@ -23,6 +24,7 @@ from barpc.ba import BlockPrior
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
+from barpc.ba.solving.structure import counting_sort
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, parts
 from barpc.base.options import TieOptions
@@ -180,11 +182,12 @@ def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Arr
 def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
     """Return the median height of the points in each cell and its sigma (2, rows, cols); NaN where there is none."""
     width, height = tile.size
-    east, north = map(np.array, transform("EPSG:4326", tile.crs, *ground[:, :2].T))
-    col, row = (np.floor(one / tile.step).astype(np.int64) for one in (east - tile.west, tile.north - north))
-    inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))
-    cell, alt = row[inside] * width + col[inside], ground[inside, 2]
-    order = np.lexsort((alt, cell))
+    east, north = Transformer.from_crs("EPSG:4326", tile.crs, always_xy=True).transform(*ground[:, :2].T)
+    col, row = (np.floor(one / tile.step) for one in (east - tile.west, tile.north - north))
+    inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))  # none that has no place
+    cell, alt = (row * width + col)[inside].astype(np.int64), ground[inside, 2]
+    order = np.argsort(alt, kind="stable")
+    order = order[counting_sort(cell[order], width * height)[0]]
     cell, alt = cell[order], alt[order]
     start = np.flatnonzero(np.diff(cell, prepend=-1))
     of, count = cell[start], np.diff(start, append=len(cell))

@@ -12,10 +12,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
 from typing import Any, ClassVar
+from zlib import crc32
 
 import numpy as np
 
+from barpc import __version__
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.ranking import TABLE_ROWS_SHOWN, flagged, worst_first
@@ -38,17 +42,31 @@ _ARROW_LENGTH = 20.0  # units of a long residual
 
 @cache
 def template(name: str) -> Any:
-    """Return a template of the page; values are escaped, and an unknown name is an error."""
+    """Return a template of the page; values are escaped, and an unknown name is an error.
+
+    It is compiled once, and kept beside its source as Python keeps modules.
+    """
     import jinja2
 
-    loader, undefined = jinja2.PackageLoader("barpc.report", ""), jinja2.StrictUndefined
+    class Compiled(SourceFileLoader):
+        def source_to_code(self, data: Any, path: Any) -> Any:  # type: ignore[override]
+            return environment.compile(data.decode(), self.name, path)
+
+        def path_stats(self, path: Any) -> dict[str, Any]:  # of another version it is compiled anew
+            of_file, versions = super().path_stats(path), f"{__version__} {jinja2.__version__}"
+            return {**of_file, "mtime": of_file["mtime"] + crc32(versions.encode())}
+
+    class Loader(jinja2.BaseLoader):
+        def load(self, environment: Any, name: str, globals: Any = None) -> Any:
+            code = Compiled(name, str(Path(__file__).with_name(name))).get_code(name)
+            return environment.template_class.from_code(environment, code, globals or {})
+
     environment = jinja2.Environment(
-        loader=loader,
+        loader=Loader(),
         autoescape=True,
-        undefined=undefined,
+        undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        optimized=False,  # it is used once
     )
     environment.filters |= {"n": coordinate, "tally": tally}
     environment.filters |= {one.__name__: one for one in (counted, figure, known, listed, metres)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from dataclasses import replace
 from itertools import chain
 from types import SimpleNamespace
@@ -29,7 +30,7 @@ from .made import (
     seen,
 )
 
-pytest.importorskip("jinja2")
+jinja2 = pytest.importorskip("jinja2")
 
 LON, LAT = 111319.491, 110574.276  # m of a degree at the equator, WGS84
 
@@ -49,6 +50,29 @@ def drawn_names(places, taken=()) -> Drawing:
 
 def plane(height: float = 300.0, unit: float = 100.0) -> Plane:
     return Plane(10.0, 0.0, np.array([unit, 2 * unit]), height, unit / LON)
+
+
+def test_a_template_is_compiled_once_and_anew_by_another_version(tmp_path, monkeypatch):
+    """As a module is: kept in a folder that can be written, and where none can be it works all the same."""
+    compiled, compile_it = [], jinja2.Environment.compile
+
+    def watched(self, source, name=None, filename=None, **further):
+        compiled.append(name)
+        return compile_it(self, source, name, filename, **further)
+
+    monkeypatch.setattr(jinja2.Environment, "compile", watched)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    (tmp_path / "file").touch()
+    for folder, versions, times in (("kept", "112", 2), ("file", "111", 3)):
+        compiled.clear()
+        monkeypatch.setattr(sys, "pycache_prefix", str(tmp_path / folder))
+        for version in versions:
+            monkeypatch.setattr(jinja2, "__version__", version)
+            text = maps.template.__wrapped__("drawings.svg.j2").module.names(
+                [(SimpleNamespace(advice=""), "A", 1.0, 2.0)]
+            )
+            assert ">A<" in text
+        assert compiled == ["drawings.svg.j2"] * times
 
 
 # --- the plane --------------------------------------------------------------------------------------------

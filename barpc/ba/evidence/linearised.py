@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+import scipy.sparse as sp
 
 from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
@@ -37,11 +39,6 @@ class TrackGroup:
     volume: Array  # (T, S) log of what the integral over the ground point leaves
     by_unknown: Array  # (T, n, 2, q)
 
-    def of(self, values: Array) -> Array:
-        """Return values (2, K) of observations arranged by track (T, 2n)."""
-        count, n = self.rows.shape
-        return np.ascontiguousarray(values[:, self.rows].transpose(1, 2, 0)).reshape(count, 2 * n)
-
     def all_but(self, some: IntArray, view: int) -> tuple[Array, Array]:
         """Return 1 or 0 (T, 2n, 1) for values of some tracks, 0 in a view, and what ground points follow (T, 3, 2n).
 
@@ -53,17 +50,6 @@ class TrackGroup:
         counts = np.repeat(self.subsets[subset], 2, axis=1)[..., None]
         return counts, self.follow[some[:, None], 3 * subset[:, None] + np.arange(3)]
 
-    def followed(self, values: Array) -> Array:
-        """Return the coordinates (T, S, 3) of values (T, 2n) along the ground points' derivatives."""
-        found: Array = self.follow @ values[..., None]
-        return found.reshape(len(values), len(self.subsets), 3)
-
-    def weighed(self, values: Array, followed: Array, weight: Array) -> Array:
-        """Return the values (T, 2n) less the part that ground points absorb, weighted over subsets (T, S)."""
-        parts = (weight[..., None] * followed).reshape(len(values), 1, -1) @ self.follow
-        seen: Array = np.repeat(weight @ self.subsets, 2, axis=1)
-        return np.asarray(seen * values - parts[:, 0])
-
     def weight(self, weight: Array) -> Array:
         """Return the projectors (T, 2n, 2n) off the motions of ground points, weighted over subsets (T, S)."""
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
@@ -71,6 +57,44 @@ class TrackGroup:
         diagonal = np.einsum("tii->ti", out)
         diagonal += np.repeat(weight @ self.subsets, 2, axis=1)
         return out
+
+
+@dataclass(frozen=True, eq=False)
+class Subsets:
+    """All subsets (S,) of the tracks (T,) of all groups, one after the other, and their observations (M,) likewise."""
+
+    rows: IntArray  # (M,) observations
+    of_row: IntArray  # (M,) their tracks
+    of_subset: IntArray  # (S,) the subsets' tracks
+    members: sp.csr_array  # (S, M) 1 for observations of a subset
+    member_of: sp.csc_array  # (M, S) the same, turned
+    size: IntArray  # (S,) how many these are
+    views: IntArray  # (T,) how many a track has
+    begins: tuple[IntArray, IntArray]  # (T,) where the observations, and the subsets, of each track begin
+    parts: tuple[tuple[slice, slice], ...]  # observations and subsets of each group
+    volume: Array  # (S,) as of the groups
+
+    @classmethod
+    def of(cls, tracks: Sequence[TrackGroup]) -> Subsets:
+        """Return the subsets of groups of tracks."""
+        count, many, n = np.array([(len(one.rows), *one.subsets.shape) for one in tracks]).T
+        views, subsets = np.repeat(n, count), np.repeat(many, count)
+        every = np.arange(len(views))
+        members = sp.csr_array(sp.block_diag([sp.kron(sp.eye_array(len(one.rows)), one.subsets) for one in tracks]))
+        members.eliminate_zeros()
+        ends = (np.append(0, np.cumsum(count * length)).tolist() for length in (n, many))
+        return cls(
+            np.concatenate([one.rows.ravel() for one in tracks]),
+            np.repeat(every, views),
+            np.repeat(every, subsets),
+            members,
+            members.T,
+            np.diff(members.indptr),
+            views,
+            (np.cumsum(views) - views, np.cumsum(subsets) - subsets),
+            tuple(zip(*([slice(*one) for one in pairwise(bounds)] for bounds in ends), strict=True)),
+            np.concatenate([one.volume.ravel() for one in tracks]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +138,11 @@ class Linear:
         )
 
     @cached_property
+    def subsets(self) -> Subsets:
+        """Subsets of the observations of all tracks that may be right together."""
+        return Subsets.of(self.tracks)
+
+    @cached_property
     def pairs(self) -> Pairs:
         """All pairs of observations of the same track, an observation with itself among them."""
         rows = np.concatenate(
@@ -145,8 +174,7 @@ class Linear:
     def taking_part(self) -> BoolArray:
         """Observations (K,) of tracks."""
         rows = np.zeros(len(self.view), dtype=bool)
-        for tracks in self.tracks:
-            rows[tracks.rows] = True
+        rows[self.subsets.rows] = True
         return rows
 
     def left(self, step: Array) -> Array:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dtrtri
 
-from barpc.ba.evidence.linearised import Linear, TrackGroup
+from barpc.ba.evidence.linearised import Linear, Subsets
 from barpc.base.geodesy import CHUNK, Array
 from barpc.base.statistics import BACKFITTING, CONVERGED, GROSS, ITERATIONS, LEAST_NOISE, RIDGE, SLIGHT, STANDS, SURE
 from barpc.scene import BoolArray, IntArray
@@ -78,18 +78,15 @@ def moving(linear: Linear, extra: Array, group: Group, found: MixtureFit) -> Arr
     left = linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma
     away = np.einsum("cmk,m->ck", group.by_move, found.move) / linear.sigma
     moved = _MovedObservations(left + away, group.share, found.scatter)
-    out = np.zeros(len(linear.view))
-    for tracks in linear.tracks:
-        out[tracks.rows] = _expect(linear, tracks, left, found.noise, found.eps, moved).gone[:, None]
+    out, subsets = np.zeros(len(linear.view)), linear.subsets
+    out[subsets.rows] = _expect(linear, left, found.noise, found.eps, moved).gone(subsets)[subsets.of_row]
     return out
 
 
 def log_likelihoods(linear: Linear, residual: Array, found: MixtureFit) -> Array:
     """Return the log-likelihood (K,) of every observation's track, at residuals (2, K) in stated deviations."""
     out = np.zeros(len(linear.view))
-    for tracks in linear.tracks:
-        weight = _expect(linear, tracks, residual, found.noise, found.eps)
-        out[tracks.rows] = weight.log[:, None]
+    out[linear.subsets.rows] = _expect(linear, residual, found.noise, found.eps).log[linear.subsets.of_row]
     return out
 
 
@@ -106,7 +103,7 @@ def off_from_right(linear: Linear, residual: Array, right: Array) -> tuple[Array
         weighted = np.swapaxes(ground * np.repeat(weight, 2, axis=1)[..., None], 1, 2)
         matrix = weighted @ ground + RIDGE * np.eye(3)
         by_row = np.linalg.solve(matrix, np.swapaxes(ground, 1, 2))  # (T, 3, 2n)
-        values = tracks.of(residual)
+        values = residual.T[tracks.rows].reshape(count, -1)
         left = values - (np.swapaxes(by_row, 1, 2) @ (weighted @ values[..., None]))[..., 0]
         spread = 1.0 + (1.0 - 2.0 * np.repeat(weight, 2, axis=1)) * (np.swapaxes(ground, 1, 2) * by_row).sum(axis=1)
         off = (left / np.sqrt(np.maximum(spread, 0.1))).reshape(count, n, 2)
@@ -163,78 +160,80 @@ class _MovedObservations:
 
 @dataclass(frozen=True, eq=False)
 class _Expected:
+    """Expectations of tracks that stand, and then of those that move."""
+
     log: Array  # (T,) log-likelihood of a track
-    of_subset: Array  # (T, S) probability of each subset
-    right: Array  # (T, n) of each observation, alone or with others
-    square: Array  # (T, S) squared residuals of the subsets
-    values: Array  # (T, 2n) residuals
-    followed: Array  # (T, S, 3) what ground points follow of them
-    moved: _Expected | None = None  # the same of tracks that move
+    right: Array  # (M,) probability of each observation, alone or with others
+    shares: list[Array]  # (S,) probability of each subset
+    subsets: list[_OfSubsets]
 
-    @property
-    def sums(self) -> tuple[float, Array]:
-        """Squared residuals of subsets as often as they are right, and how often each is."""
-        return float((self.of_subset * self.square).sum()), self.of_subset.sum(axis=0)
-
-    @property
-    def gone(self) -> Array:
+    def gone(self, subsets: Subsets) -> Array:
         """Probability (T,) that a track of which something is right moves."""
-        assert self.moved is not None
-        still, gone = self.of_subset.sum(axis=1), self.moved.of_subset.sum(axis=1)
+        still, gone = (np.add.reduceat(share, subsets.begins[1]) for share in self.shares)
         return np.asarray(gone / np.maximum(still + gone, 1e-300))
-
-    def pull(self, tracks: TrackGroup) -> Array:
-        """Return the residuals (T, 2n), less the part that ground points absorb, by their probability."""
-        return tracks.weighed(self.values, self.followed, self.of_subset)
 
 
 def _expect(
-    linear: Linear,
-    tracks: TrackGroup,
-    residual: Array,
-    noise: float,
-    eps: Array,
-    moved: _MovedObservations | None = None,
+    linear: Linear, residual: Array, noise: float, eps: Array, moved: _MovedObservations | None = None
 ) -> _Expected:
-    n, subsets = tracks.rows.shape[1], tracks.subsets
-    size = len(subsets)
+    """Return the expectations of all tracks at residuals (2, K) [stated deviations], and those of tracks that moved."""
+    subsets, (rows, begins) = linear.subsets, linear.subsets.begins
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
-    right, wrong = np.log1p(-eps)[tracks.view], np.log(eps)[tracks.view]
-    log, square, values, followed = _of_subsets(tracks, residual, noise, area)
-    both = [log]
+    view = linear.view[subsets.rows]
+    odds, wrong = (np.log1p(-eps) - np.log(eps))[view], np.add.reduceat(np.log(eps)[view], rows)
+    found = [_OfSubsets.at(linear, residual, noise, area)]
+    log = [found[0].log]
     if moved is not None:
-        share = moved.share[tracks.rows[:, 0], None]
-        log_moved, square_moved, values_moved, followed_moved = _of_subsets(tracks, moved.residual, moved.noise, area)
-        both = [log + np.log1p(-share), log_moved + np.log(share)]
-    chance = right @ subsets.T + wrong @ (1.0 - subsets).T
-    log = np.concatenate([one + chance for one in both], axis=1)
-    odds = np.exp(right - wrong)
-    alone = wrong.sum(axis=1) + np.log1p(odds.sum(axis=1)) - np.log(linear.image) - (n - 1) * np.log(area)
-    top = np.maximum(log.max(axis=1), alone)
-    share, of_none = np.exp(log - top[:, None]), np.exp(alone - top)
-    total = share.sum(axis=1) + of_none
-    share /= total[:, None]
-    single = (of_none / total / (1.0 + odds.sum(axis=1)))[:, None] * odds
-    all_log, still = top + np.log(total), share[:, :size]
-    if moved is None:
-        return _Expected(all_log, still, still @ subsets + single, square, values, followed)
-    gone = share[:, size:]
-    right_of_all = (still + gone) @ subsets + single
-    of_moved = _Expected(all_log, gone, gone @ subsets, square_moved, values_moved, followed_moved)
-    return _Expected(all_log, still, right_of_all, square, values, followed, of_moved)
+        share = moved.share[subsets.rows[rows]][subsets.of_subset]
+        found.append(_OfSubsets.at(linear, moved.residual, moved.noise, area))
+        log = [log[0] + np.log1p(-share), found[1].log + np.log(share)]
+    chance = subsets.members @ odds + wrong[subsets.of_subset]
+    np.exp(odds, out=odds)
+    of_odds = np.add.reduceat(odds, rows)
+    alone = wrong + np.log1p(of_odds) - np.log(linear.image) - (subsets.views - 1) * np.log(area)
+    log = [one + chance for one in log]
+    top = np.maximum.reduce([alone, *(np.maximum.reduceat(one, begins) for one in log)])
+    shares, of_none = [np.exp(one - top[subsets.of_subset]) for one in log], np.exp(alone - top)
+    total = of_none + sum(np.add.reduceat(one, begins) for one in shares)
+    shares = [one / total[subsets.of_subset] for one in shares]
+    single = (of_none / total / (1.0 + of_odds))[subsets.of_row] * odds
+    return _Expected(top + np.log(total), subsets.member_of @ sum(shares) + single, shares, found)
 
 
-def _of_subsets(tracks: TrackGroup, residual: Array, noise: float, area: float) -> tuple[Array, Array, Array, Array]:
-    """Return the log-likelihoods (T, S) if a subset is right, and their squares, values and absorbed parts."""
-    n = tracks.rows.shape[1]
-    values = tracks.of(residual)
-    followed = tracks.followed(values)
-    of_each = (values**2).reshape(len(values), n, 2).sum(axis=2)
-    square = np.maximum(of_each @ tracks.subsets.T - (followed**2).sum(axis=2), 0.0)
-    members = tracks.subsets.sum(axis=1)
-    log = tracks.volume - square / (2.0 * noise**2)
-    log -= (n - members) * np.log(area) + 0.5 * (2 * members - 3) * np.log(2.0 * np.pi * noise**2)
-    return log, square, values, followed
+@dataclass(frozen=True, eq=False)
+class _OfSubsets:
+    log: Array  # (S,) log-likelihood if a subset is right
+    square: Array  # (S,) squared residuals of subsets
+    values: Array  # (M, 2) residuals
+    followed: Array  # (S, 3) what ground points follow of them
+
+    @classmethod
+    def at(cls, linear: Linear, residual: Array, noise: float, area: float) -> _OfSubsets:
+        """Return the likelihoods of all subsets at residuals (2, K) [stated deviations]."""
+        subsets = linear.subsets
+        values, followed = residual.T.take(subsets.rows, axis=0), np.empty((len(subsets.size), 3))
+        for tracks, (rows, some) in zip(linear.tracks, subsets.parts, strict=True):
+            count = len(tracks.rows)
+            np.matmul(tracks.follow, values[rows].reshape(count, -1, 1), out=followed[some].reshape(count, -1, 1))
+        square = np.maximum(subsets.members @ (values**2).sum(axis=1) - (followed**2).sum(axis=1), 0.0)
+        left_out, two_pi = subsets.views[subsets.of_subset] - subsets.size, np.log(2.0 * np.pi * noise**2)
+        log = subsets.volume - square / (2.0 * noise**2)
+        log -= left_out * np.log(area) + 0.5 * (2 * subsets.size - 3) * two_pi
+        return cls(log, square, values, followed)
+
+    def expected(self, linear: Linear, share: Array) -> _Component:
+        """Return the expectations where each subset is right with a probability (S,)."""
+        subsets, seen = linear.subsets, linear.subsets.member_of @ share
+        pulls, weighed = seen[:, None] * self.values, share[:, None] * self.followed
+        absorbed, weights = np.empty_like(pulls), list[Array]()
+        for tracks, (rows, some) in zip(linear.tracks, subsets.parts, strict=True):
+            count = len(tracks.rows)
+            np.matmul(weighed[some].reshape(count, 1, -1), tracks.follow, out=absorbed[rows].reshape(count, 1, -1))
+            weights.append(share[some].reshape(count, -1))
+        right, pull = np.zeros(len(linear.view)), np.zeros((2, len(linear.view)))
+        right[subsets.rows], pull[:, subsets.rows] = seen, (pulls - absorbed).T
+        freedom = float(share @ (2 * subsets.size - 3))
+        return _Component(tuple(weights), right, pull, float(share @ self.square), freedom)
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,7 +398,7 @@ class Mixture:
         assert self.group is not None
         share, scatter = self.group.share, noise
         if cold:
-            rows = np.concatenate([tracks.rows[:, 0] for tracks in self.linear.tracks])
+            rows = self.linear.subsets.rows[self.linear.subsets.begins[0]]
             cell, moved = self.group.cell, seen.kinds[1]
             weights = seen.moving[rows], np.ones(len(rows))
             gone, all_of = (np.bincount(cell[rows], w, cell.max() + 1) for w in weights)
@@ -411,31 +410,17 @@ class Mixture:
         linear, size = self.linear, self.extra.shape[1]
         step, extra, move = np.split(self.x, [linear.precision.size, linear.precision.size + size])
         left = linear.left(step.reshape(linear.shape)) + np.einsum("cek,e->ck", self.extra, extra)
-        moved, log = None, 0.0
+        moved = None
         if self.group is not None:
             away = np.einsum("cmk,m->ck", self.beside[1][:, size:], move)
             moved = self.moved = replace(self.moved, residual=left + away)
+        found, subsets = _expect(linear, left, self.noise, self.eps, moved), linear.subsets
         right, moving = np.zeros((2, len(linear.view)))
-        found = [_expect(linear, tracks, left, self.noise, self.eps, moved) for tracks in linear.tracks]
-        for tracks, one in zip(linear.tracks, found, strict=True):
-            log += float(one.log.sum())
-            right[tracks.rows] = one.right
-            if moved is not None:
-                moving[tracks.rows] = one.gone[:, None]
-        kinds = [found] if moved is None else [found, [one.moved for one in found if one.moved is not None]]
-        return _Expectations(log, right, moving if moved is not None else moving[:0], tuple(map(self._kind, kinds)))
-
-    def _kind(self, found: Sequence[_Expected]) -> _Component:
-        squares, freedom = 0.0, 0.0
-        right, pull = np.zeros(len(self.linear.view)), np.zeros((2, len(self.linear.view)))
-        for tracks, one in zip(self.linear.tracks, found, strict=True):
-            count, n = tracks.rows.shape
-            square, often = one.sums
-            squares += square
-            freedom += float(often @ (2 * tracks.subsets.sum(axis=1) - 3))
-            right[tracks.rows] = one.of_subset @ tracks.subsets
-            pull[:, tracks.rows] = one.pull(tracks).reshape(count, n, 2).transpose(2, 0, 1)
-        return _Component(tuple(one.of_subset for one in found), right, pull, squares, freedom)
+        right[subsets.rows] = found.right
+        if moved is not None:
+            moving[subsets.rows] = found.gone(subsets)[subsets.of_row]
+        kinds = (one.expected(linear, share) for one, share in zip(found.subsets, found.shares, strict=True))
+        return _Expectations(float(found.log.sum()), right, moving if moved is not None else moving[:0], tuple(kinds))
 
     @property
     def _noises(self) -> list[float]:
