@@ -202,7 +202,7 @@ def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(mo
 
     def astray(residual: Any, start: Any, jacobian: Any, **_: Any) -> Any:
         least = float((residual(start) ** 2).sum())
-        for size in (1e6, 1e9):
+        for size in (1e4, 3e5):  # farther off the matrix there has no factor, with some processors or SciPy 1.18
             assert float((residual(start + size) ** 2).sum()) > 1e3 * least
         assert float((residual(start) ** 2).sum()) == pytest.approx(least, rel=1e-12)
         return SimpleNamespace(x=start, nfev=4, message="ended.", success=True)
