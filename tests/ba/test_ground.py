@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,12 +20,13 @@ from barpc.ba.constraints.ground import (
     terrain_heights,
 )
 from barpc.ba.constraints.terrain import NUM_BENDS, RegularisedDem, Relief
-from barpc.ba.parameters.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, PointPrior, prior_sigmas
+from barpc.ba.parameters.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, prior_sigmas
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference
 from barpc.sensor.pushbroom import Pushbroom
+from tests.ba.conftest import Held, held_by
 
 LON, LAT = 5.0, 43.0
 GEOD = pyproj.Geod(ellps="WGS84")
@@ -55,20 +56,6 @@ def heights(n: int = 6, **given: Any) -> PointConstraints:
     return PointConstraints(
         (), weak, np.arange(n), (0.0, 500.0), options, given.pop("dem", hill), given.pop("reference", None)
     )
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What `PointConstraints.hold` gives its priors to."""
-
-    point_prior: Any = None
-
-
-def held_by(given: PointConstraints, points: np.ndarray) -> PointPrior:
-    problem: Any = Problem()
-    prior = given.hold(problem, points).point_prior
-    assert prior is not None
-    return prior
 
 
 def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak_rays_by_its_slopes() -> None:
@@ -147,7 +134,7 @@ def test_where_the_slope_is_unknown_the_height_holds_alone_and_where_the_height_
     assert abs(east) < 0.02
     nowhere = terrain_heights(points[1:2], np.array([0]), hill, 1.0, 5.0)
     assert nowhere.common.shape == (0, 3, 3)
-    problem: Any = Problem(prior)
+    problem: Any = Held(prior)
     none = replace(heights(3, dem=None), weak=np.zeros(3, dtype=bool), placed=nowhere)
     assert none.hold(problem, points).point_prior is None
 

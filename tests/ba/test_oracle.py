@@ -24,7 +24,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State, _WhitenedProblem, camera_step, gauss_newton
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
-from tests.ba.conftest import centers_of
+from tests.ba.conftest import Held, centers_of, held_by
 from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
 from tests.constants import chosen
 from tests.lanes import diagonal, rest_slow
@@ -590,12 +590,12 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     points = ecef_of(np.column_stack([lon, lat, altitudes]))
     weak = np.arange(strong + 2) >= strong
     heights = PointConstraints((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
-    prior = heights._held(points)
-    assert prior is not None
+    prior = held_by(heights, points)
     assert prior.index.tolist() == [strong, strong + 1]
     np.testing.assert_allclose(prior.apart(points)[:, 0] * sigma, altitudes[-2:] - alt, atol=1e-6)
     assert not prior.residual(points)[:, 1:].any()
-    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None
+    none: Any = Held(prior)
+    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool)).hold(none, points).point_prior is None
 
 
 def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(case, monkeypatch):
