@@ -18,7 +18,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
-from tests.constants import chosen
+from tests.constants import Sized, chosen
 
 CALM = {"drift": 0, "learn_priors": False, "hold_out": False}
 
@@ -218,11 +218,11 @@ def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
 
 
 @pytest.mark.slow
-def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
+def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     dirty = simulate_block(3, 400, seed=5, outliers=0.1)
     passes = []
     for share in (0.0, 0.2):
-        monkeypatch.setattr(rounds, "SLIGHT", share)
+        sized(slight_cut=share)
         with chosen(AdjustOptions, robust_threshold=1.2):
             found = solve(dirty, **CALM, estimate_noise=False)
         passes.append(int(found.status.split()[0]))

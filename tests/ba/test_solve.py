@@ -15,6 +15,7 @@ from barpc.ba.solving import solve
 from barpc.ba.solving.solve import Minimum, State, _has_converged
 from barpc.base.errors import AdjustError
 from barpc.simulate import simulate_block
+from tests.constants import Sized
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
 FACTOR = object()
@@ -150,8 +151,8 @@ def test_where_no_damping_however_strong_helps_it_ends(monkeypatch, gain: float,
         assert found == "no step lowers the cost 1: the solution is not usable"
 
 
-def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch) -> None:
-    monkeypatch.setattr(solve, "ITERATIONS", 5)
+def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch, sized: Sized) -> None:
+    sized(steps=5)
     found, dampings = run(monkeypatch, [1.0, 1.0 + 5e-13], [0.5])
     assert isinstance(found, Minimum)
     assert dampings == [0.0] * 5

@@ -21,6 +21,7 @@ from barpc.base.geodesy import ecef_from_ground
 from barpc.base.statistics import SMALL
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
+from tests.constants import Sized
 from tests.distributions import chi2
 from tests.lanes import rest_slow
 
@@ -340,13 +341,13 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", rest_slow([50, 300], mark=pytest.mark.nightly))
 def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_within_their_bound(
-    monkeypatch, n: int
+    sized: Sized, n: int
 ) -> None:
     """Against the inverse of the whole matrix (9 unknowns a view), whose drifts are a hundredth of the rotations."""
     block = simulate_block(n, 20 * n, seed=1, num_checks=0)
     if n < 300:
-        monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
-        monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", 0)
+        sized(dense_views=0)
+        sized(dense_unknowns=0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
     with pytest.warns(BarpcWarning, match="constrained in height"):  # they share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, options, centers=centers_of(block))
@@ -551,10 +552,10 @@ def determined(problem: Any, minimum: Any, sigma: np.ndarray) -> np.ndarray:
     return (1 - inverse.diagonal().reshape(sigma.shape) / sigma**2).clip(0, 1)
 
 
-def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
+def test_a_large_block_learns_once_a_solve(at_minimum, sized: Sized) -> None:
     """By the covariance at hand: the drift of all views by its squares, the constants by those of most."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
@@ -574,9 +575,9 @@ def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
     assert tested.drift_sigma == pytest.approx([np.median(drift[:, 0])])
 
 
-def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimum, monkeypatch) -> None:
+def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimum, sized: Sized) -> None:
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)
@@ -595,10 +596,10 @@ def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimu
     assert told[1].ratio == pytest.approx(tested.ratio) == pytest.approx(total.sum() / freedom.sum())
 
 
-def test_constants_of_a_large_block_once_widened_stay(at_minimum, monkeypatch) -> None:
+def test_constants_of_a_large_block_once_widened_stay(at_minimum, sized: Sized) -> None:
     """They take from the drift, which is another then: asked whether it stands it would send them back, in turns."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     given = CameraPrior(problem.camera_prior.mean, problem.camera_prior.sigma.copy())
     given.sigma[:, :6] /= 30.0
     v = Variances(given, problem.cameras.unknowns, True, False)
