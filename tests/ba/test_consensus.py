@@ -102,8 +102,14 @@ def test_centres_are_apart_from_two_standard_deviations_on(apart: float, found: 
     assert (distance > 0) == found
 
 
-def test_nothing_is_told_where_one_group_takes_all() -> None:
-    assert told(np.r_[np.zeros(150), 1e6]) is None  # so far out that it is a group of no width
+def test_nothing_is_gained_where_one_group_takes_all() -> None:
+    lone = np.r_[np.zeros(50), 1e6]  # so far out that it is a group of no width
+    part, distance, gain = _mixture(lone - lone.mean())
+    assert 0 <= part < 0.05
+    assert np.isfinite([part, distance, gain]).all()
+    with np.errstate(invalid="ignore"):
+        assert _mixture(np.ones(50)) == (0.0, 0.0, 0.0)
+    assert told(np.r_[np.zeros(150), 1e6]) is None
     assert told(np.ones(150)) is None
 
 
