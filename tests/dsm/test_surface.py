@@ -86,8 +86,8 @@ def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(mad
 
 
 @pytest.mark.slow
-def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch):
-    monkeypatch.setattr(surface_module, "BLOCK_SIZE", 128)
+def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch, sized):
+    sized(surface_block=128)
     asked = []
     whole = surface_module.surface_tile
 

@@ -24,7 +24,6 @@ from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import _PairSearch, match_pair
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair, reach_of
-from barpc.tie.patches import oriented
 from barpc.tie.patches.oriented import PatchTile
 from tests.constants import Sized
 from tests.lanes import rest_slow
@@ -170,7 +169,7 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, sized: 
 
     monkeypatch.setattr(PatchTile, "surfaces", watched)
     sized(places_together=30_000)
-    monkeypatch.setattr(oriented, "PIECE", 20_000)
+    sized(windows_together=20_000)
     parts = structural._GridSearch(*scene.views, 1, coarse).matches()
     assert len(sizes) >= 8
     assert max(sizes) <= 60_000
