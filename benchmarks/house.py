@@ -3,7 +3,7 @@
 Numbers are counted by their meanings, so that a constant that is shared counts wherever it means something else: module
 constants, modules beyond the first that use a number of `barpc.base.statistics`, floats inside functions other than 0,
 0.5, 1, 2 and powers of ten, and numeric defaults of parameters. Names are those of classes, functions and constants of
-modules, a leading _ left out.
+modules, a leading _ left out. A test pins internals where it names something private of barpc or sets a part of it.
 
 python benchmarks/house.py            # a table of the package and its folders
 python benchmarks/house.py --numbers  # every module constant that is a number, with where it stands
@@ -163,6 +163,60 @@ def arrows(trees: dict[Path, ast.Module]) -> int:
     return len(found)
 
 
+def is_private(name: str) -> bool:
+    """A name with one leading _, but for those that namedtuples and notebooks have in public."""
+    return (
+        name.startswith("_") and not name.startswith("__") and name not in ("_", "_replace", "_asdict", "_repr_html_")
+    )
+
+
+def owner(node: ast.AST) -> str:
+    """The name that attributes, items and calls begin with: a for a.b[c](d).e."""
+    while isinstance(node, ast.Attribute | ast.Subscript | ast.Call):
+        node = node.func if isinstance(node, ast.Call) else node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def pins(test: ast.FunctionDef, imported: set[str]) -> bool:
+    """Whether a test names something private or sets an attribute of what is imported from barpc."""
+    own = set(imported)
+    for node in ast.walk(test):
+        match node:
+            case ast.ImportFrom(module=str(module), names=names) if module.startswith("barpc"):
+                own |= {alias.asname or alias.name for alias in names}
+    for node in ast.walk(test):
+        match node:
+            case ast.Name(id=name) if is_private(name) and name in own:
+                return True
+            case ast.Attribute(attr=name) if is_private(name) and owner(node) not in ("self", "cls"):
+                return True
+            case ast.Call(
+                func=ast.Attribute(attr="setattr" | "delattr" | "setitem" | "patch" | "object"), args=[at, *_]
+            ):
+                text = at.value if isinstance(at, ast.Constant) else None
+                if owner(at) in own or str(text).startswith("barpc"):
+                    return True
+    return False
+
+
+def tests() -> tuple[int, int, int]:
+    """Lines of the tests; tests; tests that pin internals."""
+    lines = count = pinned = 0
+    for path in (ROOT / "tests").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        tree, lines = ast.parse(text), lines + len(text.splitlines())
+        of_barpc = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom | ast.Import)]
+        own = {
+            (alias.asname or alias.name).split(".")[0]
+            for node in of_barpc
+            for alias in node.names
+            if (getattr(node, "module", None) or alias.name).startswith("barpc")
+        }
+        found = [function for function in functions(tree) if function.name.startswith("test")]
+        count, pinned = count + len(found), pinned + sum(pins(function, own) for function in found)
+    return lines, count, pinned
+
+
 def surface() -> tuple[int, int]:
     """Flags over all verbs, and fields of options."""
     import click
@@ -207,6 +261,7 @@ def main() -> None:
         if inside := {path: tree for path, tree in trees.items() if place in path.parents}:
             print(f"| {name} |", " | ".join(map(str, measured(inside))), "|")
     print(f"\n{arrows(trees)} arrows between rooms")
+    print("{} lines of tests; of {} tests {} pin internals".format(*tests()))
     print("{} flags over all verbs, {} fields of options".format(*surface()))
 
 

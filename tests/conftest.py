@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import constants
 from tests.lanes import spread
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -23,6 +24,10 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no shared data at {folder} (set BARPC_SHARED)")
     return folder
+
+
+sized = pytest.fixture(constants.sized)
+"""Sets sizes of `tests.constants.SIZES`."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

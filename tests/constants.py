@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 from unittest import mock
+
+import pytest
 
 from barpc.base.options import AdjustOptions, FitOptions, Options, TieOptions
 
@@ -49,3 +51,62 @@ def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
                 for place in places:
                     stack.enter_context(mock.patch(place, value))
         yield record(**values)
+
+
+SIZES = {
+    "altimetry_points": ("barpc.ba.altimetry.SAMPLE",),
+    "scene_points": ("barpc.ba.constraints.gauge.SAMPLE",),
+    "tests_kept": ("barpc.ba.control.snooping.KEPT",),
+    "heights_measured": ("barpc.ba.result.MANY",),
+    "slight_cut": ("barpc.ba.robust.rounds.SLIGHT",),
+    "terms_kept": ("barpc.ba.robust.systematic_residuals.KEPT",),
+    "unknowns_tried": ("barpc.ba.robust.variances.SMALL",),
+    "columns_kept": ("barpc.ba.solving.covariance.KEPT",),
+    "dense_unknowns": ("barpc.ba.solving.covariance._DENSE_UNKNOWNS",),
+    "fronts_in_memory": ("barpc.ba.solving.linear.IN_MEMORY",),
+    "observations_together": ("barpc.ba.solving.normal.CHUNK",),
+    "dense_views": ("barpc.ba.solving.normal.LEAF",),
+    "products_kept": ("barpc.ba.solving.problem.KEPT",),
+    "steps": ("barpc.ba.solving.solve.ITERATIONS",),
+    "front_views": ("barpc.ba.solving.structure.LEAF",),
+    "edge_rounds": ("barpc.ba.terms.detectors.ITERATIONS",),
+    "cells_read": ("barpc.rasters.dem._MAX_CELLS",),
+    "resampled_block": ("barpc.rpcio.grids.BLOCK_SIZE",),
+    "points_together": ("barpc.sensor.rpc.CHUNK",),
+    "keypoints_per_image": ("barpc.tie.matchers.features.PER_IMAGE",),
+    "candidates_together": ("barpc.tie.matchers.guided._PAIRS",),
+    "places_together": ("barpc.tie.matchers.structural.PIECE",),
+    "sides_crossed": ("barpc.tie.pairing.area._MOST_CROSSED",),
+    "sides_together": ("barpc.tie.pairing.area._TOGETHER",),
+    "patches_together": ("barpc.tie.patches.register.CHUNK",),
+    "newton_steps": ("barpc.tie.patches.register.NEWTON_STEPS",),
+    "kept_after": ("barpc.workspace.KEEP_AFTER",),
+    "rows_together": ("barpc.report.runfiles._TOGETHER",),
+    "tracks_in_tables": ("barpc.report.outcome.MAX_TRACKS",),
+    "observations_intersected": ("barpc.report.outcome._TOGETHER",),
+    "shown": (
+        "barpc.report.maps.MAX_SHOWN",
+        "barpc.report.page.MAX_SHOWN",
+    ),
+    "pictures": ("barpc.report.maps.MAX_PICTURES",),
+    "images_together": (
+        "barpc.pipeline.loading.GROUP",
+        "barpc.pipeline.executor.GROUP",
+    ),
+    "surface_block": ("barpc.dsm.surface.BLOCK_SIZE",),
+    "windows_together": ("barpc.tie.patches.oriented.PIECE",),
+}
+"""Name -> constants from which on work is done in parts, sampled, thinned or given up: small things count as large."""
+
+Sized = Callable[..., None]
+
+
+def sized(monkeypatch: pytest.MonkeyPatch) -> Sized:
+    """Return the function that sets sizes by their names as long as a test runs."""
+
+    def put(**values: Any) -> None:
+        for name, value in values.items():
+            for place in SIZES[name]:
+                monkeypatch.setattr(place, value)
+
+    return put

@@ -210,8 +210,8 @@ def test_a_run_that_is_refused_at_once_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_that_is_refused_late_keeps_its_stages(tmp_path, monkeypatch):
-    monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
+def test_a_run_that_is_refused_late_keeps_its_stages(tmp_path, sized):
+    sized(kept_after=0.0)
     with pytest.raises(TiePointError), Workspace(tmp_path / "run") as run:
         run.store("detect", "k", {"x": np.ones(3)})
         raise TiePointError

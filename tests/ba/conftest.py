@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 
 from barpc import simulate
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba.constraints.ground import PointConstraints
+from barpc.ba.parameters.priors import PointPrior
 from barpc.fit import fit_rpc
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.constants import chosen
@@ -49,3 +52,17 @@ def block() -> SimulatedBlock:
 def adjusted(block: SimulatedBlock) -> Adjustment:
     """`block`, adjusted."""
     return solve(block)
+
+
+@dataclass(frozen=True)
+class Held:
+    """What `PointConstraints.hold` gives its priors to."""
+
+    point_prior: Any = None
+
+
+def held_by(given: PointConstraints, points: np.ndarray) -> PointPrior:
+    problem: Any = Held()
+    prior = given.hold(problem, points).point_prior
+    assert prior is not None
+    return prior

@@ -393,7 +393,7 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
 
 
 @pytest.mark.parametrize(("whole", "most", "every"), [(False, 100, 1), (True, 100, 2), (False, 24, 2), (True, 40, 2)])
-def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch, whole, most, every):
+def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch, sized, whole, most, every):
     """And at no more than so many: of 47 with a height near them, whose surface is the only one that is asked."""
     rng = np.random.default_rng(0)
     middle = ecef_from_ground(np.array([5.0, 44.0, 300.0]))
@@ -401,7 +401,7 @@ def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch
     seen = np.arange(60) < 47
     heights = Altimetry(ground_from_ecef(points), np.full(60, 0.5), np.full(60, 2.0))
     held: list[Any] = []
-    monkeypatch.setattr(altimetry, "SAMPLE", most)
+    sized(altimetry_points=most)
     monkeypatch.setattr(altimetry, "_covariance_without_heights", lambda covariance, found, ties: np.eye(7))
     monkeypatch.setattr(altimetry, "TieSurface", SimpleNamespace(of=lambda local: local))
     monkeypatch.setattr(altimetry, "register", lambda surface, *_: surface)

@@ -19,6 +19,7 @@ from barpc.ba.terms.detectors import _Columns, find_edges
 from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
+from tests.constants import Sized
 
 
 def columns(cols: list[np.ndarray], sigma: float = 1.0, together: bool = False) -> tuple[_Columns, np.ndarray]:
@@ -118,8 +119,8 @@ def test_a_step_of_a_focal_plane_has_to_explain_four_more_a_view(share, found) -
 
 
 @pytest.mark.parametrize(("share", "found"), [(0.48, False), (0.52, True)])
-def test_changes_half_as_large_as_the_largest_are_taken_with_it(monkeypatch, share, found) -> None:
-    monkeypatch.setattr(detectors, "ITERATIONS", 1)
+def test_changes_half_as_large_as_the_largest_are_taken_with_it(sized: Sized, share, found) -> None:
+    sized(edge_rounds=1)
     made, col = columns([np.arange(200.0)] * 2)
     size = np.where(np.arange(400) < 200, np.sqrt(200.0 / 50.0), np.sqrt(share * 200.0 / 50.0))
     edges, _ = grown(made, np.stack([np.where(col < 100, 0.0, size), 0 * col]))

@@ -14,20 +14,19 @@ from barpc.ba.constraints.gauge import MOTIONS, _motion_of_points
 from barpc.ba.constraints.ground import (
     DEM_BIAS,
     PointConstraints,
-    _join_priors,
-    _slopes,
     flat_heights,
     ground_control,
     reference_control,
     terrain_heights,
 )
 from barpc.ba.constraints.terrain import NUM_BENDS, RegularisedDem, Relief
-from barpc.ba.parameters.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, _stated_accuracy, prior_sigmas
+from barpc.ba.parameters.priors import DEFAULT_ACCURACY, USABLE_ACCURACY, prior_sigmas
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Reference
 from barpc.sensor.pushbroom import Pushbroom
+from tests.ba.conftest import Held, held_by
 
 LON, LAT = 5.0, 43.0
 GEOD = pyproj.Geod(ellps="WGS84")
@@ -65,11 +64,10 @@ def test_what_altimetry_holds_a_terrain_does_not_and_of_the_rest_those_with_weak
     relief = Relief(None, np.zeros(6, dtype=bool), np.full(3, np.nan), np.zeros((3, 6)), np.full(3, np.nan))
     by_altimetry = flat_heights(points, np.array([0, 5]), 350.0, 1.0, 0.0)
     given = replace(heights(), relief=relief, placed=by_altimetry)
-    held = given._held(points)
-    assert held is not None
-    assert held.index.tolist() == [1, 2, 3, 4]
+    held = held_by(given, points)
+    assert held.index.tolist() == [1, 2, 3, 4, 0, 5]
     up = enu_basis(ground_from_ecef(points[1:5]))[:, 2]
-    along = held.rows[:, 0] / np.linalg.norm(held.rows[:, 0], axis=1, keepdims=True)
+    along = held.rows[:4, 0] / np.linalg.norm(held.rows[:4, 0], axis=1, keepdims=True)
     assert ((along * up).sum(axis=1) > 0.9999).tolist() == [True, True, True, False]
 
 
@@ -83,14 +81,13 @@ def test_what_is_believed_of_a_dem_holds_all_tracks_but_those_held_already(monke
     asked: list[float] = []
     relief: Any = SimpleNamespace(common_sigma=lambda bias: asked.append(bias) or np.arange(1.0, NUM_BENDS + 1.0))
     by_altimetry = flat_heights(points, np.array([3]), 350.0, 1.0, 0.0)
-    held = replace(heights(4), relief=relief, placed=by_altimetry)._held(points)
-    assert held is not None
-    assert held.index.tolist() == [0, 1]
-    off = held.apart(points)[:, 0]
+    held = held_by(replace(heights(4), relief=relief, placed=by_altimetry), points)
+    assert held.index.tolist() == [0, 1, 3]
+    off = held.apart(points)[:2, 0]
     np.testing.assert_allclose(off, (350.0 - alt[:2]) / 4.0, rtol=1e-5)  # sigmas of 2 m, of which four are worth one
-    np.testing.assert_allclose(held.apart(placed([10.0] * 4, 0.0, 350.0))[:, 0] - held.apart(
-        placed([0.0] * 4, 0.0, 350.0))[:, 0], -0.5, atol=1e-2)  # fmt: skip
-    np.testing.assert_allclose(held.common[:, 0], bent[:2] * np.arange(1.0, NUM_BENDS + 1.0) / 4.0)
+    np.testing.assert_allclose(held.apart(placed([10.0] * 4, 0.0, 350.0))[:2, 0] - held.apart(
+        placed([0.0] * 4, 0.0, 350.0))[:2, 0], -0.5, atol=1e-2)  # fmt: skip
+    np.testing.assert_allclose(held.common[:2, 0], bent[:2] * np.arange(1.0, NUM_BENDS + 1.0) / 4.0)
     assert not held.common[:, 1:].any()
     assert asked == [DEM_BIAS]
 
@@ -137,7 +134,9 @@ def test_where_the_slope_is_unknown_the_height_holds_alone_and_where_the_height_
     assert abs(east) < 0.02
     nowhere = terrain_heights(points[1:2], np.array([0]), hill, 1.0, 5.0)
     assert nowhere.common.shape == (0, 3, 3)
-    assert _join_priors([nowhere, None]) is None
+    problem: Any = Held(prior)
+    none = replace(heights(3, dem=None), weak=np.zeros(3, dtype=bool), placed=nowhere)
+    assert none.hold(problem, points).point_prior is None
 
 
 def test_what_heights_share_is_a_level_and_slopes_that_are_as_large_at_the_edges() -> None:
@@ -150,9 +149,10 @@ def test_what_heights_share_is_a_level_and_slopes_that_are_as_large_at_the_edges
         np.testing.assert_allclose(prior.common[:, 0, column], 3.0 * away / np.abs(away).max(), atol=3e-3)
     assert not prior.common[:, 1:].any()
     # by the edges of others
-    np.testing.assert_allclose(_slopes(points[:1], points), prior.common[:1, 0, 1:] / 3.0, atol=1e-9)
-    lone = _slopes(points[:1], points[:1])
-    np.testing.assert_allclose(lone, 0.0, atol=1e-6)  # one point has no slope
+    of_others = terrain_heights(points, np.array([0]), lambda lon, _: np.full(len(lon), 300.0), 2.0, 6.0, span=points)
+    np.testing.assert_allclose(of_others.common[:, 0, 1:], prior.common[:1, 0, 1:], atol=3e-9)
+    lone = flat_heights(points, np.array([0]), 300.0, 2.0, 6.0)
+    np.testing.assert_allclose(lone.common[:, 0, 1:] / 3.0, 0.0, atol=1e-6)  # one point has no slope
 
 
 def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
@@ -164,8 +164,8 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
         ground_control(gcps, np.array([0])),
         flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0),
     )
-    joined = _join_priors([control, None, flat])
-    assert joined is not None
+    none = replace(heights(3, dem=None), weak=np.zeros(3, dtype=bool))
+    joined = held_by(replace(none, control=(control,), placed=flat), points)
     assert joined.index.tolist() == [0, 1, 2]
     assert joined.common.shape == (3, 3, 3)
     assert not joined.common[0].any()
@@ -183,8 +183,7 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
 )
 def test_a_terrain_holds_all_tracks(options: dict[str, Any], index: list[int], bias: float) -> None:
     points = placed(np.linspace(0, 2000, 6), np.linspace(0, 1000, 6), 350.0)
-    held = heights(options={"dem_sigma": 4.0, **options})._held(points)
-    assert held is not None
+    held = held_by(heights(options={"dem_sigma": 4.0, **options}), points)
     assert held.index.tolist() == index
     np.testing.assert_allclose(1.0 / (held.rows[:, 0] @ _up(points[0])), 4.0, rtol=1e-3)
     np.testing.assert_allclose(held.common[:, 0, 0], bias / 4.0)
@@ -204,11 +203,10 @@ def test_tracks_beside_a_reference_share_its_terrain(n: int, factor: float) -> N
     reference = Reference(gcps, np.array([1.0, 1.0, 8.0]), np.zeros((1, 2)))
     made = heights(n, reference=reference, options={"dem_sigma": 4.0, "dem_bias_sigma": 99.0})
     made = replace(made, control=(ground_control(gcps, np.arange(2)),) * 2)
-    held = made._held(points)
-    assert held is not None
-    assert len(held.index) == n
-    np.testing.assert_allclose(1.0 / (held.rows[:, 0] @ _up(points[0])), 4.0 * factor, rtol=1e-3)
-    np.testing.assert_allclose(held.common[:, 0, 0], 2.0 / factor)
+    held = held_by(made, points)
+    assert len(held.index) == n + 4  # behind both points of the reference, twice
+    np.testing.assert_allclose(1.0 / (held.rows[4:, 0] @ _up(points[0])), 4.0 * factor, rtol=1e-3)
+    np.testing.assert_allclose(held.common[4:, 0, 0], 2.0 / factor)
     assert held.common[-1, 0, 1] == pytest.approx(2.0 / factor * 1500 / 4000, rel=0.01)
 
 
@@ -249,10 +247,10 @@ def flown(*accuracy: float) -> Any:
 
 
 def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> None:
-    assert _stated_accuracy(flown(3.0, 0.5)) == (3.0, 0.5)
-    assert _stated_accuracy(flown(0.01, 0.02)) == (USABLE_ACCURACY, USABLE_ACCURACY)
-    assert _stated_accuracy(flown()) == (DEFAULT_ACCURACY, DEFAULT_ACCURACY)
-    views: Any = (flown(3.0, 0.5), flown(0.3, 9.0))
+    views: Any = (flown(0.01, 0.02), flown())
+    stated = prior_sigmas(views, AdjustOptions(), 0)
+    np.testing.assert_array_equal(stated, [[USABLE_ACCURACY] * 6, [DEFAULT_ACCURACY] * 6])
+    views = (flown(3.0, 0.5), flown(0.3, 9.0))
     sigma = prior_sigmas(views, AdjustOptions(), 2)
     np.testing.assert_array_equal(sigma[0], np.repeat([3.0, 0.5, 0.2, 0.2], 3))
     np.testing.assert_array_equal(sigma[1], np.repeat([0.3, 9.0, 0.2, 0.2], 3))
@@ -300,8 +298,7 @@ def test_heights_of_a_narrow_scene_are_not_said_to_bend_where_it_is_not() -> Non
 
 def test_heights_without_a_terrain_may_be_wrong_together_by_the_range_of_their_altitudes() -> None:
     points = placed(np.linspace(0, 2000, 6), 0.0, 350.0)
-    held = heights(dem=None)._held(points)
-    assert held is not None
+    held = held_by(heights(dem=None), points)
     np.testing.assert_allclose(held.common[:, 0, 0], 2.0)  # each by half of it
     views: Any = (flown(),)
     np.testing.assert_array_equal(prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0))

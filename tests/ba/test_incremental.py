@@ -16,6 +16,7 @@ from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.simulate import simulate_block
 from tests.ba.conftest import solve
+from tests.constants import Sized
 
 
 def prior_of(names: tuple[str, ...] = ("a", "c"), size: int = 3) -> BlockPrior:
@@ -176,10 +177,10 @@ def test_a_block_leaves_what_it_knows_of_its_free_views() -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*constrained in height")
-def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(monkeypatch, tmp_path) -> None:
+def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(sized: Sized, tmp_path) -> None:
     made = simulate_block(6, 300, seed=5)
     dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))
-    monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
+    sized(dense_views=0)
     block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0)).save(tmp_path / "prior.npz")
     read = BlockPrior.load(tmp_path / "prior.npz")
     assert read.less is not None

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg as la
 
 from barpc.ba import Adjustment
-from barpc.ba.solving import linear, normal
+from barpc.ba.solving import linear
 from barpc.ba.solving.linear import Blocks
 from barpc.ba.solving.structure import counting_sort, dissect
 from barpc.base.errors import AdjustError
@@ -51,18 +51,18 @@ def test_a_matrix_that_is_not_finite_is_an_adjust_error():
         linear.factorize_blocks(blocks, dissect(pairs, np.zeros((2, 2)), np.ones(2, dtype=bool)))
 
 
-def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted, monkeypatch):
-    monkeypatch.setattr(normal, "LEAF", 0)
+def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted, sized):
+    sized(dense_views=0)
     sparse = adjust(block)
     assert sparse.covariance.factor.method == "multifrontal"
     np.testing.assert_allclose(sparse.params, adjusted.params, atol=1e-4)
     np.testing.assert_allclose(sparse.gauge.sigma, adjusted.gauge.sigma, rtol=1e-4)
 
 
-def test_what_a_large_block_does_not_keep_it_works_out_again(block, adjusted, monkeypatch):
+def test_what_a_large_block_does_not_keep_it_works_out_again(block, adjusted, sized):
     """Derivatives from one step to the next, and the terms of the smooth parts."""
-    monkeypatch.setattr("barpc.ba.solving.problem.KEPT", 0)
-    monkeypatch.setattr("barpc.ba.robust.systematic_residuals.KEPT", 0)
+    sized(products_kept=0)
+    sized(terms_kept=0)
     found = adjust(block)
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-7)
     np.testing.assert_allclose(found.smooth.rms, adjusted.smooth.rms, atol=1e-9)

@@ -13,7 +13,6 @@ import scipy.linalg as la
 from barpc.ba import adjust_tracks
 from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.constraints.incremental import BlockPrior
-from barpc.ba.solving import linear, normal, structure
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Blocks, factorize_blocks
 from barpc.ba.solving.solve import camera_step
@@ -23,6 +22,7 @@ from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.constants import Sized
 from tests.lanes import diagonal
 
 
@@ -56,9 +56,9 @@ def _work(order: Dissection) -> int:
     ("sites", "leaf", "kept"),
     diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9]),
 )
-def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(monkeypatch, sites, leaf, kept) -> None:
-    monkeypatch.setattr(structure, "LEAF", leaf)
-    monkeypatch.setattr(linear, "IN_MEMORY", kept)
+def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(sized: Sized, sites, leaf, kept) -> None:
+    sized(front_views=leaf)
+    sized(fronts_in_memory=kept)
     pairs, place = _sites(*sites)
     n, q = len(place), 2
     matrix, rng = _matrix(pairs, n, q), np.random.default_rng(leaf)
@@ -207,11 +207,11 @@ def _square(views: int) -> SimulatedBlock:
         ),
     ],
 )
-def test_a_step_and_its_covariance_are_those_of_the_dense_solve(monkeypatch, views, case, ties, leaf) -> None:
+def test_a_step_and_its_covariance_are_those_of_the_dense_solve(sized: Sized, views, case, ties, leaf) -> None:
     many = _square(views)
     if views < 200:
-        monkeypatch.setattr(normal, "LEAF", 0)
-    monkeypatch.setattr(structure, "LEAF", leaf)
+        sized(dense_views=0)
+    sized(front_views=leaf)
     tracks = many.tracks if ties == "all" else _weakly_tied(many, 6 if ties == "weak" else 0)
     gcps = many.gcps if ties == "all" else None
     with pytest.warns(match="not tied") if ties == "none" else nullcontext():
@@ -244,7 +244,7 @@ def test_a_step_and_its_covariance_are_those_of_the_dense_solve(monkeypatch, vie
         assert abs(off.mean()) < 0.1
 
 
-def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypatch) -> None:
+def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(sized: Sized) -> None:
     """Views of an earlier run far apart, whose unknowns are correlated: in the matrix as in the dense one."""
     many, names = _square(48), ("view_0045", "view_0002", "view_0020")
     root = np.random.default_rng(0).normal(size=(27, 27)) + 3.0 * np.eye(27)
@@ -258,7 +258,7 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypa
     )
     both = []
     for most in (0, 10**6):
-        monkeypatch.setattr(normal, "LEAF", most)
+        sized(dense_views=most)
         chosen = AdjustOptions(**INDEPENDENT)
         joined = join(many.views, many.tracks, None, chosen)
         problem = make_problem(joined, chosen, centers_of(many), prior)
@@ -280,7 +280,7 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(monkeypa
         pytest.param({}, 110, id="alone-110", marks=pytest.mark.nightly),
     ],
 )
-def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
+def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, sized: Sized, options, n) -> None:
     """Rounds, variances and covariance: nothing else may change. Heights held by a terrain are wrong together."""
     made = simulate_block(n, 20 * n, seed=4, num_checks=0)
     chosen = AdjustOptions(**{**INDEPENDENT, "solver": "sparse", **options})
@@ -289,7 +289,7 @@ def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, options, n) -> None:
     for name in ("TOLERANCE", "STANDS"):  # both end at the minimum, not a step before it
         monkeypatch.setattr(f"barpc.ba.robust.rounds.{name}", 1e-10)
     for most in (0, 10**6):
-        monkeypatch.setattr(normal, "LEAF", most)
+        sized(dense_views=most)
         found.append(adjust_tracks(made.views, made.tracks, chosen, dem=dem, centers=centers_of(made)))
     one, other = found
     assert [f.covariance.factor.method for f in found] == ["multifrontal", "dense"]

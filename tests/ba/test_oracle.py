@@ -14,17 +14,15 @@ from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.constraints.gauge import MOTIONS, _modes, datum_shares, gauge_report
 from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control
-from barpc.ba.control import snooping
 from barpc.ba.control.snooping import image_test
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations
-from barpc.ba.solving import normal
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State, _WhitenedProblem, camera_step, gauss_newton
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
-from tests.ba.conftest import centers_of
+from tests.ba.conftest import Held, centers_of, held_by
 from tests.ba.oracle import Plain, ecef_of, enu_of, ground_of
 from tests.constants import chosen
 from tests.lanes import diagonal, rest_slow
@@ -139,8 +137,8 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_views", [100, 0])
-def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, monkeypatch, dense_views):
-    monkeypatch.setattr(normal, "LEAF", dense_views)
+def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, sized, dense_views):
+    sized(dense_views=dense_views)
     matrix, gradient, cost = case.dense
     size = case.params.size
     reduced = case.reduced
@@ -155,10 +153,10 @@ def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_pro
     assert reduced.gain == pytest.approx(gradient[size:] @ moved, rel=1e-5)
 
 
-def test_pieces_of_any_size_make_the_same_system(case, monkeypatch):
+def test_pieces_of_any_size_make_the_same_system(case, sized):
     whole = case.reduced
-    monkeypatch.setattr(normal, "CHUNK", 3)
-    monkeypatch.setattr("barpc.sensor.rpc.CHUNK", 5)
+    sized(observations_together=3)
+    sized(points_together=5)
     pieces = case.reduced
     _assert_close(pieces.matrix, whole.matrix, 1e-12)
     _assert_close(pieces.gradient, whole.gradient, 1e-9)
@@ -261,7 +259,7 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
     _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
 
 
-def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, monkeypatch):
+def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, sized):
     """Baarda's w against 1 - J (J^T J)^-1 J^T of the whole differenced problem; heights that share errors, too."""
     matrix, _, _ = case.dense
     jacobian = case.plain.jacobian(case.params, case.points)
@@ -276,7 +274,7 @@ def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, mon
     places = 2 * rows[:, None] + [0, 1]
     assert (left[places] < 0.99).any()  # or all would be residuals over what is stated
     np.testing.assert_allclose(found, (np.abs(whitened[places]) / np.sqrt(left[places])).max(axis=1), rtol=1e-4)
-    monkeypatch.setattr(snooping, "KEPT", 1)
+    sized(tests_kept=1)
     one_by_one = image_test(covariance, case.problem, _state(case), residual, case.weight, rows)
     np.testing.assert_allclose(one_by_one, found, rtol=1e-9)
 
@@ -300,19 +298,19 @@ def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
     assert _modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
 
 
-def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, monkeypatch):
+def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, sized):
     matrix, _, _ = case.dense
     size = case.params.size
     for columns in (1, 5, size - 1, size, 1000):
-        monkeypatch.setattr("barpc.ba.solving.covariance.KEPT", columns * size)
+        sized(columns_kept=columns * size)
         covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
         _assert_close(covariance.full, np.linalg.inv(matrix)[:size, :size], 1e-4)
         np.testing.assert_array_equal(covariance.full, covariance.full.T)
 
 
 @pytest.mark.parametrize("small", [0, 900])
-def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, monkeypatch, small):
-    monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", small)
+def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, sized, small):
+    sized(dense_unknowns=small)
     q = case.params.shape[1]
     inverse = np.linalg.inv(case.dense[0])
     fresh = Minimum(_state(case), case.reduced).covariance(case.problem.free)
@@ -363,13 +361,13 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     _assert_close(rebuilt, expected, 1e-4)
 
 
-def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(case, monkeypatch):
+def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(case, monkeypatch, sized):
     covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
     before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
     whole = gauge_report(covariance, case.points, before, use)
-    monkeypatch.setattr("barpc.ba.constraints.gauge.SAMPLE", 12)
+    sized(scene_points=12)
     assert gauge_report(covariance, case.points, before, use).radius != whole.radius  # every second
-    monkeypatch.setattr("barpc.ba.constraints.gauge.SAMPLE", 4)
+    sized(scene_points=4)
     some = gauge_report(covariance, case.points, before, use)
     monkeypatch.undo()
     sample = np.arange(12) % 4 == 0
@@ -590,12 +588,12 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     points = ecef_of(np.column_stack([lon, lat, altitudes]))
     weak = np.arange(strong + 2) >= strong
     heights = PointConstraints((), weak, np.arange(strong + 2), (100.0, 500.0), AdjustOptions(), None)
-    prior = heights._held(points)
-    assert prior is not None
+    prior = held_by(heights, points)
     assert prior.index.tolist() == [strong, strong + 1]
     np.testing.assert_allclose(prior.apart(points)[:, 0] * sigma, altitudes[-2:] - alt, atol=1e-6)
     assert not prior.residual(points)[:, 1:].any()
-    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool))._held(points) is None
+    none: Any = Held(prior)
+    assert replace(heights, weak=np.zeros(strong + 2, dtype=bool)).hold(none, points).point_prior is None
 
 
 def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(case, monkeypatch):

@@ -19,6 +19,7 @@ from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import solve
+from tests.constants import Sized
 from tests.lanes import rest_slow
 
 
@@ -120,9 +121,9 @@ def test_heights_of_a_pair_move_as_its_cameras_do(made, found, pair) -> None:
     assert heights.relative == pytest.approx(relative, rel=1e-3)
 
 
-def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, found, monkeypatch) -> None:
+def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, found, sized: Sized) -> None:
     whole = pair_heights(found, 0, 1)
-    monkeypatch.setattr("barpc.ba.result.MANY", 20)
+    sized(heights_measured=20)
     some = pair_heights(found, 0, 1)
     assert 10 <= some.count <= 20
     assert some.absolute == pytest.approx(whole.absolute, rel=0.05)

@@ -18,7 +18,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
-from tests.constants import chosen
+from tests.constants import Sized, chosen
 
 CALM = {"drift": 0, "learn_priors": False, "hold_out": False}
 
@@ -192,28 +192,6 @@ def test_a_better_agreement_takes_the_place_of_a_compromise(clean) -> None:
     assert found.noise == pytest.approx(1.0, abs=0.15)
 
 
-@pytest.mark.few(2)
-@pytest.mark.parametrize(("wave", "settled"), [(0.0, False), (0.02, False), (0.06, True), (0.5, True)])
-def test_points_follow_what_is_smooth_where_it_is_seen(monkeypatch, wave: float, settled: bool) -> None:
-    """Of noise of 0.1 px: a smooth part of less than 0.3 sigmas is taken from each view by itself."""
-    made = simulate_block(3, 1500, seed=5, noise=0.0)
-    options = AdjustOptions(drift=0)
-    block = join(made.views, replace(made.tracks, sigma=np.full(len(made.tracks), 0.1)), None, options)
-    problem = make_problem(block, options, centers_of(made), None)
-    state, heights = first_state(problem, block, options, None)
-    each = rounds.Rounds(problem, block, state, heights, block.use)
-    row = (block.xy[1] - 1e4) / 1e4
-    smooth = wave * np.sin(5 * row) * (block.view == 1)
-    noise = np.random.default_rng(0).normal(0, 0.02, block.xy.shape)
-    each.residual = noise + np.stack([smooth, smooth])
-    again = seen(monkeypatch, rounds.Problem, "projected_off_points")
-    left = each._scatter()
-    assert bool(again) == settled
-    assert np.sqrt((left**2).mean()) < 0.025
-    if not settled:
-        assert np.abs(left - noise).mean() < 0.012
-
-
 def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
     made = simulate_block(3, 200, seed=5)
     block = join(made.views, made.tracks, None, AdjustOptions(drift=0))
@@ -232,11 +210,11 @@ def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
 
 
 @pytest.mark.slow
-def test_a_cut_that_changes_little_is_not_solved_again(monkeypatch) -> None:
+def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     dirty = simulate_block(3, 400, seed=5, outliers=0.1)
     passes = []
     for share in (0.0, 0.2):
-        monkeypatch.setattr(rounds, "SLIGHT", share)
+        sized(slight_cut=share)
         with chosen(AdjustOptions, robust_threshold=1.2):
             found = solve(dirty, **CALM, estimate_noise=False)
         passes.append(int(found.status.split()[0]))

@@ -15,6 +15,7 @@ from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.structure import make_structure
 from barpc.sensor.image_corrections import bsplines
 from tests import distributions as stats
+from tests.constants import Sized
 
 SIZE = (10000, 20000)
 
@@ -211,8 +212,10 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
 
 
 @pytest.mark.parametrize(("most", "once"), [(599, False), (600, True)])
-def test_terms_of_a_block_that_is_not_large_are_worked_out_once(monkeypatch, most: int, once: bool) -> None:
-    monkeypatch.setattr("barpc.ba.robust.systematic_residuals.KEPT", most)
+def test_terms_of_a_block_that_is_not_large_are_worked_out_once(
+    monkeypatch, sized: Sized, most: int, once: bool
+) -> None:
+    sized(terms_kept=most)
     asked: list[slice] = []
     terms = Smooth._terms
     monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))

@@ -15,6 +15,7 @@ from barpc.ba.solving import solve
 from barpc.ba.solving.solve import Minimum, State, _has_converged
 from barpc.base.errors import AdjustError
 from barpc.simulate import simulate_block
+from tests.constants import Sized
 
 STATE = State(np.zeros((1, 2)), np.zeros((1, 3)), history=(7.0,))
 FACTOR = object()
@@ -150,8 +151,8 @@ def test_where_no_damping_however_strong_helps_it_ends(monkeypatch, gain: float,
         assert found == "no step lowers the cost 1: the solution is not usable"
 
 
-def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch) -> None:
-    monkeypatch.setattr(solve, "ITERATIONS", 5)
+def test_a_cost_that_stands_is_no_failure_and_the_steps_are_counted(monkeypatch, sized: Sized) -> None:
+    sized(steps=5)
     found, dampings = run(monkeypatch, [1.0, 1.0 + 5e-13], [0.5])
     assert isinstance(found, Minimum)
     assert dampings == [0.0] * 5
@@ -202,7 +203,7 @@ def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(mo
 
     def astray(residual: Any, start: Any, jacobian: Any, **_: Any) -> Any:
         least = float((residual(start) ** 2).sum())
-        for size in (1e6, 1e9):
+        for size in (1e4, 3e5):  # farther off the matrix there has no factor, with some processors or SciPy 1.18
             assert float((residual(start + size) ** 2).sum()) > 1e3 * least
         assert float((residual(start) ** 2).sum()) == pytest.approx(least, rel=1e-12)
         return SimpleNamespace(x=start, nfev=4, message="ended.", success=True)

@@ -185,7 +185,8 @@ def test_what_is_proposed_once_is_not_again() -> None:
     rows = [interval(0.0, 4000.0), interval(0.0, 6000.0), interval(0.0, 4000.0, 0), interval(0.0, 4000.0)]
 
     def of(intervals: list[Interval], *without: Any) -> list[tuple[str, int]]:
-        return [(one.NAME, one.view) for one in proposed(s, intervals, [], without)]
+        known = "step", "decay", "transient", "low_frequency"  # whatever else the table has
+        return [(one.NAME, one.view) for one in proposed(s, intervals, [], without) if one.NAME in known]
 
     part = [("step", 1), ("decay", 1), ("decay", 1)]
     first = [("step", 1), *[("decay", 1)] * (len(Decay.propose(s, rows[0])))]

@@ -18,8 +18,10 @@ from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground
+from barpc.base.statistics import SMALL
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
+from tests.constants import Sized
 from tests.distributions import chi2
 from tests.lanes import rest_slow
 
@@ -38,7 +40,28 @@ def seen(known: np.ndarray) -> np.ndarray:
     return np.hstack([known, np.zeros((len(known), 1))])
 
 
-ANY: Any = SimpleNamespace(problem=SimpleNamespace(free=None), small=False)
+def large(n: int, model: str = "rotation", drift: int = 0, cautious: bool = False) -> Variances:
+    """The same as a part of a block so large that it learns once a solve: of degrees of drift that nothing shows."""
+    rest = -(-(SMALL + 1) // (3 * n))
+    return variances(n, model, drift + rest, cautious)
+
+
+def learnt(
+    v: Variances, params: np.ndarray, known: np.ndarray, last: PriorTest | None = None, now: np.ndarray | None = None
+) -> tuple[CameraPrior, PriorTest]:
+    """What a block says with unknowns (N, q) that its observations determine by so much, of further ones nothing.
+
+    `now` are the standard deviations that it was solved with, where these are not the given ones.
+    """
+    n, size = v.given.sigma.shape
+    mean, share, sigma = v.given.mean.copy(), np.zeros((n, size)), v.given.sigma if now is None else now
+    mean[:, : params.shape[1]], share[:, : known.shape[1]] = params, known
+    free = np.ones(n * size, dtype=bool)
+    variance = (1.0 - share) * np.where(np.isfinite(sigma), sigma, 1.0) ** 2
+    covariance = SimpleNamespace(free=free, is_large=False, of_views=lambda: variance[:, :, None] * np.eye(size))
+    problem: Any = SimpleNamespace(camera_prior=replace(v.given, sigma=sigma), free=free)
+    minimum: Any = SimpleNamespace(state=SimpleNamespace(params=mean), covariance=lambda _: covariance)
+    return v.learnt(problem, minimum, last)
 
 
 def params_of(v: Variances, totals: list[float]) -> np.ndarray:
@@ -83,58 +106,67 @@ def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
 
 
 def test_squares_and_freedom_are_those_of_the_unknowns_that_are_determined() -> None:
-    v = variances(2, "rotation", 1)
+    v = replace(large(2, "rotation", 1), stated=np.array([True, False]))
     params = np.array([[2.5, 4.5, 0.5, 2.5, 0.5, 0.5], [0.5, 0.5, 0.5, 0.5, 3.5, 0.5]])
     known = np.array([[1.0, 0.5, 0.25, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.75, 0.0]])
-    total, freedom = v._by_view(params, seen(known))
-    np.testing.assert_allclose(total, [[1.0 + 4.0, 4.0, 0.0], [0.0, 9.0, 0.0]])
-    np.testing.assert_allclose(freedom, [[1.75, 1.5, 0.0], [0.0, 1.75, 0.0]])
+    place, of_stated, count, drift = learnt(v, params, known)[1].shown[:4]
+    np.testing.assert_allclose([place, of_stated], [[1.0 + 4.0, 1.75]] * 2)
+    assert count.tolist() == [1.0, 0.0]
+    np.testing.assert_allclose(drift, [4.0 + 9.0, 1.5 + 1.75])
     # one that is not determined at all does not count, wherever it stands
     params[1, 0] = 99.0
-    np.testing.assert_allclose(v._by_view(params, seen(known))[0, :, 0], [5.0, 0.0])
+    tested = learnt(v, params, known)[1]
+    np.testing.assert_allclose([tested.ratio, tested.freedom], [5.0 / 1.75, 1.75])
 
 
 def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four() -> None:
-    v = variances(2, "rotation", 2)
+    v = large(2, "rotation", 2)
     params, known = v.given.mean.copy(), np.ones((2, 9))
     params[:, 3] += 3.0  # sigma 1: squares 9 and 9 of 6 degrees
     params[0, 6] += 2.0
+    prior, tested = learnt(v, params, known)
     expected = np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6), 1.0])
-    np.testing.assert_allclose(v._beside(params, seen(known), None), expected)
+    np.testing.assert_allclose(tested.wide[:3], expected)
+    np.testing.assert_allclose(prior.sigma[:, 6:12], [np.repeat(expected[1:], 3)] * 2)
+    assert tested.turned == 1.0
 
 
 def test_a_drift_grows_thirtyfold_at_most_from_one_linearisation_to_the_next() -> None:
     """One that the observations hardly determine is anywhere in what is linear."""
-    v = variances(2, "rotation", 1)
+    v = large(2, "rotation", 1)
     params, known = v.given.mean.copy(), np.ones((2, 6))
     params[:, 3] += 1e6
-    assert v._beside(params, seen(known), None)[0] == 30.0
-    last = PriorTest(1.0, 2.0, np.ones(2), np.zeros(2, dtype=bool), (), wide=(30.0, 1.0))
-    assert v._beside(params, seen(known), last)[0] == 900.0
+    first = learnt(v, params, known)[1]
+    assert (first.wide[0], first.turned) == (30.0, 1.0)
+    assert learnt(v, params, known, first)[1].wide[0] == 900.0
 
 
 @pytest.mark.parametrize("cautious", [False, True])
 @pytest.mark.parametrize(("share", "unexpected"), [(0.95, False), (1.05, True)])
 def test_drifts_of_another_platform_are_let_be_as_large_as_they_may_be(cautious, share, unexpected) -> None:
     """As large as leaves a tenth of chance to something smaller; those of a thousandth's chance only."""
-    v = variances(2, "rotation", 1, cautious)
+    v = large(2, "rotation", 1, cautious)
     total = share * chi2.isf(1e-3, 6)
     params, known = v.given.mean.copy(), np.ones((2, 6))
     params[0, 4] += np.sqrt(total)
     likely, possible = (4 + total) / (4 + 6), total / chi2.ppf(0.1, 6)
     assert possible > likely
     expected = possible if cautious and unexpected else likely
-    np.testing.assert_allclose(v._beside(params, seen(known), None), np.sqrt([expected, 1.0]))
-    np.testing.assert_allclose(v._beside(params, seen(0.49 / 6 * known), None)[0], np.sqrt((4 + total) / (4 + 0.49)))
+    np.testing.assert_allclose(learnt(v, params, known)[1].wide[0], np.sqrt(expected))
+    np.testing.assert_allclose(learnt(v, params, 0.49 / 6 * known)[1].wide[0], np.sqrt((4 + total) / (4 + 0.49)))
 
 
-def test_without_control_priors_are_rather_too_wide_than_too_narrow() -> None:
-    v = variances(2, cautious=True)
-    for totals in ([18.0, 6.0], [1.5, 1.0], [0.5, 0.4]):
-        scale, odd = v._widened(ANY, params_of(v, totals), seen(np.ones((2, 3))), np.ones(1))
-        expected = max((4 + sum(totals)) / (4 + 6), sum(totals) / chi2.ppf(0.1, 6), 1.0)
-        np.testing.assert_allclose(scale, np.sqrt(expected))
-        assert not odd.any()
+@pytest.mark.parametrize("cautious", [False, True])
+@pytest.mark.parametrize("totals", [[18.0, 6.0], [7.0, 6.0], [6.0, 6.0], [0.5, 0.4]])
+def test_two_views_are_widened_together_and_without_control_rather_too_wide_than_too_narrow(cautious, totals) -> None:
+    """Where they are too large for one chance in twenty, and never narrowed."""
+    v = large(2, cautious=cautious)
+    prior, tested = learnt(v, params_of(v, totals), np.ones((2, 3)))
+    likely, possible = (4 + sum(totals)) / (4 + 6), sum(totals) / chi2.ppf(0.1, 6)
+    expected = 1.0 if sum(totals) < chi2.isf(0.05, 6) else max(likely, possible) if cautious else likely
+    np.testing.assert_allclose(tested.scale, np.sqrt(expected))
+    np.testing.assert_allclose(prior.sigma[:, :3], 2.0 * np.sqrt(expected))
+    assert not tested.odd.any()
 
 
 @pytest.mark.parametrize(("share", "large"), [(0.97, False), (1.03, True)])
@@ -146,15 +178,6 @@ def test_corrections_are_too_large_where_chance_has_five_percent(share: float, l
     assert not v._too_large(params, seen(known), np.full(n, 1.1))
     assert not v._too_large(params, seen(0.49 / 18 * known), np.ones(n))  # nothing is determined
     assert v._too_large(params_of(v, [99.0] * 6), seen(0.51 / 18 * known), np.ones(n))
-
-
-def test_two_views_are_widened_together() -> None:
-    v = variances(2)
-    scale, odd = v._widened(ANY, params_of(v, [18.0, 6.0]), seen(np.ones((2, 3))), np.ones(1))
-    np.testing.assert_allclose(scale, np.sqrt((4 + 24) / (4 + 6)))
-    assert not odd.any()
-    scale, _ = v._widened(ANY, params_of(v, [1.0, 1.0]), seen(np.ones((2, 3))), np.ones(1))
-    np.testing.assert_array_equal(scale, 1.0)  # and never narrowed
 
 
 def told(n: int, stated: float, off: dict[int, float], seed: int = 0) -> PriorTest:
@@ -204,7 +227,8 @@ def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple
         return np.array([9.0, 1.0, 1.0]), np.array([True, False, False]), alone
 
     monkeypatch.setattr(Variances, "_odd", odd)
-    return v._widened(ANY, params_of(v, [600.0, 3.0, 3.0]), seen(np.ones((3, 3))), np.ones(1))
+    around: Any = SimpleNamespace(problem=SimpleNamespace(free=None), small=False)
+    return v._widened(around, params_of(v, [600.0, 3.0, 3.0]), seen(np.ones((3, 3))), np.ones(1))
 
 
 def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(monkeypatch) -> None:
@@ -317,13 +341,13 @@ def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("n", rest_slow([50, 300], mark=pytest.mark.nightly))
 def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_within_their_bound(
-    monkeypatch, n: int
+    sized: Sized, n: int
 ) -> None:
     """Against the inverse of the whole matrix (9 unknowns a view), whose drifts are a hundredth of the rotations."""
     block = simulate_block(n, 20 * n, seed=1, num_checks=0)
     if n < 300:
-        monkeypatch.setattr("barpc.ba.solving.normal.LEAF", 0)
-        monkeypatch.setattr("barpc.ba.solving.covariance._DENSE_UNKNOWNS", 0)
+        sized(dense_views=0)
+        sized(dense_unknowns=0)
     options = AdjustOptions(**({"min_convergence": 60.0} if n < 300 else {}))
     with pytest.warns(BarpcWarning, match="constrained in height"):  # they share an error, taken off the sparse matrix
         found = adjust_tracks(block.views, block.tracks, options, centers=centers_of(block))
@@ -464,26 +488,29 @@ def test_one_view_that_is_far_off_is_named_and_the_others_keep_their_priors(
 # --- how it is learnt -------------------------------------------------------------------------------------------------
 
 
-def waved(n: int = 3) -> Variances:
-    """Priors of views with splines and a step, whose standard deviations differ from one to another."""
+def waved(n: int = 3, cautious: bool = False) -> Variances:
+    """Priors of views of a large block with splines and a step."""
     unknowns = Unknowns(
-        "rotation", 1, np.zeros((n, 3)), np.ones(n), np.zeros((2, n)), np.ones((2, n)),
+        "rotation", 1 + SMALL // (3 * n), np.zeros((n, 3)), np.ones(n), np.zeros((2, n)), np.ones((2, n)),
         waves=AdditionalParameters(9, np.full((n, 2), 5.0)),
     )  # fmt: skip
     sigma = np.full((n, unknowns.size), 2.0)
     sigma[:, unknowns.in_waves] = 0.3
-    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, True, False)
+    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, True, cautious)
 
 
 def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
     """Band by band; that of all views counts as four observations beside a view's own, 0.02 px as one beside all."""
     v, rng = waved(), np.random.default_rng(0)
     first, bands = v.unknowns.in_waves.start, v.unknowns.waves.bands
-    sigma, shape = v.given.sigma.copy(), v.given.sigma.shape
+    sigma, shape = 5.0 * v.given.sigma, v.given.sigma.shape
     sigma[2, first:] = np.inf  # of an earlier block, whose matrix tells
     params, known = rng.normal(0, 0.1, shape), rng.uniform(0, 1, shape)
-    found = v._waves(params, known, sigma)
-    np.testing.assert_array_equal(found[:, :first], sigma[:, :first])
+    params[:, :first] = 0.0
+    known[:, :first] = 0.0
+    found = learnt(v, params, known, now=sigma)[0].sigma
+    np.testing.assert_allclose(found[:, :3], 2.0)  # no other prior follows
+    np.testing.assert_allclose(found[:, 3:first], np.hypot(2.0, [0.02] * 3 + [0.0] * (first - 6))[None].repeat(3, 0))
     assert np.isinf(found[2, first:]).all()
     for band in np.unique(bands):
         rows = first + np.flatnonzero(bands == band)
@@ -493,14 +520,6 @@ def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
         for view in (0, 1):
             expected = np.sqrt((4 * common + squares[view]) / (4 + freedom[view]))
             np.testing.assert_allclose(found[view, rows], expected)
-
-
-def test_what_follows_waves_changes_no_other_prior() -> None:
-    v = waved()
-    again = v._going_on(v.given.sigma * 5.0)
-    first = v.unknowns.in_waves.start
-    np.testing.assert_array_equal(again.given.sigma[:, :first], 2.0)
-    np.testing.assert_array_equal(again.given.sigma[:, first:], 1.5)
     np.testing.assert_array_equal(v.given.sigma[:, first:], 0.3)
     assert v.learn_waves
     assert not variances(2).learn_waves
@@ -508,10 +527,11 @@ def test_what_follows_waves_changes_no_other_prior() -> None:
 
 def test_where_waves_are_followed_a_drift_is_as_large_as_it_shows() -> None:
     """Whatever control there is: what else bends heights is followed."""
-    v = replace(waved(2), cautious=True)
-    params, known = np.zeros(v.given.sigma.shape), np.ones(v.given.sigma.shape)
+    v = waved(2, cautious=True)
+    params, known = np.zeros((2, 6)), np.ones((2, 6))
     params[0, 3] = 30.0
-    np.testing.assert_allclose(v._beside(params, seen(known), None), np.sqrt([(4 + 225) / (4 + 6), 1.0]))
+    tested = learnt(v, params, known)[1]
+    np.testing.assert_allclose([tested.wide[0], tested.turned], np.sqrt([(4 + 225) / (4 + 6), 1.0]))
 
 
 @pytest.fixture(scope="module")
@@ -532,10 +552,10 @@ def determined(problem: Any, minimum: Any, sigma: np.ndarray) -> np.ndarray:
     return (1 - inverse.diagonal().reshape(sigma.shape) / sigma**2).clip(0, 1)
 
 
-def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
+def test_a_large_block_learns_once_a_solve(at_minimum, sized: Sized) -> None:
     """By the covariance at hand: the drift of all views by its squares, the constants by those of most."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
@@ -555,9 +575,9 @@ def test_a_large_block_learns_once_a_solve(at_minimum, monkeypatch) -> None:
     assert tested.drift_sigma == pytest.approx([np.median(drift[:, 0])])
 
 
-def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimum, monkeypatch) -> None:
+def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimum, sized: Sized) -> None:
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)
@@ -576,10 +596,10 @@ def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimu
     assert told[1].ratio == pytest.approx(tested.ratio) == pytest.approx(total.sum() / freedom.sum())
 
 
-def test_constants_of_a_large_block_once_widened_stay(at_minimum, monkeypatch) -> None:
+def test_constants_of_a_large_block_once_widened_stay(at_minimum, sized: Sized) -> None:
     """They take from the drift, which is another then: asked whether it stands it would send them back, in turns."""
     problem, minimum = at_minimum
-    monkeypatch.setattr("barpc.ba.robust.variances.SMALL", 0)
+    sized(unknowns_tried=0)
     given = CameraPrior(problem.camera_prior.mean, problem.camera_prior.sigma.copy())
     given.sigma[:, :6] /= 30.0
     v = Variances(given, problem.cameras.unknowns, True, False)
@@ -648,18 +668,24 @@ def test_every_view_is_tried_up_to_four_hundred_unknowns(unknowns: int, small: b
 @pytest.mark.parametrize("size", [0.0, 2.0, 3.0, 90.0])
 def test_views_that_state_an_accuracy_share_what_they_are_off_by(model: str, unknowns: int, size: float) -> None:
     """As far as their corrections leave room: what is independent is as large as a thousandth's chance lets it."""
-    v = replace(variances(4, model), stated=np.array([True, False, True, True]))
-    params, known = v.given.mean.copy(), np.full((4, unknowns), 0.5)
+    v = replace(large(4, model, 1), stated=np.array([True, False, True, True]))
+    params, known = v.given.mean.copy(), np.full((4, unknowns + 3), 0.5)
     params[0, 1] += size * 2.0  # of a standard deviation of 2
-    params[1] += 99.0
+    params[1, :unknowns] += 99.0
+    params[2, unknowns] += 50.0  # while the drift is learnt the constants are not
     known[3] = 0.0  # of this view nothing is determined
+
+    def shared(v: Variances, known: np.ndarray) -> np.ndarray:
+        return learnt(v, params, known)[0].sigma[:, 0] / 2.0
+
     freedom = 0.5 * 2 * unknowns
     alone = min(size**2 / chi2.ppf(1e-3, freedom), 1.0)
     expected = np.sqrt(max(alone + (1 - alone) * 2 * 3 / unknowns, 1.0))
-    np.testing.assert_allclose(v._shared(params, seen(known)), [expected, 1.0, expected, expected])
-    np.testing.assert_array_equal(v._shared(params, seen(0.49 / freedom * known)), 1.0)  # nothing is determined
-    np.testing.assert_array_equal(replace(v, learns=False)._shared(params, seen(known)), 1.0)
-    np.testing.assert_array_equal(replace(v, stated=None)._shared(params, seen(known)), 1.0)
+    np.testing.assert_allclose(shared(v, known), [expected, 1.0, expected, expected])
+    assert learnt(v, params, known)[1].shared == pytest.approx(expected)
+    np.testing.assert_array_equal(shared(v, 0.49 / freedom * known), 1.0)  # nothing is determined
+    np.testing.assert_array_equal(shared(replace(v, learns=False), known), 1.0)
+    np.testing.assert_array_equal(shared(replace(v, stated=None), known), 1.0)
 
 
 def test_what_is_not_said_to_be_shared_is_not() -> None:

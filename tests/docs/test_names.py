@@ -169,3 +169,17 @@ def test_the_names_are_read_from_pages_that_have_them():
     assert sum(len(names(page)) for page in PRESENT) > 60
     assert sum(len(paths(page)) for page in PRESENT) > 40
     assert "barpc.ba.evidence.scan" in names(DOCS / "adjustment.md")
+
+
+def test_what_a_diff_of_contributing_starts_from_is_in_the_files_that_it_names():
+    parts = [part for block in blocks(ROOT / "CONTRIBUTING.md", "diff") for part in block.text.split("\n\n")]
+    known = ""
+    for part in parts:
+        for line in part.splitlines():
+            if line.startswith("# "):
+                known = "".join(
+                    path.read_text() for name in re.findall(r"barpc/[\w/]+\.py", line) if (path := ROOT / name).exists()
+                )
+            elif not line.startswith("+"):
+                assert line[1:] in known, line
+    assert len(parts) >= 5

@@ -86,8 +86,8 @@ def test_the_same_bytes_whoever_works_and_in_whatever_order_images_are_given(mad
 
 
 @pytest.mark.slow
-def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch):
-    monkeypatch.setattr(surface_module, "BLOCK_SIZE", 128)
+def test_an_interrupted_command_goes_on_where_it_was(rendered, tmp_path, monkeypatch, sized):
+    sized(surface_block=128)
     asked = []
     whole = surface_module.surface_tile
 
@@ -335,9 +335,9 @@ def test_coarse_cells_have_the_median_of_their_ground(rendered, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch):
+def test_a_refusal_after_long_work_leaves_nothing_either(rendered, tmp_path, monkeypatch, sized):
     """Not even what a run that is gone on with would need: it is refused each time."""
-    monkeypatch.setattr("barpc.workspace.KEEP_AFTER", 0.0)
+    sized(kept_after=0.0)
     monkeypatch.setattr(stereo, "MATCHED", 1.1)
     with pytest.raises(NoSurfaceError, match="nothing is written"):
         make_dsm(rendered.paths[:2], tmp_path / "dsm.tif", OPTIONS)

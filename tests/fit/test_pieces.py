@@ -14,7 +14,7 @@ from barpc.base.errors import FitError, InputError, RpcError
 from barpc.base.geodesy import metres_per_unit
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.certificate import coverage, roundtrip
-from barpc.fit.methods import _curvature, solve_lcurve
+from barpc.fit.methods import solve_lcurve
 from barpc.fit.points import (
     Errors,
     control_points,
@@ -427,28 +427,6 @@ def test_expected_sizes_fall_with_the_degree() -> None:
     size = expected_size(ALL)
     np.testing.assert_allclose(size[:20], np.r_[[np.inf] * 4, [0.1] * 6, [0.03] * 10])
     np.testing.assert_allclose(size[20:], np.r_[[0.003] * 3, [0.0003] * 6, [0.00003] * 10])
-
-
-def test_the_curvature_of_the_l_curve_is_that_of_the_sampled_curve() -> None:
-    """(rho' eta'' - rho'' eta') / (rho'^2 + eta'^2)^1.5, numerically, away from the corner too."""
-    rng = np.random.default_rng(5)
-    s, beta, rest = np.geomspace(1, 1e-4, 12), rng.normal(size=12), 0.3
-    h = np.geomspace(1e-4, 1.0, 4001)
-
-    def curve(h: Any) -> Any:
-        f = s**2 / (s**2 + h[:, None] ** 2)
-        eta2 = ((f * beta / s) ** 2).sum(axis=1)
-        rho2 = (((1 - f) * beta) ** 2).sum(axis=1) + rest
-        return 0.5 * np.log(rho2), 0.5 * np.log(eta2)
-
-    rho, eta = curve(h)
-    t = np.log(h)
-    rho1, eta1 = np.gradient(rho, t), np.gradient(eta, t)
-    rho2, eta2 = np.gradient(rho1, t), np.gradient(eta1, t)
-    expected = (rho1 * eta2 - rho2 * eta1) / (rho1**2 + eta1**2) ** 1.5
-    found = _curvature(h[:, None], s, beta, rest)
-    scale = np.abs(expected[50:-50]).max()
-    np.testing.assert_allclose(found[50:-50], expected[50:-50], rtol=1e-3, atol=1e-4 * scale)
 
 
 def test_the_camera_under_a_model_is_found_through_its_corrections(camera: Camera) -> None:

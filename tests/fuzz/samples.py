@@ -48,6 +48,7 @@ from barpc.tie.pairing.area import read_area
 from barpc.workspace import Workspace
 from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import binary, colmap
+from tests.pointio.test_gcp_formats import SAME as GCP_FILES
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 from tests.sensor import terrasar_files
@@ -438,54 +439,12 @@ CSV_GCPS = (
     b"id,Longitude [deg],lat,h,image,px,py,sigma_xy,sigma_z,sigma_px\n1,5.4,43.2,120.5,left.tif,10.5,20.25,1,2,0.5\n"
     b'1,5.4,43.2,120.5,"right.tif",30,40,1,2,0.5\n2,5.5,43.3,99,left,5,6,,,\n'
 )
-TOOLS: dict[str, tuple[str, bytes, tuple[Mutate, ...]]] = {
-    "qgis": (
-        "left.points",
-        b"#CRS: EPSG:32631\nmapX,mapY,sourceX,sourceY,enable\n694517.1,4796759.5,264.1,-889.4,1\n"
-        b"694416.8,4796929,1,-2,0\n",
-        (mutate_text,),
-    ),
-    "odm": ("gcp_list.txt", b"WGS84 UTM 31N\n694517.1 4796759.5 244.4 264.1 889.4 left.tif p\n", (mutate_text,)),
-    "envi": (
-        "left.pts",
-        b"; ENVI\n; projection info = {UTM, 31, North, WGS-84, units=Meters}\n; Map (x,y), Image (x,y)\n"
-        b"694517 4796759 2 3\n",
-        (mutate_text,),
-    ),
-    "metashape": (
-        "m.csv",
-        b"# CoordinateSystem: EPSG:32631+5773\n#Camera,Label,X/East,Y/North,Z/Altitude,px,py,Error_(m)\n"
-        b"left,p,694517,4796759,244,264,889,\n",
-        (mutate_text,),
-    ),
-    "micmac": (
-        "g.xml",
-        b"<Global><DicoAppuisFlottant><OneAppuisDAF><Pt>5.4 43.2 100</Pt><NamePt>p</NamePt>"
-        b"<Incertitude>1 1 1</Incertitude></OneAppuisDAF></DicoAppuisFlottant>"
-        b"<SetOfMesureAppuisFlottants><MesureAppuiFlottant1Im><NameIm>left.tif</NameIm>"
-        b"<OneMesureAF1I><NamePt>p</NamePt><PtIm>1 2</PtIm></OneMesureAF1I></MesureAppuiFlottant1Im>"
-        b"</SetOfMesureAppuisFlottants></Global>",
-        (mutate_xml, mutate_text),
-    ),
-    "guessed": (
-        "a.csv",
-        b"marker;GPS Latitude;GPS Longitude;elev [ft];photo name;image x;image y\n"
-        b"p;43\xc2\xb017'54,7\"N;5\xc2\xb023'53\"E;802;LEFT.JPG;10,5;20\n",
-        (mutate_text,),
-    ),
-    "old geojson": (
-        "old.geojson",
-        b'{"type": "FeatureCollection", "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32631"}},'
-        b' "features": [{"type": "Feature", "geometry": {"type": "Point", "coordinates": [694517.1, 4796759.5]},'
-        b' "properties": {"photo": "left", "pixel": 3, "line": 4, "elevation": 120}}]}',
-        (mutate_json,),
-    ),
-}  # fmt: skip
-"""GCPs of other tools: the file's name, a good one, and the damage that suits it."""
 
 
-def _gcp_sample(name: str, data: bytes, mutations: tuple[Mutate, ...]) -> Sample:
-    return Sample(name, lambda path: read_gcps(path, NAMES), lambda: data, mutations)
+def _gcp_sample(name: str, text: str) -> Sample:
+    data = text.encode()
+    damage = {"<": (mutate_xml, mutate_text), "{": (mutate_json,)}.get(text[0], (mutate_text,))
+    return Sample(name, lambda path: read_gcps(path, NAMES), lambda: data, damage)
 
 
 MATCHES = b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
@@ -503,7 +462,7 @@ SAMPLES: dict[str, Sample] = {
     "gcps": Sample("a.gcp", lambda path: read_gcps(path, NAMES), lambda: ASP_GCPS, (mutate_text,)),
     "gcps csv": Sample("a.csv", lambda path: read_gcps(path, NAMES), lambda: CSV_GCPS, (mutate_text,)),
     "gcps json": Sample("a.geojson", lambda path: read_gcps(path, NAMES), lambda: GCPS, (mutate_json,)),
-    **{f"gcps {kind}": _gcp_sample(*row) for kind, row in TOOLS.items()},
+    **{f"gcps {kind}": _gcp_sample(*row) for kind, row in GCP_FILES.items()},
     "matches csv": Sample("t.csv", lambda path: read_matches(path, NAMES), lambda: MATCHES, (mutate_text,)),
     "matches npz": Sample(
         "t.npz",

@@ -15,7 +15,7 @@ from barpc import __version__
 from barpc.base.errors import AdjustError, ImageError, OutputError
 from barpc.base.identity import Input
 from barpc.base.safe_io import MB
-from barpc.pipeline.executor import CachingExecutor, Spilled, run_batch, worker_count
+from barpc.pipeline.executor import BATCH_SECONDS, CachingExecutor, Spilled, run_batch, worker_count
 from barpc.workspace import Workspace
 
 
@@ -211,11 +211,11 @@ def test_a_batch_is_half_a_second_of_work_but_leaves_the_others_their_share(tmp_
 def test_the_time_of_a_task_is_a_running_mean(tmp_path) -> None:
     pool = Later()
     with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
-        for n in range(200):
+        for n in range(300):
             caching.submit(square, n)
-        for seconds, mean in ((0.4, 0.4), (0.2, 0.3), (0.1, 0.2)):
+        for seconds, mean in ((0.04, 0.04), (0.02, 0.03), (0.009, 0.0195)):
             pool.finish(0, lambda fn, tasks, s=seconds: [(s, fn(*task), None) for task in tasks])
-            assert caching._seconds[square] == pytest.approx(mean)
+            assert len(pool.batches[-1][1][1]) == int(BATCH_SECONDS / mean)
         caching.shutdown()
 
 
@@ -224,12 +224,11 @@ def test_a_batch_is_of_one_function(tmp_path) -> None:
     with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
         for n in range(40):
             caching.submit(square if n % 20 < 18 else refuse, n + 5)
-        caching._seconds[square] = caching._seconds[refuse] = 0.001
         while pool.batches:
             _, (fn, tasks, _) = pool.batches[0]
             wanted = [n + 5 for n in range(40) if (fn is square) == (n % 20 < 18)]
             assert {task[0] for task in tasks} <= set(wanted)
-            pool.finish()
+            pool.finish(0, lambda fn, tasks: [(0.001, n, None) for n in range(len(tasks))])
 
 
 def test_cpu_seconds_of_workers_are_added_up(tmp_path) -> None:
@@ -279,7 +278,10 @@ def test_a_cancelled_task_is_not_done(tmp_path) -> None:
             sent += [task[0] for task in pool.batches[0][1][1]]
             pool.finish()
         assert sent == list(range(7))
-        assert caching._in_flight == 0
+        more = [caching.submit(square, n) for n in range(10, 30)]
+        assert len(pool.batches) == 6  # as many as at first: nothing is in flight
+        caching.shutdown()
+        assert all(future.cancelled() or not future.done() for future in more)
 
 
 def test_after_its_end_nothing_is_handed_out_or_kept(tmp_path) -> None:
@@ -336,11 +338,12 @@ def test_arrays_count_by_values_type_and_shape(tmp_path) -> None:
 
 
 def test_a_large_array_is_spilled_once_and_a_small_one_is_sent(tmp_path) -> None:
-    large, small = np.zeros(MB // 8), np.zeros(MB // 8 - 1)
-    with Workspace(tmp_path / "run") as workspace:
-        caching = CachingExecutor(workspace, {}, Later())
-        assert caching._spill((1, small)) == (1, small)
-        first, second = caching._spill((1, large)), caching._spill((2, large.copy()))
+    large, small, pool = np.zeros(MB // 8), np.zeros(MB // 8 - 1), Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for args in ((1, small), (1, large), (2, large.copy())):
+            caching.submit(refuse, *args)
+        sent, first, second = (args[1][0] for _, args in pool.batches)
+        assert sent == (1, small)
         assert isinstance(first, Spilled)
         assert isinstance(second, Spilled)
         (place,) = first.large.values()
@@ -349,8 +352,6 @@ def test_a_large_array_is_spilled_once_and_a_small_one_is_sent(tmp_path) -> None
         number, array = second.load()
         assert number == 2
         np.testing.assert_array_equal(array, large)
-        unknown = (object(), large)
-        assert caching._spill(unknown) is unknown
         caching.shutdown()
 
 

@@ -82,9 +82,8 @@ def test_a_folder_is_listed_once_for_all_its_images_and_again_when_it_changes(bl
 
 
 @pytest.mark.parametrize("keep_going", [False, True])
-def test_other_workers_read_the_same_views_and_the_first_error_counts(block, folder, monkeypatch, keep_going):
-    for place in ("loading", "executor"):
-        monkeypatch.setattr(f"barpc.pipeline.{place}.GROUP", 3)
+def test_other_workers_read_the_same_views_and_the_first_error_counts(block, folder, sized, keep_going):
+    sized(images_together=3)
     told = []
     given = [*block[1], folder / "missing.tif", folder / "none.tif"]
     with ThreadPoolExecutor(2) as executor:

@@ -225,6 +225,8 @@ def test_the_consumers_that_are_always_there_need_no_other_package():
 class Other:
     """What stands for another tool's module: it says how it was asked, and answers with a camera of ours."""
 
+    __spec__ = None
+
     def __init__(self, rpc: RPC) -> None:
         self.rpc, self.asked = rpc, []
 
@@ -237,6 +239,12 @@ class Other:
         return self
 
 
+def install(monkeypatch: pytest.MonkeyPatch, module: Other) -> None:
+    """Let it be what Python imports as the other tool."""
+    for name in ("shareloc.geomodels", "shareloc.geomodels.rpc", "orthority.factory"):
+        monkeypatch.setitem(sys.modules, name, module)
+
+
 @pytest.mark.parametrize(
     ("name", "reader"),
     [("a.tif", "rpc_from_geotiff"), ("a_RPC.TXT", "rpc_from_rpc_file"), ("a.json", "RPCModel")],
@@ -246,7 +254,7 @@ def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_p
     path = write(rpc, image, tmp_path / "out", name)
     rpcm = Other(rpc)
     rpcm.projection = lambda lon, lat, alt: rpc.project(np.column_stack([lon, lat, alt])).T
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda module: {"rpcm.rpc_model": rpcm}[module])
+    monkeypatch.setitem(sys.modules, "rpcm.rpc_model", rpcm)
     project = CONSUMERS["rpcm"].open(path)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     np.testing.assert_array_equal(project(ground), rpc.project(ground))
@@ -276,7 +284,7 @@ def shareloc(rpc: RPC, takes: Callable[[Array], BoolArray] = lambda lon: np.abs(
 def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(lon, turn, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
     model = shareloc(rpc)
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
+    install(monkeypatch, model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
     np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
@@ -292,7 +300,7 @@ def test_shareloc_is_asked_of_a_grid_from_the_corner_of_the_first_pixel_and_row_
         return np.column_stack([rpc.localize(np.column_stack([col, row]) - 0.5, alt)[:, :2], alt])
 
     asked.direct_loc_h = direct_loc_h
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: asked)
+    install(monkeypatch, asked)
     monkeypatch.setattr("barpc.pipeline.verify_outputs.open_camera", lambda _: SimpleNamespace(model=None))
     localize = verify_outputs._shareloc_grid(tmp_path / "a_grid.tif")
     np.testing.assert_allclose(localize(at)[:, :2], rpc.localize(at[:, :2], at[:, 2])[:, :2], rtol=0, atol=1e-12)
@@ -307,7 +315,7 @@ def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatc
     model = shareloc(rpc)
     inverse = model.inverse_loc
     model.inverse_loc = lambda *given: threads.append(10 * threads[-1]) or inverse(*given)
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
+    install(monkeypatch, model)
     monkeypatch.setitem(sys.modules, "numba", numba)
     CONSUMERS["shareloc"].open(tmp_path / "a.tif")(control_grid(rpc, SIZE, ALTITUDES)[0])
     assert threads == [2, 1, 10, 2]
@@ -334,7 +342,7 @@ def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatc
 )
 def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, monkeypatch, tmp_path):
     rpc = make_rpc(lon=lon)
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: shareloc(rpc, takes))
+    install(monkeypatch, shareloc(rpc, takes))
     named = {"shareloc": replace(CONSUMERS["shareloc"], package="numpy"), "barpc": CONSUMERS["barpc"]}
     monkeypatch.setattr("barpc.pipeline.verify_outputs._consumers", lambda _: named)
     write_rpc(rpc, tmp_path / "a.geom")
@@ -349,7 +357,7 @@ def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
     rpc = make_rpc()
     model = Other(rpc)
     model.world_to_pixel = lambda columns: rpc.project(columns.T).T
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.import_module", lambda _: model)
+    install(monkeypatch, model)
     ground, _ = control_grid(rpc, SIZE, ALTITUDES)
     found = CONSUMERS["orthority"].open(tmp_path / "a.tif")(ground)
     np.testing.assert_array_equal(found, rpc.project(ground))

@@ -345,8 +345,13 @@ def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, fit, 
         ("a____b", False), ("", False), ("__", False), ("a__", False),
     ],
 )  # fmt: skip
-def test_a_pair_is_two_names_of_views(stem, pair) -> None:
-    assert outputs._is_pair(stem, {"a", "b", "b__c"}) == pair
+def test_a_pair_is_two_names_of_views(stem, pair, tmp_path) -> None:
+    """Only its matches in the folder are outputs that a run may replace."""
+    (tmp_path / "asp").mkdir()
+    (tmp_path / "asp" / f"{stem}.txt").touch()
+    known: Any = [SimpleNamespace(name=name) for name in ("a", "b", "b__c")]
+    names = outputs.output_names(known, RunOptions(stop_after="matching"), tmp_path)
+    assert (f"asp/{stem}.txt" in names) == pair
 
 
 def test_json_has_an_item_of_a_list_a_line() -> None:

@@ -264,7 +264,7 @@ def test_numbers_are_the_same_in_any_type() -> None:
     np.testing.assert_array_equal(of(np.array([1 + 2j, 3 - 1j], np.complex64)), [1.0, 2.0, 3.0, -1.0])
 
 
-def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair, tmp_path, monkeypatch) -> None:
+def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair, tmp_path, monkeypatch, sized) -> None:
     sizes: list[int] = []
     real = views.read_group
 
@@ -273,8 +273,7 @@ def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair,
         return real(given, *how)
 
     monkeypatch.setattr(views, "read_group", watched)
-    for place in ("loading", "executor"):
-        monkeypatch.setattr(f"barpc.pipeline.{place}.GROUP", 2)
+    sized(images_together=2)
     third = placed(tmp_path, "c", pixels_of(5), 7)
     told: list[tuple[str, int, int]] = []
     load_views([*pair, third], progress=lambda *now: told.append(now))
@@ -289,7 +288,7 @@ def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair,
             return super().submit(function, *given)
 
     for group, asked in ((3, 0), (2, 2)):
-        monkeypatch.setattr(views, "GROUP", group)
+        sized(images_together=group)
         with Counting(1) as pool:
             load_views([*pair, third], executor=pool)
         assert pool.asked == asked

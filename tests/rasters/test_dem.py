@@ -327,11 +327,11 @@ def test_that_lines_meet_no_terrain_is_said_where_it_reaches_out_of_the_altitude
         )
 
 
-def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, monkeypatch):
+def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, sized):
     dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
     lon, lat = 5 + STEP * np.array([0.0, 2.5]), 44 - STEP * np.array([0.0, 3.5])  # nodes 0 .. 3 by 0 .. 4
-    monkeypatch.setattr("barpc.rasters.dem._MAX_CELLS", 20)
+    sized(cells_read=20)
     assert np.isfinite(dem(lon, lat)).all()
-    monkeypatch.setattr("barpc.rasters.dem._MAX_CELLS", 19)
+    sized(cells_read=19)
     with pytest.raises(InputError, match="spread over 20 cells"):
         dem(lon, lat)

@@ -53,7 +53,6 @@ def moved_in(path: Path, data: bytes) -> None:
     new.replace(path)
 
 
-NIGHTLY = pytest.mark.nightly
 FAST, SLOW = (in_place, "detect"), ((moved_in, "cameras"), (in_place, "hash"), (in_place, "fit"))
 
 

@@ -338,12 +338,12 @@ def test_a_point_outside_of_all_images_is_on_the_map_too():
     assert drawn.points("point") == [[(0.0, 0.0)]]  # no tie point, and a path all the same
 
 
-def test_of_many_tie_points_and_images_some_are_drawn(monkeypatch):
+def test_of_many_tie_points_and_images_some_are_drawn(sized):
     views, outlines, _ = scene()
     points = [(10.0 + 1e-6 * k, 0.0, 0.0, 0.0) for k in range(1501)]
     assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points))).points("point")[0]) == 751
     assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points[:1500]))).points("point")[0]) == 1500
-    monkeypatch.setattr(maps, "MAX_SHOWN", 2)
+    sized(shown=2)
     drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "2"]
 

@@ -127,11 +127,11 @@ def test_rows_with_few_tie_points_are_placed_by_the_new_camera(check_run, block_
 
 
 @pytest.mark.parametrize("rows", [50, 333])
-def test_tracks_are_intersected_alike_in_parts_of_any_size(block_run, monkeypatch, rows):
+def test_tracks_are_intersected_alike_in_parts_of_any_size(block_run, sized, rows):
     run = block_run.run
     keep = run.keep & (np.arange(len(run.tracks)) % 7 > 0) & (run.tracks.point > 3)
     whole = triangulate_tracks(run.tracks, run.after, run.altitude, keep)
-    monkeypatch.setattr(runs, "_TOGETHER", rows)
+    sized(observations_intersected=rows)
     parts = triangulate_tracks(run.tracks, run.after, run.altitude, keep)
     assert (parts.ok == whole.ok).all()
     assert not parts.ok[:4].any()
@@ -157,12 +157,12 @@ def test_a_track_is_intersected_from_what_counts_and_the_rest_is_measured_agains
         assert np.hypot(*found.residuals[first[0]]) == pytest.approx(50.0, abs=3.0)
 
 
-def test_the_tables_hold_every_so_many_th_track(monkeypatch, block_run):
+def test_the_tables_hold_every_so_many_th_track(sized, block_run):
     run = replace(block_run.run)
     usable = np.flatnonzero(np.isfinite(run.ground).all(axis=1))
     assert runs.MAX_TRACKS == 200_000
     for most, step in ((len(usable), 1), (len(usable) - 1, 2), (len(usable) // 2 - 1, 3)):
-        monkeypatch.setattr(runs, "MAX_TRACKS", most)
+        sized(tracks_in_tables=most)
         assert run.written_tracks.tolist() == usable[::step].tolist()
 
 

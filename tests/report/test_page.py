@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from barpc.base.errors import BarpcError, InputError
 from barpc.cli import cli
 from barpc.pipeline import outputs
-from barpc.report import Run, maps, page, summarize
+from barpc.report import Run, page, summarize
 from barpc.report.ranking import worst_first
 from barpc.report.runfiles import MAX_PICTURES, TABLES, Draped, ObservationTable, RunFiles
 from barpc.report.summary.words import metres
@@ -113,9 +113,8 @@ def test_check_points_answer_how_accurate_it_is_on_the_ground(block_run, tmp_pat
     assert 'class="check_points"' in html
 
 
-def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(maps, "MAX_PICTURES", 4)
-    monkeypatch.setattr(page, "MAX_SHOWN", 5)
+def test_a_page_of_many_images_shows_the_worst_and_says_so(block_run, sized):
+    sized(pictures=4, shown=5)
     html = page.report_html(block_run.record, block_run.folder)
     assert "Of 9 images 4 are shown: those with the largest systematic part." in html
     assert "the first 5 of 9, all in the files beside this page" in html

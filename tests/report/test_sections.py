@@ -79,12 +79,12 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     assert nothing.rows[0][3].text == "-"
 
 
-def test_a_map_needs_an_outline_and_says_where_some_are_left_out(monkeypatch):
+def test_a_map_needs_an_outline_and_says_where_some_are_left_out(sized):
     outlines = [a_square(10.0, 0.0)] * 3
     assert asked("map", pairs=[a_pair()]).charts == []
     ((_, whole),) = asked("map", outlines=outlines).charts
     assert whole.startswith("Footprints at the altitude of the scene")
-    monkeypatch.setattr(page, "MAX_SHOWN", 2)
+    sized(shown=2)
     ((_, some),) = asked("map", outlines=outlines).charts
     assert some == f"{whole} At most 2 of 3 footprints are drawn; all are in footprints.geojson."
 

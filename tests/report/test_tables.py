@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.report import outcome as runs
-from barpc.report import runfiles as modules
 from barpc.report import summarize
 from barpc.report.geopackage import geopackage
 from barpc.report.records import json_form
@@ -104,11 +102,11 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     assert geopackage(map_layers(run, again)) == (block_run.folder / "map.gpkg").read_bytes()
 
 
-def test_tables_are_written_and_read_in_parts_of_any_size(block_run, monkeypatch):
+def test_tables_are_written_and_read_in_parts_of_any_size(block_run, sized):
     rows = 7
     tables, whole = block_run.folder / "tables", read_tables(block_run.record, block_run.folder)
     assert len(whole.tracks) % rows
-    monkeypatch.setattr(modules, "_TOGETHER", rows)
+    sized(rows_together=rows)
     for name, content in TABLES.items():
         assert b"".join(content(block_run.run, block_run.record)) == (tables / name).read_bytes(), name
     again = read_tables(block_run.record, block_run.folder)
@@ -122,8 +120,8 @@ def test_tables_are_written_and_read_in_parts_of_any_size(block_run, monkeypatch
             _parse_points([*text[: 1 + rows], *[""] * lost, *text[1 + rows :]])
 
 
-def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, monkeypatch):
-    monkeypatch.setattr(runs, "MAX_TRACKS", 100)
+def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, sized):
+    sized(tracks_in_tables=100)
     summary = summarize(block_run.run)
     found = summary.tables
     assert not found.complete

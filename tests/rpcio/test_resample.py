@@ -31,8 +31,8 @@ SIZE = (420, 360)  # two blocks each way
 
 
 @pytest.fixture(autouse=True)
-def _small_blocks(monkeypatch):
-    monkeypatch.setattr(grids, "BLOCK_SIZE", 256)
+def _small_blocks(sized):
+    sized(resampled_block=256)
 
 
 def scenery(col, row):
@@ -133,12 +133,12 @@ def test_a_correction_of_whole_pixels_moves_numbers_and_changes_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_blocks_leave_no_seams(tmp_path, monkeypatch):
+def test_blocks_leave_no_seams(tmp_path, sized):
     image = raster(tmp_path / "a.tif", seen(60000.0, "uint16"))
     write_resampled(make_rpc(), grid(), image, tmp_path / "b.tif")
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif")
     assert (tmp_path / "b.tif").read_bytes() == (tmp_path / "c.tif").read_bytes()
-    monkeypatch.setattr(grids, "BLOCK_SIZE", 512)
+    sized(resampled_block=512)
     write_resampled(make_rpc(), grid(), image, tmp_path / "c.tif", overwrite=True)
     assert np.abs(np.subtract(*(pixels(tmp_path / f"{name}.tif").astype(int) for name in "bc"))).max() <= 1
 

@@ -98,7 +98,7 @@ def test_what_is_known_better_counts_more() -> None:
     for sigma, bounds in (((1e-4, 1e-4, 0.1), (4e-4, 0.05)), ((0.3, 0.3, 1e-5), (0.4, 5e-4))):
         miss = []
         for seed in range(5):
-            orbit = _fit_orbit(time, *vectors(time, sigma, seed), 5)
+            orbit = fit_orbit(time, *vectors(time, sigma, seed), (-5.0, 5.0))
             exact = vectors(between)
             miss.append([np.abs(f.T - e).max() for f, e in zip(orbit(between), exact, strict=True)])
         assert (np.median(miss, axis=0) < bounds).all()

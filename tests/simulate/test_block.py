@@ -9,7 +9,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
-from barpc.simulate import BlockOptions, _SiteGrid, _turned, fly, looks, recentred, simulate_block
+from barpc.simulate import BlockOptions, fly, looks, recentred, simulate_block
 
 
 @pytest.fixture(scope="module")
@@ -144,28 +144,34 @@ def test_a_thousand_views_are_simulated():
     ],
 )  # fmt: skip
 def test_sites_stand_on_a_grid_as_square_as_can_be(num_views, per_site, columns, rows):
-    grid = _SiteGrid.square(num_views, BlockOptions(per_site=per_site), 5.0, 43.0)
-    assert (grid.columns, grid.rows) == (columns, rows)
+    lon, lat = sites(num_views, per_site=per_site, lon=5.0, lat=43.0).round(9).T
+    assert (len(np.unique(lon)), len(np.unique(lat))) == (columns, rows)
+
+
+def sites(num_views, **options):
+    """Where the middles of the images lie, a site's first, as (lon, lat): cameras as delivered that are right."""
+    block = simulate_block(num_views, 0, num_checks=0, attitude=0.0, position=0.0, **options)
+    first = block.views[:: options.get("per_site", 3)]
+    middle = [view.sensor.localize((np.array(view.size) - 1.0) / 2.0, np.mean(view.alt_range)) for view in first]
+    return np.array(middle)[:, :2]
 
 
 def test_neighbouring_sites_are_an_image_less_the_overlap_apart():
-    options = BlockOptions(size=(4000, 3000), overlap=0.25, gsd=0.5)
-    grid = _SiteGrid.square(12, options, 5.0, 43.0)
-    metres = metres_per_unit(np.array([5.0, 43.0, 0.0]))[:2]
-    assert np.array(grid.step) * metres == pytest.approx([0.75 * 2000, 0.75 * 1500])
-    lon, lat = grid.lonlat([0, 1, 0.5], [0, 1, 0.5])
-    assert lon == pytest.approx([5.0 - 0.5 * grid.step[0], 5.0 + 0.5 * grid.step[0], 5.0])
-    assert lat == pytest.approx([43.0 + 0.5 * grid.step[1], 43.0 - 0.5 * grid.step[1], 43.0])  # rows run south
-    lon, _ = _SiteGrid(2, 1, 180.0, 0.0, (0.2, 0.1)).lonlat(0, [0, 1])
-    assert lon == pytest.approx([179.9, -179.9])
+    found = sites(12, size=(4000, 3000), overlap=0.25, gsd=0.5, lon=5.0, lat=43.0)
+    step = np.array([0.75 * 2000, 0.75 * 1500]) / metres_per_unit(np.array([5.0, 43.0, 0.0]))[:2]
+    signs = [[-0.5, 0.5], [0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]  # rows run south
+    np.testing.assert_allclose(found, [5.0, 43.0] + step * signs, atol=1e-7)
+    west, east = sites(6, lon=180.0, lat=0.0)[:, 0]
+    assert west == pytest.approx(-east, abs=1e-7)
+    assert 179.0 < west < 180.0
 
 
 def test_a_block_ends_before_the_pole():
-    step = _SiteGrid.square(1, BlockOptions(), 0.0, 84.9).step[1]
-    for lat, sign in ((85.0 - 0.5 * step - 1e-3, 1), (85.0 - 0.5 * step - 1e-3, -1)):
-        assert _SiteGrid.square(1, BlockOptions(), 0.0, sign * lat).rows == 1
+    step = np.ptp(sites(9, per_site=1, lon=0.0, lat=84.0)[:, 1]) / 2.0
+    for lat in (85.0 - 0.5 * step - 1e-3, -85.0 + 0.5 * step + 1e-3):
+        assert len(sites(1, lon=0.0, lat=lat)) == 1
         with pytest.raises(InputError, match="beyond 85"):
-            _SiteGrid.square(1, BlockOptions(), 0.0, sign * (lat + 2e-3))
+            simulate_block(1, 0, lon=0.0, lat=lat + np.copysign(2e-3, lat))
 
 
 @pytest.mark.parametrize("wrong", [{"num_views": 0}, {"num_tracks": -1}, {"num_checks": -1}, {"num_gcps": -1}], ids=str)
@@ -236,20 +242,11 @@ def test_a_block_may_have_no_tracks():
     assert simulate_block(3, 5, num_checks=0).truth.check.num_points == 0
 
 
-def test_a_camera_turned_about_the_earth_s_axis_is_elsewhere_in_longitude_only(block):
-    rpc = block.views[0].sensor
-    turned = _turned(rpc, 178.0)
-    assert turned.ground_offset - rpc.ground_offset == pytest.approx([178.0 - 360.0, 0.0, 0.0])
-    ground = block.truth.ground[:20]
-    np.testing.assert_allclose(turned.project(ground + [178.0, 0.0, 0.0]), rpc.project(ground), atol=1e-6)
-
-
 def test_corrections_turn_about_where_the_satellite_is_in_the_middle_of_the_image():
-    options = BlockOptions(per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
-    block = simulate_block(4, 50, lon=20.0, lat=10.0, per_site=2, size=(3000, 9000), alt_range=(100.0, 300.0))
-    grid = _SiteGrid.square(4, options, 20.0, 10.0)
+    layout = {"lon": 20.0, "lat": 10.0, "per_site": 2, "size": (3000, 9000), "alt_range": (100.0, 300.0)}
+    block, there, options = simulate_block(4, 50, **layout), sites(4, **layout), BlockOptions(size=(3000, 9000))
     for number, correction in enumerate(block.truth.corrections):
-        lon, lat = grid.lonlat(*divmod(number // 2, grid.columns))
+        lon, lat = there[number // 2]
         flown = fly(np.array([lon, lat, 200.0]), looks(2)[number % 2], options.size, options.gsd)
         assert np.linalg.norm(correction.center - flown.position(4499.5)) < 1.0
     low, high = block.views[0].alt_range

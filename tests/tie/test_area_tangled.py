@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.tie.pairing import area
 from barpc.tie.pairing.area import read_area
 
 
@@ -27,17 +26,17 @@ def test_an_outline_that_crosses_itself_is_two_areas(tmp_path):
     assert bow.contains(inside).tolist() == [True, True, False, False]
 
 
-def test_an_outline_is_untangled_of_as_many_crossings_as_allowed_and_no_more(tmp_path, monkeypatch):
+def test_an_outline_is_untangled_of_as_many_crossings_as_allowed_and_no_more(tmp_path, sized):
     star = np.array([[np.sin(k * 0.8 * np.pi), np.cos(k * 0.8 * np.pi)] for k in range(5)])  # five crossings
-    monkeypatch.setattr(area, "_MOST_CROSSED", 5)
+    sized(sides_crossed=5)
     read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(area, "_MOST_CROSSED", 4)
+    sized(sides_crossed=4)
     with pytest.raises(InputError, match="an outline crosses itself more than 4 times"):
         read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(area, "_TOGETHER", 1)  # found from both sides of a side, whatever is looked at together
+    sized(sides_together=1)  # found from both sides of a side, whatever is looked at together
     with pytest.raises(InputError, match="more than 4 times"):
         read_area(an_area(tmp_path, star))
-    monkeypatch.setattr(area, "_MOST_CROSSED", 0)
+    sized(sides_crossed=0)
     read_area(an_area(tmp_path, np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])))
 
 

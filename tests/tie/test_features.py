@@ -17,7 +17,7 @@ from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octa
 from barpc.tie.pixels import survey, tiles
 from barpc.tie.tasks import Work, store_of
 from barpc.workspace import Workspace
-from tests.constants import chosen
+from tests.constants import Sized, chosen
 from tests.tie.stages import detect
 
 from .conftest import write_image
@@ -66,9 +66,9 @@ def test_no_cell_holds_more_than_its_quota_and_the_strongest_stay(tmp_path, text
     assert quota(np.zeros((10, 2)), response, 64, 3).tolist() == [7, 8, 9]
 
 
-def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture, monkeypatch) -> None:
+def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture, sized: Sized) -> None:
     path = write_image(tmp_path / "a.tif", texture)
-    monkeypatch.setattr(features, "PER_IMAGE", 300)
+    sized(keypoints_per_image=300)
     found = detect([view(path)])[0]
     assert 150 <= len(found) <= 300
     counts = np.unique(np.floor((found.xy + 0.5) / 64).astype(int), axis=0, return_counts=True)[1]
@@ -188,14 +188,14 @@ def test_keypoints_are_kept_for_a_later_pass_with_another_camera_or_threshold(tm
     ],
 )  # fmt: skip
 def test_an_image_is_looked_at_as_closely_as_the_keypoints_wanted_ask_for(
-    keypoints, points, tile, zoom, monkeypatch
+    keypoints, points, tile, zoom, sized: Sized
 ) -> None:
-    monkeypatch.setattr(features, "PER_IMAGE", keypoints)
+    sized(keypoints_per_image=keypoints)
     options = TieOptions(points_per_image=points, tile=tile)
     share = KeypointDensity.of((4000, 4000), options)
     assert share.zoom == zoom
     assert share.density == keypoints / 16e6
-    monkeypatch.setattr(features, "PER_IMAGE", 10 * keypoints)
+    sized(keypoints_per_image=10 * keypoints)
     assert KeypointDensity.of((4000, 40_000), options).zoom in (zoom, 1, 2)
 
 

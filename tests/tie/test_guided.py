@@ -13,7 +13,7 @@ from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _pairs_in_band
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
-from tests.constants import chosen
+from tests.constants import Sized, chosen
 from tests.tie.conftest import write_image
 
 ACROSS = 4.0
@@ -276,10 +276,10 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     )
 
 
-def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, monkeypatch) -> None:
+def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, sized: Sized) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    monkeypatch.setattr("barpc.tie.matchers.guided._PAIRS", 7)
+    sized(candidates_together=7)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

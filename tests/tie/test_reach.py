@@ -24,8 +24,8 @@ from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
 from barpc.tie.matchers.matching import _PairSearch, match_pair
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair, reach_of
-from barpc.tie.patches import oriented
 from barpc.tie.patches.oriented import PatchTile
+from tests.constants import Sized
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
@@ -153,7 +153,7 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
 
 
 @pytest.mark.slow
-def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) -> None:
+def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, sized: Sized, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
     search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
@@ -168,8 +168,8 @@ def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, scene) 
         return found
 
     monkeypatch.setattr(PatchTile, "surfaces", watched)
-    monkeypatch.setattr(structural, "PIECE", 30_000)
-    monkeypatch.setattr(oriented, "PIECE", 20_000)
+    sized(places_together=30_000)
+    sized(windows_together=20_000)
     parts = structural._GridSearch(*scene.views, 1, coarse).matches()
     assert len(sizes) >= 8
     assert max(sizes) <= 60_000

@@ -12,6 +12,7 @@ from scipy import ndimage
 from barpc.tie.patches import register
 from barpc.tie.patches.register import _Template, _upsampled, _with_derivatives, register_patches, register_places
 from barpc.tie.pixels import PixelReader
+from tests.constants import Sized
 from tests.lanes import diagonal
 from tests.tie.conftest import write_image
 
@@ -226,10 +227,10 @@ def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> Non
     np.testing.assert_array_equal(*results)
 
 
-def test_what_has_not_settled_is_not_ok(texture, reference, monkeypatch) -> None:
+def test_what_has_not_settled_is_not_ok(texture, reference, sized: Sized) -> None:
     """After one step from half a pixel away the last step is far longer than one that settles."""
     assert run(texture, texture, reference, reference + 0.5, np.eye(2)).ok.all()
-    monkeypatch.setattr("barpc.tie.patches.register.NEWTON_STEPS", 1)
+    sized(newton_steps=1)
     assert not run(texture, texture, reference, reference + 0.5, np.eye(2)).ok.any()
     assert run(texture, texture, reference, reference + 0.001, np.eye(2)).ok.all()
 

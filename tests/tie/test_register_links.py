@@ -24,6 +24,7 @@ from barpc.tie.patches.register import (
     references,
     register_places,
 )
+from tests.constants import Sized
 from tests.tie.conftest import write_image
 from tests.tie.test_pairs import camera, views
 from tests.tie.test_tracks import tracks_of
@@ -206,7 +207,7 @@ def test_places_far_apart_are_found_as_in_one_window(tmp_path, monkeypatch, inte
     np.testing.assert_allclose(apart.xy[apart.ok], (reference + [-2, 3])[apart.ok], atol=0.01)
 
 
-def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
+def test_patches_are_registered_tile_by_tile(monkeypatch, sized: Sized) -> None:
     links, seen = links_of(80, 3), []
 
     def ordered(function: Any, tasks: Any, name: str) -> list[PatchRegistration]:
@@ -214,7 +215,7 @@ def test_patches_are_registered_tile_by_tile(monkeypatch) -> None:
         return [PatchRegistration.none(task[3]) for task in tasks]
 
     monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
-    monkeypatch.setattr("barpc.tie.patches.register.CHUNK", 1)
+    sized(patches_together=1)
     found = links.register(1, 256, SimpleNamespace(ordered=ordered))
     assert len(found.xy) == 160
     for _, band, origin, start, linear, structural in seen:

@@ -25,6 +25,7 @@ from barpc.tie.patches.register import _usual
 from barpc.tie.pixels import Survey, read_picture, survey, tiles
 from barpc.tie.tasks import Store, Work
 from barpc.workspace import Workspace
+from tests.constants import Sized
 from tests.lanes import diagonal, rest_slow
 from tests.tie.stages import detect
 
@@ -69,11 +70,11 @@ def left(xy: np.ndarray) -> float:
     ],
 )
 def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_hold(
-    pair, monkeypatch, most: int, zoom: int
+    pair, monkeypatch, sized: Sized, most: int, zoom: int
 ) -> None:
     """16 to 0.6 keypoints a cell of 64 px, as images of 2,000 to 13,000 px a side have; each looked at in its way."""
     monkeypatch.setattr(features, "_ZOOMS", ((np.inf, zoom),))
-    monkeypatch.setattr(features, "PER_IMAGE", most)
+    sized(keypoints_per_image=most)
     options = TieOptions(tile=128)
     for found in detect(pair, options):
         assert 0.9 * most <= len(found) <= most
@@ -84,9 +85,9 @@ def test_the_quiet_half_of_a_scene_has_its_share_however_few_keypoints_it_may_ho
 
 
 @pytest.mark.parametrize(("side", "zoom"), [(1000, 1), (3000, 1), (4000, 2), (13_000, 2), (15_000, 4), (40_000, 4)])
-def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int, monkeypatch) -> None:
+def test_larger_images_are_looked_at_in_less_detail(side: int, zoom: int, sized: Sized) -> None:
     assert KeypointDensity.of((side, side), TieOptions()).zoom == zoom
-    monkeypatch.setattr(features, "PER_IMAGE", 10**7)
+    sized(keypoints_per_image=10**7)
     assert KeypointDensity.of((side, side), TieOptions(points_per_image=10**6)).zoom <= zoom
 
 
@@ -123,9 +124,9 @@ def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
     assert inside == [False] * 4  # to match, and to count what there was to see
 
 
-def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, monkeypatch) -> None:
+def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, sized: Sized) -> None:
     store = Store(str(tmp_path), str(tmp_path))
-    monkeypatch.setattr(features, "PER_IMAGE", 900)
+    sized(keypoints_per_image=900)
     files = locate(pair[:1], TieOptions(tile=256), Work(store=store))[0]
     assert 890 < len(files) <= 900
     every, numbers = files.load()
@@ -159,8 +160,10 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
 
 
 @pytest.mark.slow
-def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(pair, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(features, "PER_IMAGE", 300)
+def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(
+    pair, tmp_path, monkeypatch, sized: Sized
+) -> None:
+    sized(keypoints_per_image=300)
     options, keys = TieOptions(tile=256), []
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
