@@ -7,7 +7,8 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 from unittest import mock
 
-from barpc.base.options import AdjustOptions, FitOptions, Options, TieOptions
+from barpc.base.declarations import Options
+from barpc.base.options import AdjustOptions, FitOptions, TieOptions
 
 Record = TypeVar("Record", bound=Options)
 

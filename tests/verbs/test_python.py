@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ import rasterio
 from rasterio.io import MemoryFile
 
 import barpc
+from barpc.base.declarations import Options
 from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
-from barpc.base.options import Options
 from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
 from barpc.verbs.images import camera_of, every
@@ -302,16 +301,6 @@ def test_two_processes_write_what_one_does(tmp_path):
         barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)
     one, two = ((tmp_path / name / "matches.csv").read_bytes() for name in "12")
     assert one == two
-
-
-def test_an_rpc_is_compared_with_another_or_with_those_of_a_folder(tmp_path):
-    rpc = barpc.read_rpc(VIEWS[0])
-    moved = replace(rpc, image_offset=rpc.image_offset + [3.0, 4.0])
-    barpc.write_rpc(moved, tmp_path / f"{VIEWS[0].stem}_RPC.TXT")
-    for against in (tmp_path, tmp_path / f"{VIEWS[0].stem}_RPC.TXT"):
-        (found,) = barpc.check(VIEWS[0], against=against)
-        assert (found.image, Path(found.against).parent) == (str(VIEWS[0]), tmp_path)
-        assert found.max_px == pytest.approx(5.0, abs=1e-6)
 
 
 def test_a_fit_tells_its_progress(tmp_path):
