@@ -14,6 +14,7 @@ import click
 import numpy as np
 import pytest
 import rasterio
+from click.testing import CliRunner
 from rasterio.io import MemoryFile
 
 import barpc
@@ -51,6 +52,38 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
         for flag in command.params:
             name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
             assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)
+
+
+@pytest.mark.parametrize(
+    ("verb", "given", "keyword", "wrong"),
+    [
+        ("export", ("run", "out", "s2p"), "alt", (1.0,)),
+        ("export", ("run", "out", "s2p"), "alt_range", (1.0, 2.0)),
+        ("verify", ("run",), "expect", "12"),
+        ("verify", ("run",), "expect", "g" * 64),
+        ("calibrate", (["a", "b", "c"], "s.cal"), "overwrite", "yes"),
+        ("calibrate", (["a", "b", "c"], "s.cal"), "sensor", 3),
+        ("info", (VIEWS[0],), "at", (5.4, 43.3)),
+        ("info", (VIEWS[0],), "alt", float("nan")),
+    ],
+)
+def test_what_a_verb_cannot_take_is_refused_by_the_names_of_both(verb, given, keyword, wrong):
+    with pytest.raises(InputError, match=rf"^{verb}: .*{keyword}\b") as caught:
+        public(verb)(*given, **{keyword: wrong})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [
+        ("--alt", ("export", "r", "o", "--to", "s2p", "--alt", "1", "x")),
+        ("--at", ("info", str(VIEWS[0]), "--at", "5.4", "43.3", "nan")),
+    ],
+)
+def test_a_flag_that_holds_no_number_is_wrong_usage(flag, words):
+    found = CliRunner().invoke(cli, words)
+    assert found.exit_code == 2
+    assert f"'{flag}'" in found.output
 
 
 def test_folders_that_are_verbs_are_both():
