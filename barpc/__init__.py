@@ -33,7 +33,8 @@ _PUBLIC_MODULES = {
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
     "barpc.fit": "fit_rpc fit_rpc_points",
-    "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions DsmOptions",
+    "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
+    "barpc.base.verb_options": "DsmOptions",
     "barpc.base.errors": "BarpcError BarpcWarning",
 }
 _PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
@@ -45,10 +46,10 @@ if TYPE_CHECKING:
     from barpc.base.errors import BarpcError as BarpcError
     from barpc.base.errors import BarpcWarning as BarpcWarning
     from barpc.base.options import AdjustOptions as AdjustOptions
-    from barpc.base.options import DsmOptions as DsmOptions
     from barpc.base.options import FitOptions as FitOptions
     from barpc.base.options import RunOptions as RunOptions
     from barpc.base.options import TieOptions as TieOptions
+    from barpc.base.verb_options import DsmOptions as DsmOptions
     from barpc.cameras import open_camera as open_camera
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points

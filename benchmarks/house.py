@@ -221,7 +221,8 @@ def surface() -> tuple[int, int]:
     """Flags over all verbs, and fields of options."""
     import click
 
-    from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions, declared
+    from barpc.base.declarations import declared
+    from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
     from barpc.cli import COMMANDS, Verbs
 
     verbs = Verbs()

@@ -491,7 +491,8 @@ def solve(scene: Scene, options: AdjustOptions | None = None) -> tuple[tuple[Sen
 def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
     """Refitted cameras and the summary of the whole command, tie points given; options as in a TOML file."""
     import barpc
-    from barpc.base.options import RunOptions, with_values
+    from barpc.base.declarations import with_values
+    from barpc.base.options import RunOptions
     from barpc.pointio.matches import write_matches
     from barpc.rpcio import write_rpc
 

@@ -48,8 +48,9 @@ import rasterio  # noqa: E402
 
 import barpc  # noqa: E402
 from barpc.ba import adjust_tracks  # noqa: E402
+from barpc.base.declarations import with_values  # noqa: E402
 from barpc.base.errors import BarpcError  # noqa: E402
-from barpc.base.options import AdjustOptions, RunOptions, with_values  # noqa: E402
+from barpc.base.options import AdjustOptions, RunOptions  # noqa: E402
 from barpc.pointio.matches import write_matches  # noqa: E402
 from barpc.rpcio import write_rpc  # noqa: E402
 from barpc.scene import BoolArray  # noqa: E402

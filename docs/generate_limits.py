@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 from barpc import scene
-from barpc.base import frozen, geodesy, options, safe_io
+from barpc.base import declarations, frozen, geodesy, options, safe_io
 from barpc.base.remote import _CACHE_BYTES as HELD
 from barpc.base.remote import _MAX_REQUEST_BYTES as REQUEST
 from barpc.base.remote import REQUEST_BYTES, hosts
@@ -109,8 +109,8 @@ def rows() -> list[tuple[str, str]]:
         ),
         (
             "numbers of options",
-            f"{many(1 / options._REAL)} to {many(options._REAL)}, and 0; "
-            f"whole ones below {many(options._MAX_EXACT_INTEGER)}",
+            f"{many(1 / declarations._REAL)} to {many(declarations._REAL)}, and 0; "
+            f"whole ones below {many(declarations._MAX_EXACT_INTEGER)}",
         ),
         ("numbers of metadata of a camera", many(geodesy.MAX_COORDINATE)),
         (

@@ -14,7 +14,8 @@ from typing import Any, get_args, get_origin
 
 import click
 
-from barpc.base.options import AdjustOptions, FitOptions, Options, Rule, RunOptions, TieOptions, declared
+from barpc.base.declarations import Options, Rule, declared
+from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import COMMANDS, cli
 from barpc.cli.flags import ADJUSTMENT, REMOTE, RUN, TIE, field_of, flag_name
 
@@ -25,7 +26,7 @@ TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": Fit
 
 HEAD = """# Options
 
-<!-- Written by docs/generate_options.py. Edit barpc/base/options.py and the verbs' help texts, then run it again. -->
+<!-- Written by docs/generate_options.py. Edit barpc/base/options.py, verb_options.py and the verbs' help texts, then run it again. -->
 
 Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong
 type or a value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
@@ -38,8 +39,8 @@ rpc_formats = ["txt", "geom"]
 points_per_image = 8000
 ```
 
-From Python the same, with the records named in the headings (`barpc.base.options.schema()`: the JSON schema of such a
-file):
+From Python the same, with the records named in the headings (`barpc.base.declarations.schema(barpc.RunOptions)`: the JSON
+schema of such a file):
 
 ```python
 import barpc

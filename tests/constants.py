@@ -9,7 +9,8 @@ from unittest import mock
 
 import pytest
 
-from barpc.base.options import AdjustOptions, FitOptions, Options, TieOptions
+from barpc.base.declarations import Options
+from barpc.base.options import AdjustOptions, FitOptions, TieOptions
 
 Record = TypeVar("Record", bound=Options)
 

@@ -66,23 +66,17 @@ def match(**flags: Any) -> int:
 
 @click.command("check", cls=Grouped)
 @_images_argument
-@click.option("--against", metavar="PATH", help="Compare with this RPC (one image), or those of this folder.")
 @with_flags(*TIE)
 def check(**flags: Any) -> int:
     r"""Measure how well the cameras of overlapping images agree, without adjusting or writing anything.
 
-    With --against, no tie points are matched: each image's RPC is compared with another one over the image and
-    its altitudes; exit 3 where one differs by more than a millionth of a pixel.
-
     \b
-    Examples:
+    Example:
       barpc check adjusted/*.vrt
-      barpc check adjusted/*.vrt --against delivered/
     """
     from barpc.verbs import runs
 
-    against = flags.pop("against")
-    return _run_pipeline(runs.check, flags) if against is None else _compare(flags, against)
+    return _run_pipeline(runs.check, flags)
 
 
 def _run_pipeline(work: Callable[..., AdjustResult], flags: dict[str, Any]) -> int:
@@ -104,13 +98,3 @@ def _tell_result(result: AdjustResult) -> int:
     said = output_width() is not None and not (wants_json() or is_quiet())
     reasons = [] if said else list(result.record.reasons)
     return tell_gate("" if is_quiet() and reasons else result.record.headline, reasons)
-
-
-def _compare(flags: dict[str, Any], against: str) -> int:
-    from barpc.pipeline.verify_outputs import READING_TOLERANCE
-    from barpc.verbs.runs import check
-
-    found = check(image_paths(flags["images"], flags["image_list"]), against=against)
-    tell([row._asdict() for row in found], *("{}  {}  max {:.3g} px".format(*row) for row in found))
-    off = [f"{row.image}: {row.max_px:.3g} px." for row in found if not row.max_px <= READING_TOLERANCE]
-    return tell_gate(f"{len(off)} of {len(found)} RPCs differ.", off) if off else 0

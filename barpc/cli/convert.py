@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from barpc.base.options import ConvertOptions
+from barpc.base.verb_options import ConvertOptions
 from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import at_work, remark, tell, tell_gate, wants_json
 from barpc.pipeline.verify_outputs import Reading

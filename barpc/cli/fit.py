@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.base.options import RefitOptions, declared
+from barpc.base.declarations import declared
+from barpc.base.verb_options import RefitOptions
 from barpc.cli.flags import flag, flags_of, given_flags, paper, run_options
 from barpc.cli.terminal import at_work, tell, tell_gate, wants_json
 

@@ -12,8 +12,9 @@ from typing import Any, TypeVar, get_args, get_origin
 
 import click
 
+from barpc.base.declarations import Declared, Options, checked, declared, with_values
 from barpc.base.errors import InputError
-from barpc.base.options import PAPER, Declared, Options, RunOptions, checked, declared, read_options, with_values
+from barpc.base.options import PAPER, RunOptions, read_options
 from barpc.base.remote import is_url
 from barpc.base.safe_io import read_names
 from barpc.cli.terminal import echo
@@ -57,7 +58,7 @@ def field_of(target: str) -> Declared:
 
 
 _LISTED_FLAGS = {
-    "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs", "--against",
+    "--out-dir", "--overwrite", "--keep-going", "--images", "--image-list", "--options", "--jobs",
     "--help", "--help-all", "--matches", "--aoi", "--gcp", "--check-points", "--dem", "--geoid", "--reference",
 }  # fmt: skip
 """Flags that `--help` lists; `--help-all` has the rest."""
@@ -171,7 +172,7 @@ def _help(one: Declared, several: bool) -> str:
     """Return the help of a flag: the words of its field, unit and bounds, and the default."""
     rule, numbers = one.rule, {int, float} & {one.kind, *get_args(one.kind)}
     default = ",".join(one.default) if isinstance(one.default, tuple) else one.default
-    notes = [rule.unit] if rule.metavar and numbers else []  # else it stands for the value
+    notes = [rule.unit] if rule.metavar and rule.unit and numbers else []  # else it stands for the value
     notes += [f"default: {default}"] if default not in (None, "") else []
     notes += [bounds.strip()] if numbers and (bounds := replace(rule, unit="").bounds()) else []
     how = " Names of 'barpc convert --help', commas between." if rule.rows else " (repeatable)"

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from barpc.base.options import HeightOptions
+from barpc.base.verb_options import InfoOptions
 from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import echo, wants_json
 from barpc.verbs.describe import described, outlines_geojson
@@ -18,10 +18,7 @@ from barpc.verbs.points import terrain_of
 
 @click.command("info")
 @click.argument("images", nargs=-1, metavar="IMAGE...")
-@click.option(
-    "--at", type=(float, float, float), help="Ground point of the angles: LON LAT ALT.  [default: the centre]"
-)
-@flags_of(HeightOptions)
+@flags_of(InfoOptions)
 @click.option("--footprint", "outlines", is_flag=True, help="Print outlines on the ground as GeoJSON instead.")
 def info(images: tuple[str, ...], at: tuple[float, float, float] | None, outlines: bool, **flags: Any) -> int:
     r"""Print the source of a camera, its coverage and view angles; of several, each pair's angle.

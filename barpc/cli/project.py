@@ -15,8 +15,8 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
-from barpc.base.options import HeightOptions
 from barpc.base.safe_io import TABLE, opened_text
+from barpc.base.verb_options import HeightOptions
 from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.verbs import points as verbs

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from barpc.base.options import DsmOptions, OrthoOptions
+from barpc.base.verb_options import CalibrateOptions, DsmOptions, ExportOptions, OrthoOptions, VerifyOptions
 from barpc.cli.flags import flags_of, given_flags, jobs_option
 from barpc.cli.terminal import at_work, echo, print_comparison, remark, tell, tell_gate, wants_json
 
@@ -53,14 +53,8 @@ def report(run_dir: str, other: str | None) -> int:
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("out_dir", metavar="OUT_DIR")
 @click.option("--to", "target", type=click.Choice(_TARGET_NAMES), required=True, help="The tool.")
-@click.option(
-    "--alt",
-    type=(float, float),
-    metavar="LOW HIGH",
-    help="Altitudes of the scene [m above the ellipsoid].  [default: of its tie points, and a margin]",
-)
-@click.option("--overwrite", is_flag=True, help="Replace what an earlier export wrote.")
-def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | None, overwrite: bool) -> int:
+@flags_of(ExportOptions)
+def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
     satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
@@ -75,7 +69,7 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
     """
     from barpc.verbs import runs
 
-    paths = runs.export(run_dir, out_dir, target, alt=alt, overwrite=overwrite)
+    paths = runs.export(run_dir, out_dir, target, **given_flags(flags))
     tell([str(path) for path in paths], *paths)
     if not wants_json() and target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
         remark("the images are not copied: move them together with both folders, or adjust with --images copy")
@@ -85,8 +79,8 @@ def export(run_dir: str, out_dir: str, target: str, alt: tuple[float, float] | N
 @click.command("verify")
 @click.argument("run_dir", metavar="RUN_DIR")
 @click.argument("places", nargs=-1, metavar="[FOLDER...]")
-@click.option("--expect", metavar="ROOT", help="The root that was printed, or a later one.")
-def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
+@flags_of(VerifyOptions)
+def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     r"""List changed, missing and added files of a run or export, and check that cameras read as certified.
 
     SHA256SUMS lists all (but .barpc), also for `sha256sum -c`; its own SHA-256 is the root. Only --expect detects
@@ -103,16 +97,14 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
     from barpc.verbs import runs
 
     with at_work() as progress:
-        found = runs.verify(run_dir, places, expect=expect, progress=progress)
+        found = runs.verify(run_dir, places, progress=progress, **given_flags(flags))
     wrong, counts = [one for one in found if not one.passed], Counter((one.kind, one.now) for one in found)
     changed = (
         f"{one.kind} {one.file}: {one.now}{one.note and f', {one.note}'}"
         for one in found
         if one.now != SAME or one.kind == "root"
     )
-    kinds = {
-        kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in ("input", "output", "camera")
-    }
+    kinds = {kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in _VERIFIED}
     tell(list(map(asdict, found)), *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
     if not wrong:
         return 0
@@ -122,9 +114,8 @@ def verify(run_dir: str, places: tuple[str, ...], expect: str | None) -> int:
 @click.command("calibrate")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...")
 @click.option("-o", "--out", required=True, metavar="FILE", help="The calibration to write: SENSOR.cal.")
-@click.option("--sensor", metavar="NAME", help="Its name, where images state none, or several.")
-@click.option("--overwrite", is_flag=True, help="Replace the file if it exists.")
-def calibrate(runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bool) -> int:
+@flags_of(CalibrateOptions)
+def calibrate(runs: tuple[str, ...], out: str, **flags: Any) -> int:
     r"""Estimate the interior distortion and detector steps of one sensor from finished runs.
 
     `barpc adjust --calibration FILE` corrects for it. Exit code 1, and nothing written, where it changes with time,
@@ -137,7 +128,7 @@ def calibrate(runs: tuple[str, ...], out: str, sensor: str | None, overwrite: bo
     from barpc.pipeline.calibrate import calibrate as learn
 
     with at_work() as progress:
-        found = learn(runs, out, sensor, overwrite=overwrite, progress=progress)
+        found = learn(runs, out, progress=progress, **given_flags(flags))
     sizes, better = (*found["size_px"], *found["sigma_px"]), sum(run["gain"] > 0 for run in found["runs"])
     words = (
         "{}: {:.3f} px across and {:.3f} px along the flight, standard deviations {:.4f} and {:.4f} px; {} steps; of "

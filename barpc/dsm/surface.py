@@ -32,8 +32,8 @@ from barpc.base.atomic import refuse_existing, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Shown
 from barpc.base.geodesy import Array
-from barpc.base.options import DsmOptions
 from barpc.base.safe_io import plain_path
+from barpc.base.verb_options import DsmOptions
 from barpc.cameras import open_camera
 from barpc.dsm.stereo import (
     F32,

@@ -17,12 +17,14 @@ from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_s
 from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
 from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
+from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, RpcError, listed, plain
 from barpc.base.geodesy import Array, ground_from_ecef, metres_per_unit
 from barpc.base.identity import fingerprint
 from barpc.base.remote import is_url
 from barpc.base.safe_io import CALIBRATION, read_json
 from barpc.base.statistics import SURE
+from barpc.base.verb_options import CalibrateOptions
 from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
 from barpc.report import Run
 from barpc.report.runfiles import read_summary, read_tables, table_path
@@ -58,10 +60,9 @@ class _FinishedRun:
 def calibrate(
     runs: Sequence[str | Path],
     out: str | Path,
-    sensor: str | None = None,
     *,
-    overwrite: bool = False,
     progress: Progress | None = None,
+    **keywords: Any,
 ) -> dict[str, Any]:
     """Estimate the interior distortion of one sensor from finished runs, for `adjust` to apply.
 
@@ -69,10 +70,8 @@ def calibrate(
     ----------
     runs : sequence of path, three finished runs or more, whose images still are where they were
     out : path, the file to write (JSON)
-    sensor : str, optional
-        Its name. Images that state another one are excluded; without, all images must state the same.
-    overwrite : bool, replace the file
     progress : callable, optional, `progress(stage, done, total)`
+    **keywords : fields of `CalibrateOptions`: sensor, overwrite
 
     Returns
     -------
@@ -90,15 +89,15 @@ def calibrate(
     Traceback (most recent call last):
     barpc.base.errors.InputError: 2 runs given: at least 3 finished runs are needed, to hold some out
     """
-    out = Path(out)
-    refuse_existing(out, overwrite)
+    out, chosen = Path(out), with_values(CalibrateOptions(), keywords, "calibrate")
+    refuse_existing(out, chosen.overwrite)
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
     opened, tell = list[_OpenedRun](), progress or (lambda *_: None)
     for number, folder in enumerate(runs, start=1):
         opened.append(_images_of(Path(folder)))
         tell("open", number, len(runs))
-    name, found = _one_sensor([stated for *_, stated in opened], sensor), list[_FinishedRun]()
+    name, found = _one_sensor([stated for *_, stated in opened], chosen.sensor), list[_FinishedRun]()
     for folder, run in zip(runs, opened, strict=True):
         found.append(_finished_run(Path(folder), *run, name))
         tell("read", len(found), len(opened))
@@ -108,7 +107,7 @@ def calibrate(
     found, roots = [found[i] for i in order], [roots[i] for i in order]
     _refuse_unsure(name, learnt := learn([one.ties for one in found]), found)
     content = _content(name, learnt, found, roots)
-    write_text(out, json.dumps(content, indent=1) + "\n", overwrite=overwrite)
+    write_text(out, json.dumps(content, indent=1) + "\n", overwrite=chosen.overwrite)
     return content
 
 

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
+from barpc.base.declarations import declared
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, fingerprint
-from barpc.base.options import RunOptions, declared
+from barpc.base.options import RunOptions
 from barpc.base.remote import here, located, location
 from barpc.base.safe_io import IMAGE, read_names, versioned
 from barpc.base.statistics import robust_spread

@@ -103,20 +103,18 @@ def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dic
     }
 
 
-def _rpc_difference(
-    folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]
-) -> tuple[float | None, float | None]:
+def _rpc_difference(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> list[float | None]:
+    """Return the largest distance between both RPCs [px], and that without their mean shift; None: not known."""
     first, second = map(written_rpc, folders, views)
     if first is None or second is None:
-        return None, None
+        return [None, None]
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
         ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (COVERAGE_CELLS, COVERAGE_CELLS)))
-        difference = second.project(ground) - first.project(ground)
-    difference = difference[np.isfinite(difference).all(axis=1)]
-    if not len(difference):
-        return None, None
-    whole, relative = (float(np.hypot(*one.T).max()) for one in (difference, difference - difference.mean(axis=0)))
-    return whole, relative
+        apart = second.project(ground) - first.project(ground)
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    if not len(apart):
+        return [None, None]
+    return [float(np.hypot(*one.T).max()) for one in (apart, apart - apart.mean(axis=0))]
 
 
 def _scene_motion(

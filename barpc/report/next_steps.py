@@ -38,16 +38,7 @@ _REPORT_PARTS = {
 
 
 def next_steps(summary: Summary) -> tuple[StepEntry, ...]:
-    """Return the next steps of a run, at most one of each kind: use, improve, review.
-
-    Parameters
-    ----------
-    summary : Summary, of a run with its verdict
-
-    Returns
-    -------
-    steps : tuple of StepEntry, empty where nothing was written, nothing would help and nothing needs review
-    """
+    """Return the next steps of a run with its verdict, at most one of each kind: use, improve, review."""
     use = {"adjust": _hand_over, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
     return (*use(summary), *_improve(summary), *_review(summary))
 

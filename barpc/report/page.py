@@ -55,10 +55,7 @@ def can_render() -> bool:
 def report_html(summary: Summary, folder: Path | str) -> str:
     """Return the page of a run from its summary and the tables of its folder; the same files give the same text.
 
-    Raises
-    ------
-    InputError
-        A table is missing or damaged.
+    InputError where a table is missing or damaged.
     """
     files = read_tables(summary, Path(folder))
     shown = [section for make in SECTIONS if (section := make(files)) is not None]

@@ -280,11 +280,7 @@ def read_summary(folder: Path) -> Summary:
     """Read the summary.json of a run folder.
 
     Schema 2 is read under its new names, with a warning; keys of no record are named in one, and passed over.
-
-    Raises
-    ------
-    InputError
-        There is none, it does not parse, or another release's schema.
+    InputError where there is none, it does not parse, or has another release's schema.
     """
     path = folder / "summary.json"
     if not path.exists():
@@ -323,13 +319,7 @@ def _unknown_keys(found: Any, read: Any, place: str = "") -> Iterator[str]:
 
 
 def read_tables(summary: Summary, folder: Path) -> RunFiles:
-    """Read the tables of a run folder for a given summary.
-
-    Raises
-    ------
-    InputError
-        A table is missing or damaged; the message names it.
-    """
+    """Read the tables of a run folder for a given summary. InputError names a table that is missing or damaged."""
     names = [view.name for view in summary.views]
     outlines = _parsed(place := table_path(folder, "footprints.geojson"), read_text(place, GEOJSON), _parse_outlines)
     if len(outlines) != len(names):

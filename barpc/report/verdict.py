@@ -38,7 +38,7 @@ from barpc.report.ranking import flagged
 from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
 from barpc.report.summary.block import AXES, explanations, held_out_places, left_entries
-from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.views import ViewEntry, measure_views
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
@@ -57,15 +57,13 @@ _ALL_WELL = {
 
 def summarize(run: Run) -> Summary:
     """Return the summary of a run with the verdict on it; numbers that are not finite are None."""
-    found = measure_run(run)
-    views = tuple(replace(view, **view_status(view, run)) for view in found.views)  # type: ignore[arg-type]
-    verdict = block_verdict(run, views)
-    summary = Summary.read(json_form(replace(found, views=views, passed=verdict["status"] == "good", **verdict)))
+    views = tuple(replace(view, **view_status(view, run)) for view in measure_views(run))  # type: ignore[arg-type]
+    summary = Summary.read(json_form(measure_run(run, views, block_verdict(run, views))))
     return replace(summary, next=next_steps(summary))
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
-    """Return the verdict on the run: `status`, `headline`, `verdict` (sentences), and `reasons`, its reservations.
+    """Return the verdict: `status`, `passed`, `headline`, `verdict` (sentences), and `reasons`, its reservations.
 
     The one rule of what passes: `status` is "good" when no image, no control point and no file has a reservation;
     "bad" when an image was not adjusted or a file left out; else "look". All but "good" end with exit code 3.
@@ -81,6 +79,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     more = "the block needs" if whole else "ground points need" * bool(points)
     return {
         "status": "bad" if num_bad else "look" if reasons else "good",
+        "passed": not (num_bad or reasons),
         "headline": _headline(run, len(views), num_bad, len(look), more),
         "verdict": [*words(run, views), *reasons],
         "reasons": reasons,

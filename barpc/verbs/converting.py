@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import shapely
 
+from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
-from barpc.base.options import ConvertOptions, with_values
 from barpc.base.safe_io import plain_path
+from barpc.base.verb_options import ConvertOptions
 from barpc.cameras import open_camera
 from barpc.fit import FitOptions
 from barpc.fit.points import Sample, widened
@@ -106,7 +107,7 @@ def convert(
     target : path, optional, the file for one image: its name chooses the format (`barpc convert --help`)
     out_dir : path, optional, in place of it: a new folder for images with their RPCs, each opened as its readers do
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `barpc.base.options.ConvertOptions`: rpc, images, rpc_format, move, transform, window, bbox,
+    **keywords : fields of `ConvertOptions`: rpc, images, rpc_format, move, transform, window, bbox,
         aoi, alt, dem, geoid, overwrite
 
     Returns

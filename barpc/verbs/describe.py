@@ -7,33 +7,29 @@ from typing import Any
 
 import numpy as np
 
+from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, RpcError
 from barpc.base.geodesy import feature_collection, geojson_feature, polygon
+from barpc.base.verb_options import InfoOptions
 from barpc.fit.poles import smallest_denominator
 from barpc.rasters.dem import Dem
 from barpc.scene import Camera
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
-from barpc.verbs.points import Files, altitude_of, exchanged, ground_at, terrain_of
+from barpc.verbs.points import altitude_of, exchanged, ground_at, terrain_of
 
 
 def info(
     images: ImageLike | Iterable[ImageLike],
-    *,
-    at: Sequence[float] | None = None,
-    alt: float | None = None,
-    dem: Files | None = None,
-    geoid: str | None = None,
+    **keywords: Any,
 ) -> Any:
     """Return the source of a camera, its coverage and view angles; of several images, each pair's angle.
 
     Parameters
     ----------
     images : one or many: paths, patterns, folders, open rasterio datasets, Views, Cameras
-    at : (3,), optional, ground point of the angles: lon, lat [deg], alt [m]; else the image's centre
-    alt : float, optional, altitude of the ground [m]; else of the run's tie points, or the middle of the camera's
-    dem, geoid : as of `barpc.project`
+    **keywords : fields of `InfoOptions`: at, alt, dem, geoid
 
     Returns
     -------
@@ -56,7 +52,8 @@ def info(
     given = every(images)
     if not given:
         raise InputError("no image is given")
-    found = described(given, None if at is None else tuple(at), alt, terrain_of(dem, geoid, alt))
+    chosen = with_values(InfoOptions(), keywords, "info")
+    found = described(given, chosen.at, chosen.alt, terrain_of(chosen.dem, chosen.geoid, chosen.alt))
     return found if several or len(found) > 1 else found[0]
 
 

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from barpc.base.atomic import replacing
+from barpc.base.declarations import declared
 from barpc.base.errors import FitError, Remark
-from barpc.base.options import FitOptions, RefitOptions, RunOptions, declared
+from barpc.base.options import FitOptions, RunOptions
+from barpc.base.verb_options import RefitOptions
 from barpc.cameras import read_points, split_spec
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import terrain_range
@@ -59,7 +61,7 @@ def fit(
     output : path, optional, where to write; the name chooses the format. Without: measure only
     options : FitOptions, RunOptions, mapping or path of a TOML file, optional
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `FitOptions` and of `barpc.base.options.RefitOptions`: alt_range, dem, dem_margin, geoid,
+    **keywords : fields of `FitOptions` and of `RefitOptions`: alt_range, dem, dem_margin, geoid,
         keep_going, overwrite
 
     Returns

@@ -8,8 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from barpc.base.declarations import Options, declared, with_values
 from barpc.base.errors import InputError
-from barpc.base.options import Options, RunOptions, declared, read_options, with_values
+from barpc.base.options import RunOptions, read_options
 
 OptionsLike = RunOptions | Mapping[str, Any] | str | Path | None
 FLAG_NAMES = {"rpc_formats": "rpc_format"}

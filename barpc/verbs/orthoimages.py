@@ -19,11 +19,12 @@ from rasterio.warp import reproject, transform
 from rasterio.windows import Window
 
 from barpc import __version__
+from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, Remark
 from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
-from barpc.base.options import OrthoOptions, with_values
+from barpc.base.verb_options import OrthoOptions
 from barpc.export.shots import Scene, read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
@@ -70,7 +71,7 @@ def ortho(
         datasets, Views, Cameras
     out_dir : path, folder for the orthoimages, each with the name of its image
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `barpc.base.options.OrthoOptions`: dem, geoid, alt, gsd, crs, overwrite
+    **keywords : fields of `OrthoOptions`: dem, geoid, alt, gsd, crs, overwrite
 
     Returns
     -------

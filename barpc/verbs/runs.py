@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from barpc import pipeline
+from barpc.base.declarations import with_values
 from barpc.base.errors import UsageError
-from barpc.base.options import DsmOptions, with_values
+from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
 from barpc.verbs.images import ImageLike, every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
@@ -113,22 +113,20 @@ def check(
     images: ImageLike | Iterable[ImageLike],
     options: OptionsLike = None,
     *,
-    against: PathLike | None = None,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
     **keywords: Any,
-) -> Any:
+) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
 
     Parameters
     ----------
     images, options, executor, jobs, progress, **keywords : as of `barpc.adjust`
-    against : path, optional, compare each image's RPC with this one, or with those of this folder; nothing is matched
 
     Returns
     -------
-    AdjustResult, with `tracks` and `summary`, without an adjustment; with `against` a list of RpcDifference
+    AdjustResult, with `tracks` and `summary`, without an adjustment
 
     Raises
     ------
@@ -140,35 +138,10 @@ def check(
     >>> found = barpc.check("data_samples/view_0[01].tif", points_per_image=500)
     >>> found.passed, found.summary["pairs"][0]["num_matches"] > 100
     (False, True)
-    >>> [one.max_px for one in barpc.check("data_samples/view_00.tif", against="data_samples")]
-    [0.0]
     """
     chosen = run_options(options, **keywords)
-    if against is not None:
-        return _rpc_differences(images, Path(against))
     with executor_for(jobs, executor) as workers:
         return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
-
-
-class RpcDifference(NamedTuple):
-    """An image, the file of the other RPC, and the largest difference of both over image and altitudes [px]."""
-
-    image: str
-    against: str
-    max_px: float
-
-
-def _rpc_differences(images: ImageLike | Iterable[ImageLike], against: Path) -> list[RpcDifference]:
-    from barpc.cameras import open_camera
-    from barpc.pipeline.verify_outputs import difference
-    from barpc.rpcio import find_rpc
-
-    found = []
-    for view in pipeline.load_views(every(images), min_views=1, distinct=False).views:
-        other = find_rpc(against, Path(view.path)) if against.is_dir() else against
-        far = difference(view.sensor, open_camera(other).model, view.size, view.alt_range)
-        found.append(RpcDifference(view.path, str(other), far))
-    return found
 
 
 def dsm(
@@ -233,9 +206,7 @@ def export(
     run_dir: PathLike,
     out_dir: PathLike,
     to: str,
-    *,
-    alt: tuple[float, float] | None = None,
-    overwrite: bool = False,
+    **keywords: Any,
 ) -> list[Path]:
     """Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
@@ -244,8 +215,7 @@ def export(
     run_dir : path of a finished adjustment
     out_dir : path, a new folder; files in it point at images and run relative to it
     to : str, the tool: satnerf, colmap, s2p, cars, asp, stac, points
-    alt : (low, high), optional, altitudes of the scene [m above the ellipsoid]; else by its tie points
-    overwrite : bool, replace what an earlier export wrote there
+    **keywords : fields of `ExportOptions`: alt, overwrite
 
     Returns
     -------
@@ -266,15 +236,16 @@ def export(
     """
     from barpc.export import export_run
 
-    return export_run(run_dir, to, out_dir, alt_range=alt, overwrite=overwrite)
+    chosen = with_values(ExportOptions(), keywords, "export")
+    return export_run(run_dir, to, out_dir, alt_range=chosen.alt, overwrite=chosen.overwrite)
 
 
 def verify(
     run_dir: PathLike,
     places: PathLike | Sequence[PathLike] = (),
     *,
-    expect: str | None = None,
     progress: Progress | None = None,
+    **keywords: Any,
 ) -> list[Proved]:
     """Compare the files of a run or export with its SHA256SUMS, and its cameras with those certified.
 
@@ -282,8 +253,8 @@ def verify(
     ----------
     run_dir : path of a finished run, or of an export
     places : path or paths, optional, folders in which missing inputs are searched by name
-    expect : str, optional, the root that was printed, or a later one (64 hexadecimal digits)
     progress : callable, optional, `progress(stage, done, total)`
+    **keywords : fields of `VerifyOptions`: expect, the root that was printed, or a later one
 
     Returns
     -------
@@ -302,7 +273,6 @@ def verify(
     """
     from barpc.pipeline.outputs import prove
 
-    if expect is not None and not re.fullmatch("[0-9a-fA-F]{64}", expect):
-        raise UsageError(f"--expect {expect}: a root has 64 hexadecimal digits")
+    expect = with_values(VerifyOptions(), keywords, "verify").expect
     folders = [places] if isinstance(places, (str, os.PathLike)) else places
     return prove(Path(run_dir), [Path(place) for place in folders], expect and expect.lower(), progress)

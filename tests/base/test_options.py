@@ -19,28 +19,10 @@ from click.testing import CliRunner
 from jsonschema import Draft202012Validator
 
 import barpc
+from barpc.base.declarations import Declared, Options, Rule, checked, declared, schema, with_values
 from barpc.base.errors import InputError, UsageError
-from barpc.base.options import (
-    _DEEP,
-    _QUOTED,
-    PAPER,
-    AdjustOptions,
-    ConvertOptions,
-    Declared,
-    DsmOptions,
-    FitOptions,
-    Options,
-    OrthoOptions,
-    RefitOptions,
-    Rule,
-    RunOptions,
-    TieOptions,
-    checked,
-    declared,
-    read_options,
-    schema,
-    with_values,
-)
+from barpc.base.options import _DEEP, _QUOTED, PAPER, AdjustOptions, FitOptions, RunOptions, TieOptions, read_options
+from barpc.base.verb_options import ConvertOptions, DsmOptions, OrthoOptions, RefitOptions
 from barpc.cli import cli
 from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
 
@@ -213,7 +195,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
 
 def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
     """On the defaults, on every bound and beyond: the schema is the declarations in another language."""
-    written = schema()
+    written = schema(RunOptions)
     json.dumps(written)
     validator = Draft202012Validator(written)
     assert validator.is_valid({})
@@ -224,7 +206,7 @@ def test_the_schema_and_the_records_agree(tmp_path: Path) -> None:
                 continue  # not JSON, or beyond what a schema says
             wrong = json.loads(json.dumps(wrong))
             assert not validator.is_valid({table: {name: wrong}} if table else {name: wrong}), (name, wrong)
-        if one.default is not None and not one.rule.cli_only:  # no options file has it
+        if one.default is not None and not one.rule.only:  # no options file has it
             plain = json.loads(json.dumps(one.default))
             assert validator.is_valid({table: {name: plain}} if table else {name: plain}), name
 

@@ -353,19 +353,6 @@ def test_the_accuracy_stated_in_a_new_rpc_is_what_is_known_now(finished):
         assert image.rpcs.err_rand == pytest.approx(0.1)
 
 
-def test_check_compares_with_other_cameras(crops, finished, tmp_path):
-    new = sorted(finished[0].glob("*.vrt"))
-    code, out, _ = barpc("check", new[0], "--against", finished[0] / "view_00_RPC.TXT", "--json")
-    assert code == 0
-    assert json.loads(out)[0]["max_px"] <= 1e-9
-    code, out, _ = barpc("check", *new, "--against", crops[0].parent, "--json")
-    assert code == 3
-    assert min(entry["max_px"] for entry in json.loads(out)) > 1
-    code, _, err = barpc("check", new[0], "--against", tmp_path)
-    assert code == 1
-    assert "view_00.vrt" in err
-
-
 @pytest.mark.slow
 def test_adjusted_images_can_be_adjusted_again(crops, finished, tmp_path):
     code, out, err = barpc("adjust", *sorted(finished[0].glob("*.vrt")), "-o", tmp_path / "two", "--json")

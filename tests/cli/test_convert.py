@@ -14,7 +14,7 @@ import rasterio
 from rasterio.windows import Window
 
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
-from barpc.base.options import ConvertOptions
+from barpc.base.verb_options import ConvertOptions
 from barpc.cameras import open_camera
 from barpc.cli import terminal as printing
 from barpc.cli.convert import _tell_readings

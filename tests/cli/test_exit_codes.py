@@ -104,10 +104,7 @@ def test_control_points_that_do_not_count_end_with_3(fault, tmp_path):
 
 
 def test_other_verbs_end_with_3_and_say_why(pristine, tmp_path):  # noqa: F811
-    a, b = pristine[:2]
-    assert_told(command("check", a, "--against", b), "1 of 1 RPCs differ")
-    assert command("check", a, "--against", a).code == 0
-    assert_told(command("project", a, "5.4", "43.3", "nan"), "1 of 1 points could not be projected")
+    assert_told(command("project", pristine[0], "5.4", "43.3", "nan"), "1 of 1 points could not be projected")
 
 
 # --- the terminal -----------------------------------------------------------------------------------------

@@ -213,9 +213,12 @@ def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tm
         RunOptions(),
     )
     file = tmp_path / "a.toml"
-    file.write_text('[adjust]\ncenter = "line"\n')
+    file.write_text("[adjust]\nlearn_priors = true\n")
     mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))
-    assert (mixed.adjust.center, mixed.adjust.drift, mixed.adjust.jitter) == ("line", 1, "off")
+    assert (mixed.adjust.learn_priors, mixed.adjust.drift, mixed.adjust.jitter) == (True, 1, "off")
+    file.write_text('[adjust]\ncenter = "projective"\n')
+    with pytest.raises(InputError, match=r"center stands in a file, where it is not accepted; give the flag --paper"):
+        run_options({}, str(file))
     assert run_options({"paper": False}, None) == RunOptions()
     assert run_options({}, None) == RunOptions()
 
@@ -240,7 +243,6 @@ def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> N
     whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
     known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}
     assert set(whole) == known | {"--help"}
-    assert {"--against"} <= {flag for flags in listed_in_help("check", "--help").values() for flag in flags}
 
 
 def test_the_whole_help_of_a_run_has_its_flags_under_what_they_are_about() -> None:

@@ -13,7 +13,6 @@ DONE = {
     "adjust": ("{in}/view_00.tif", "{in}/view_01.tif", "-o", "{new}"),
     "match": ("{in}/view_00.tif", "{in}/view_01.tif", "-o", "{new}"),
     "check": ("{out}/view_00.vrt", "{out}/view_01.vrt"),
-    "check --against": ("{out}/view_00.vrt", "--against", "{out}"),
     "fit": ("{out}/view_00.vrt", "-o", "{new}_RPC.TXT"),
     "convert": ("{in}/view_00.tif", "{new}_RPC.TXT"),
     "convert --window": ("{in}/view_00.tif", "{new}.tif", "--window", "0", "0", "64", "64"),

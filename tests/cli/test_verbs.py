@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from barpc import dsm
-from barpc.base.options import DsmOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.cli.terminal import Lines, progress_told
 from barpc.rasters.raster import open_raster

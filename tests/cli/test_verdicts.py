@@ -16,7 +16,7 @@ from barpc.cli.fit import _certificate
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
-from tests.rpcio.conftest import make_rpc, write_image
+from tests.rpcio.conftest import make_rpc
 
 # --- fit --------------------------------------------------------------------------------------------------
 
@@ -171,40 +171,6 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
 
 
 # --- check, report, adjust --------------------------------------------------------------------------------
-
-
-def test_a_check_against_other_cameras_tells_the_largest_difference(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    images = []
-    for number, shift in enumerate((0.0, 0.25)):
-        image = write_image(tmp_path / f"i{number}.tif", shape=(1, 40, 60))
-        write_rpc(make_rpc().crop(900 + shift, 900), tmp_path / f"i{number}.RPB")
-        write_rpc(make_rpc().crop(900, 900), tmp_path / "other" / f"i{number}_RPC.TXT")
-        images.append(str(image))
-    other = tmp_path / "other"
-    assert run("check", *images, "--against", str(other)) == 3
-    said = capsys.readouterr()
-    assert said.out.splitlines() == [
-        f"{images[0]}  {other / 'i0_RPC.TXT'}  max 0 px",
-        f"{images[1]}  {other / 'i1_RPC.TXT'}  max 0.25 px",
-    ]
-    assert said.err == f"barpc: exit code 3: 1 of 2 RPCs differ. {images[1]}: 0.25 px.\n"
-    assert run("check", images[0], "--against", str(other / "i1_RPC.TXT"), "--json") == 0
-    text = capsys.readouterr().out
-    (row,) = json.loads(text)
-    assert text.splitlines()[:2] == ["[", " {"]
-    assert row == {"image": images[0], "against": str(other / "i1_RPC.TXT"), "max_px": 0.0}
-
-
-@pytest.mark.parametrize(("far", "code"), [(1e-6, 0), (1.01e-6, 3), (float("nan"), 3)])
-def test_a_millionth_of_a_pixel_is_the_bound(
-    far: float, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    image = write_image(tmp_path / "i.tif", shape=(1, 40, 60))
-    write_rpc(make_rpc().crop(900, 900), tmp_path / "i.RPB")
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.difference", lambda *_: far)
-    assert run("check", str(image), "--against", str(tmp_path / "i.RPB")) == code
 
 
 def test_two_runs_are_compared_and_one_is_reported_again(

@@ -11,7 +11,8 @@ from typing import Any
 import click
 import pytest
 
-from barpc.base.options import RunOptions, declared
+from barpc.base.declarations import declared
+from barpc.base.options import RunOptions
 from barpc.cli import COMMANDS, cli
 from barpc.report.summary import published_schema
 from tests.docs.pages import DOCS, PAGES, ROOT, blocks

@@ -10,7 +10,8 @@ import rasterio
 
 from barpc.ba import adjust_tracks, block_prior
 from barpc.base.geodesy import ground_from_ecef
-from barpc.base.options import AdjustOptions, DsmOptions
+from barpc.base.options import AdjustOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.stereo import CameraErrors

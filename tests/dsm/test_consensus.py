@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from barpc.base.options import DsmOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.dsm import stereo
 from barpc.dsm.stereo import (
     NEIGHBOUR_RADIUS,

@@ -12,7 +12,7 @@ import rasterio
 from barpc.ba.result import pair_heights
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ground_from_ecef
-from barpc.base.options import DsmOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.dsm.stereo import block_of_run

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.base.options import DsmOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import make_dsm
 from barpc.pipeline import adjust

@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 from barpc.base.errors import BarpcError, InputError, OutputError
-from barpc.base.options import DsmOptions
+from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm, stereo
 from barpc.dsm import surface as surface_module

@@ -19,8 +19,9 @@ from unittest import mock
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
+from barpc.base.declarations import Rule, declared
 from barpc.base.errors import BarpcError
-from barpc.base.options import AdjustOptions, FitOptions, Rule, declared, read_options
+from barpc.base.options import AdjustOptions, FitOptions, read_options
 from barpc.base.remote import Remote, hosts
 from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.fit import fit_rpc

@@ -198,7 +198,7 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
 
     def refused(words: str, *more: Path, sensor: str | None = None) -> None:
         with pytest.raises(InputError, match=words) as caught:
-            barpc.calibrate([*archive[:2], *more], out, sensor)
+            barpc.calibrate([*archive[:2], *more], out, sensor=sensor)
         assert "\n" not in str(caught.value)
         assert not out.exists()
 

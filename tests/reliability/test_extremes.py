@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.base.declarations import declared
 from barpc.base.errors import AdjustError, BarpcError, FitError, ImageError, InputError
 from barpc.base.frozen import load_npz
-from barpc.base.options import declared
 from barpc.base.remote import Remote, is_url, located
 from barpc.fit import fit_rpc_points
 from barpc.pointio.matches import read_links

@@ -193,13 +193,6 @@ def test_a_vrt_with_an_rpc_of_its_own_is_the_same_image(scene, tmp_path):
     assert "the same RPC" in left[1]["reason"]
 
 
-def test_cameras_of_one_image_may_be_compared_with_others(scene, tmp_path):
-    image = images_of(scene, "")[0]
-    twin = tmp_path / "view_00.vrt"
-    write_rpc_vrt(read_rpc(image), image, twin)
-    assert barpc("check", image, twin, "--against", scene).code == 0
-
-
 def test_images_that_are_nearly_empty_are_no_twins(scene, tmp_path, monkeypatch):
     """None is read whole, however many there are; a copy among them is found."""
     reads = []

@@ -9,7 +9,7 @@ import pytest
 
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.report.quality_checks import PASSED_STATUS
-from barpc.report.summary import measure_run
+from barpc.report.summary.views import measure_views
 from barpc.report.summary.words import STATUS_WORDS
 from barpc.report.verdict import block_verdict
 from tests.lanes import diagonal
@@ -22,7 +22,7 @@ OVERALL = {"weak": "look", "doubtful": "look", "failed": "bad"}
 @pytest.fixture(scope="module")
 def verdict(block_run):
     """What is said of the block with a status of its second image."""
-    run, measured = block_run.run, measure_run(block_run.run).views
+    run, measured = block_run.run, measure_views(block_run.run)
 
     def said(status, kind="adjust", **changes):
         views = [replace(view, status=PASSED_STATUS[kind], advice="") for view in measured]

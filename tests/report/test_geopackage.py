@@ -6,6 +6,8 @@ import json
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import get_args, get_type_hints
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ import shapely
 
 from barpc.report.geopackage import Layer, geopackage, point_shapes
 from barpc.report.runfiles import read_tables
+from barpc.report.summary.ground_points import GcpEntry
+from barpc.report.summary.words import STATUS_WORDS
 
 
 def layer(path: Path, name: str) -> tuple[list[shapely.Geometry], list[dict[str, object]]]:
@@ -66,12 +70,44 @@ def test_the_standard_s_tables_name_every_layer_and_none_that_is_empty(block_run
         contents = {row[0]: row for row in data.execute("SELECT * FROM gpkg_contents")}
         columns = {row[0]: row for row in data.execute("SELECT * FROM gpkg_geometry_columns")}
         assert [row[0] for row in data.execute("SELECT srs_id FROM gpkg_spatial_ref_sys ORDER BY 1")] == [-1, 0, 4326]
-    assert contents.keys() == columns.keys() == {"footprints", "tie_points", "gcps"}
+    assert contents.keys() - columns.keys() == {"layer_styles"}
+    assert columns.keys() == {"footprints", "tie_points", "gcps"}
+    assert contents["layer_styles"][1:3] == ("attributes", "layer_styles")
     west, south, east, north = contents["tie_points"][5:9]
     assert west < east
     assert south < north
     assert columns["tie_points"][2:5] == ("POINT", 4326, 1)
     assert columns["footprints"][2:5] == ("POLYGON", 4326, 0)
+
+
+def test_qgis_finds_a_style_of_every_layer_that_draws_each_status_as_the_report_does(block_run):
+    """As its OGR provider asks: by the names of table and geometry, with empty ones of catalogue and schema."""
+    with sqlite3.connect(block_run.folder / "map.gpkg") as data:
+        asked = "SELECT styleQML, useAsDefault FROM layer_styles WHERE f_table_schema = '' AND f_table_name = ? AND "
+        found = {
+            name: data.execute(f"{asked} f_geometry_column = ?", (name, column)).fetchall()
+            for name, column in data.execute("SELECT table_name, column_name FROM gpkg_geometry_columns")
+        }
+        held = {name: [row[1] for row in data.execute(f"PRAGMA table_info({name})")] for name in found}
+    assert found.keys() == {"footprints", "tie_points", "gcps"}
+    css = (Path(geopackage.__code__.co_filename).parent / "template.html.j2").read_text()
+    for name, rows in found.items():
+        ((text, default),) = rows
+        assert default == 1
+        root = ElementTree.fromstring(text)
+        assert root.findtext("layerGeometryType") == ("2" if name == "footprints" else "0")
+        renderer = root.find("renderer-v2")
+        assert renderer.get("attr") in held[name]
+        symbols = {one.get("name"): one for one in renderer.iter("symbol")}
+        values = {one.get("value"): symbols[one.get("symbol")] for one in renderer.iter("category")}
+        assert len(values) == len(symbols)
+        assert "" in values  # QGIS: all other values
+        known = {"footprints": STATUS_WORDS, "gcps": get_args(get_type_hints(GcpEntry)["status"])}.get(name, ())
+        assert values.keys() - {""} <= set(known)
+        for value, symbol in values.items():
+            props = {one.get("k"): one.get("v") for one in symbol.iter("prop")}
+            colour = props["outline_color" if name == "footprints" else "color"].split(",")
+            assert "#{:02x}{:02x}{:02x}".format(*map(int, colour)) in css, (name, value)
 
 
 def test_numbers_that_are_not_known_are_null():
@@ -85,7 +121,7 @@ def test_numbers_that_are_not_known_are_null():
 def test_gdal_opens_every_layer(reader, block_run):
     module, path = pytest.importorskip(reader), block_run.folder / "map.gpkg"
     names = [str(name) for name, *_ in module.list_layers(path)] if reader == "pyogrio" else module.listlayers(path)
-    assert list(names) == ["footprints", "tie_points", "gcps"]
+    assert list(names) == ["footprints", "tie_points", "gcps", "layer_styles"]
     if reader == "pyogrio":
         about, _, shapes, columns = module.raw.read(path, layer="tie_points")
         assert (about["crs"], about["geometry_type"]) == ("EPSG:4326", "Point Z")

@@ -11,14 +11,19 @@ import pytest
 
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.report import Run
+from barpc.report import Run, summarize
 from barpc.report import outcome as runs
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.page import decisions
-from barpc.report.summary import measure_run
 from barpc.report.summary.block import _justification
-from barpc.report.summary.ground_points import GcpEntry, measure_control, measure_gcps, measure_reference
-from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, rmse_by_view
+from barpc.report.summary.ground_points import (
+    GcpEntry,
+    measure_check_points,
+    measure_control,
+    measure_gcps,
+    measure_reference,
+)
+from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, measure_views, rmse_by_view
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.image_corrections import RowSpline
@@ -112,7 +117,7 @@ def test_rows_with_few_tie_points_are_placed_by_the_new_camera(check_run, block_
     for finished in (check_run, block_run):
         run = replace(finished.run)
         run.__dict__["gaps"] = {1: Gap(axis, 100.0, 199.0, 0, 50)}
-        first, second = measure_run(run).views[:2]
+        first, second = measure_views(run)[:2]
         assert first.gap is None
         corners = np.array(second.gap)
         model, (width, height) = (run.after or run.before)[1], run.views[1].size
@@ -171,7 +176,7 @@ def test_a_summary_counts_tie_points_by_the_views_that_see_them(check_run):
         *((p, v, 10.0 * p, 5.0) for p, views in enumerate([(0, 1), (0, 1, 2), (1, 2), (0, 2)]) for v in views)
     )
     run = Run("check", check_run.views, (), tracks)
-    found = measure_run(run)
+    found = summarize(run)
     assert found.tracks.by_length == {"2": 3, "3": 1}
     assert (found.tracks.num_tracks, found.tracks.num_observations) == (4, 9)
     assert found.tables.num_usable_tracks == np.isfinite(run.ground).all(axis=1).sum()
@@ -331,7 +336,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
     run = replace(block_run.run, gcps=None, check_points=block_run.run.gcps)
     points = run.check_points
     for sensors, changed in ((run.after, run), (run.before, replace(run, adjustment=None, fits=()))):
-        entries = measure_run(changed).check_points
+        entries = measure_check_points(changed)
         assert [entry.name for entry in entries] == list(points.names)
         for g, entry in enumerate(entries):
             rows = np.flatnonzero(points.point == g)
@@ -339,7 +344,7 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
             for k, seen in zip(rows, entry.observations, strict=True):
                 off = sensors[points.view[k]].project(points.lonlatalt[g]) - points.xy[k]
                 assert seen.residual_px == pytest.approx(off, abs=1e-9)
-    assert measure_run(block_run.run).check_points == ()
+    assert measure_check_points(block_run.run) == ()
 
 
 # --- what was left, and decided by ------------------------------------------------------------------------

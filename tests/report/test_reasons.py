@@ -15,7 +15,8 @@ import pytest
 
 import barpc
 from barpc.ba.evidence.scan import Interval
-from barpc.base.options import TieOptions, declared
+from barpc.base.declarations import declared
+from barpc.base.options import TieOptions
 from barpc.cli import COMMANDS, cli
 from barpc.cli.adjust import adjust
 from barpc.report.outcome import Run

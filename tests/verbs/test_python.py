@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,12 @@ import click
 import numpy as np
 import pytest
 import rasterio
+from click.testing import CliRunner
 from rasterio.io import MemoryFile
 
 import barpc
+from barpc.base.declarations import Options
 from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
-from barpc.base.options import Options
 from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
 from barpc.verbs.images import camera_of, every
@@ -52,6 +52,38 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
         for flag in command.params:
             name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
             assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)
+
+
+@pytest.mark.parametrize(
+    ("verb", "given", "keyword", "wrong"),
+    [
+        ("export", ("run", "out", "s2p"), "alt", (1.0,)),
+        ("export", ("run", "out", "s2p"), "alt_range", (1.0, 2.0)),
+        ("verify", ("run",), "expect", "12"),
+        ("verify", ("run",), "expect", "g" * 64),
+        ("calibrate", (["a", "b", "c"], "s.cal"), "overwrite", "yes"),
+        ("calibrate", (["a", "b", "c"], "s.cal"), "sensor", 3),
+        ("info", (VIEWS[0],), "at", (5.4, 43.3)),
+        ("info", (VIEWS[0],), "alt", float("nan")),
+    ],
+)
+def test_what_a_verb_cannot_take_is_refused_by_the_names_of_both(verb, given, keyword, wrong):
+    with pytest.raises(InputError, match=rf"^{verb}: .*{keyword}\b") as caught:
+        public(verb)(*given, **{keyword: wrong})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [
+        ("--alt", ("export", "r", "o", "--to", "s2p", "--alt", "1", "x")),
+        ("--at", ("info", str(VIEWS[0]), "--at", "5.4", "43.3", "nan")),
+    ],
+)
+def test_a_flag_that_holds_no_number_is_wrong_usage(flag, words):
+    found = CliRunner().invoke(cli, words)
+    assert found.exit_code == 2
+    assert f"'{flag}'" in found.output
 
 
 def test_folders_that_are_verbs_are_both():
@@ -302,16 +334,6 @@ def test_two_processes_write_what_one_does(tmp_path):
         barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)
     one, two = ((tmp_path / name / "matches.csv").read_bytes() for name in "12")
     assert one == two
-
-
-def test_an_rpc_is_compared_with_another_or_with_those_of_a_folder(tmp_path):
-    rpc = barpc.read_rpc(VIEWS[0])
-    moved = replace(rpc, image_offset=rpc.image_offset + [3.0, 4.0])
-    barpc.write_rpc(moved, tmp_path / f"{VIEWS[0].stem}_RPC.TXT")
-    for against in (tmp_path, tmp_path / f"{VIEWS[0].stem}_RPC.TXT"):
-        (found,) = barpc.check(VIEWS[0], against=against)
-        assert (found.image, Path(found.against).parent) == (str(VIEWS[0]), tmp_path)
-        assert found.max_px == pytest.approx(5.0, abs=1e-6)
 
 
 def test_a_fit_tells_its_progress(tmp_path):

@@ -21,7 +21,7 @@ from barpc.report.summary import ground_points
 from barpc.report.summary.block import SceneEntry, measure_scene
 from barpc.report.summary.ground_points import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
 from barpc.report.summary.pairs import PairEntry, measure_pairs
-from barpc.report.summary.views import ViewEntry, measure_views
+from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import ABOVE, Count, Vector
 
 SCHEMA: Literal[3] = 3  # Version of summary.json
@@ -156,22 +156,18 @@ def _versions() -> dict[str, str]:
     return {name: str(sys.modules[module].__version__) for module, name in names.items() if module in sys.modules}
 
 
-def measure_run(run: Run) -> Summary:
-    """Return the summary of a run without its verdict; numbers may be NaN."""
+def measure_run(run: Run, views: tuple[ViewEntry, ...], verdict: Mapping[str, Any]) -> Summary:
+    """Return the summary of a run, with its views and the verdict on it; numbers may be NaN."""
     usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
     lengths = np.bincount(np.bincount(run.tracks.point))
     return Summary(
         schema=SCHEMA,
         barpc=__version__,
         kind=run.kind,
-        status="good",
-        headline="",
-        verdict=(),
-        reasons=(),
-        passed=True,
+        **verdict,
         out_dir=run.out_dir,
         altitude_m=run.altitude,
-        views=measure_views(run),
+        views=views,
         pairs=measure_pairs(run),
         left_out=tuple(LeftOutEntry(path, reason) for path, reason in run.left_out),
         tracks=TracksEntry(
