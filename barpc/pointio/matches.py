@@ -29,7 +29,7 @@ from barpc.pointio.third_party_matches import (
     read_hloc,
     read_pair_files,
 )
-from barpc.scene import IntArray, Tracks, connected_labels
+from barpc.scene import IntArray, Tracks, connected_labels, row_pairs
 
 _MATCH_COLUMNS = ("image", "col", "row", "track")
 _NO_TRACK = "no track is seen in two of the views"
@@ -80,13 +80,7 @@ class Links:
     def of_tracks(view: IntArray, track: IntArray, xy: Array, sigma: Array) -> Links:
         """Return the observations of tracks: each is linked to the next ones of its track."""
         order = np.lexsort((view, track))
-        label, ends = track[order], [np.zeros((0, 2), dtype=np.int64)]
-        for step in range(1, min(_MAX_LINKED_DISTANCE, len(view) - 1) + 1):
-            same = np.flatnonzero(label[step:] == label[:-step])
-            if not len(same):
-                break
-            ends.append(np.column_stack([order[same], order[same + step]]))
-        return Links(view, xy, sigma, np.concatenate(ends))
+        return Links(view, xy, sigma, order[row_pairs(track[order], _MAX_LINKED_DISTANCE).T])
 
     @property
     def joins_views(self) -> bool:

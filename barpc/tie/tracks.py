@@ -14,7 +14,7 @@ from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, kd_tree
-from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
+from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude, row_pairs
 from barpc.sensor.geometry import triangulate
 from barpc.tie.detail import Seen, seen_detail
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
@@ -482,6 +482,6 @@ def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
     """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
-    (first, second), num = tracks.row_pairs(), int(tracks.view.max(initial=0)) + 1
+    (first, second), num = row_pairs(tracks.point), int(tracks.view.max(initial=0)) + 1
     keys, counts = np.unique(tracks.view[first] * num + tracks.view[second], return_counts=True)
     return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}
