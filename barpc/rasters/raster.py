@@ -20,12 +20,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.control import GroundControlPoint
 from rasterio.coords import BoundingBox
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import array_bounds
+from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base import identity
@@ -166,6 +168,27 @@ def map_crs(given: str | None, middle: Array) -> CRS:
     if not found.is_projected or found.linear_units_factor[1] != 1.0:
         raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
     return found
+
+
+def warped(path: PathOrUrl | str, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return places (N,) in another CRS, NaN where there is none, as far from a map's zone.
+
+    InputError, which names the file `path` that they are of, where one CRS does not lead to the other.
+    """
+    found, known = np.full((2, len(x)), np.nan), np.isfinite(x) & np.isfinite(y)
+    try:
+        try:
+            found[:, known] = warp_points(start, end, x[known], y[known])
+        except CPLE_BaseError:  # of one place: GDAL does not say of which
+            from pyproj import Transformer
+
+            to = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True)
+            both = np.array(to.transform(x[known].tolist(), y[known].tolist()))
+            known[known] = np.isfinite(both).all(axis=0)
+            found[:, known] = warp_points(start, end, x[known], y[known])
+    except (CRSError, CPLE_BaseError) as error:
+        raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
+    return found[0], found[1]
 
 
 def hashed(path: PathOrUrl | str) -> Input:
