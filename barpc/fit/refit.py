@@ -28,6 +28,7 @@ from barpc.fit.points import (
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
+from barpc.sensor.direct_grid import nodes_of
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rational import monomials
@@ -439,18 +440,13 @@ def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
 
 def wrong_axes_of_grid(ground: Array, image: Array) -> str:
     """Return the same of points (N, 3), (N, 2) that are all the nodes of a grid; of others nothing is said."""
-    values = (ground[:, 2], image[:, 1], image[:, 0])
-    axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
-    shape = tuple(len(axis) for axis in axes)
-    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _MIN_NODES:
+    (alts, *sides), nodes = nodes_of(ground, image)
+    if nodes is None or np.ptp(alts) < LEAST_RANGE or min(map(len, sides)) < _MIN_NODES:
         return ""
-    nodes = np.full((*shape, 3), np.nan)
-    nodes[places] = ground
     nodes = np.moveaxis(nodes[[0, -1]], 0, 2)  # rows, columns, low and high
-    picked = [
-        [(part * (side - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in shape[1:]
-    ]
-    (row, rows), (col, cols) = picked
+    (row, rows), (col, cols) = (
+        [(part * (len(side) - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in sides
+    )
     return _geometry_fault(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
 
 

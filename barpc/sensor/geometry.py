@@ -63,31 +63,21 @@ def image_grid(
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
 
 
-def footprint(sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8) -> Array:
-    """Return the outline of an image on the ground.
+def footprint(sensor: SensorModel, size: tuple[int, int], alt: npt.ArrayLike) -> Array:
+    """Return the outline (32, 2) of an image of `size` (width, height) on the ground: lon, lat [deg], not closed.
 
-    Parameters
-    ----------
-    size : (width, height) [px]
-    alt : float or (4 per_side,), altitude of the ground [m above the ellipsoid]
-    per_side : int, points on each side; an edge is a curve on the ground
-
-    Returns
-    -------
-    ring : (4 per_side, 2), lon, lat [deg], not closed; longitudes run on across the antimeridian
+    `alt` [m above the ellipsoid]: of the ground, or of each point (32,) of the outline (`image_border`). Longitudes run
+    on across the antimeridian.
     """
-    border = image_border(size, per_side)
-    ring = sensor.localize(border, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(border)))[:, :2]
-    ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
-    return ring
+    return np.asarray(footprints([sensor], [size], alt)[0])
 
 
 def footprints(sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt: npt.ArrayLike) -> Array:
-    """Return the outlines (N, 32, 2) of images on the ground at an altitude [m], or each at its own: `footprint`s."""
+    """Return the outlines (N, 32, 2) of images on the ground, at an altitude [m] or one each (N, 1): `footprint`s."""
     borders = np.array([image_border(size) for size in sizes]).reshape(len(sizes), -1, 2)
-    alts = np.repeat(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(sizes)), borders.shape[1])
+    alts = np.broadcast_to(np.asarray(alt, dtype=np.float64), borders.shape[:2])
     bounds = borders.shape[1] * np.arange(len(sizes) + 1)
-    rings = localize_stack(sensors, borders.reshape(-1, 2), alts, bounds)[:, :2].reshape(borders.shape)
+    rings = localize_stack(sensors, borders.reshape(-1, 2), alts.ravel(), bounds)[:, :2].reshape(borders.shape)
     rings[..., 0] = wrap_longitude(rings[..., 0], rings[:, :1, 0])
     return rings
 
