@@ -117,8 +117,7 @@ class TriangularSystem:
 def _take_in(triangle: Array, rows: Array) -> Array:
     """Return the triangular factor of `triangle` on top of `rows`."""
     block = min(_HOUSEHOLDER_COLUMNS, len(triangle))
-    factor: Array = scipy.linalg.lapack.dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
-    return factor
+    return np.asarray(scipy.linalg.lapack.dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0])
 
 
 @dataclass(frozen=True, eq=False)

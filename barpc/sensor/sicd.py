@@ -312,8 +312,7 @@ class Monostatic(Clocked):
 def _solve_systems(matrix: Array, right: Array) -> Array:
     """Return the solutions (2, N) of 2 x 2 systems (2, 2, N)."""
     (a, b), (c, d) = matrix
-    solved: Array = np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
-    return solved
+    return np.asarray(np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c))
 
 
 _ORDER = 30  # no polynomial of a document has so high a power
