@@ -210,25 +210,32 @@ def fit_rpc_points(
     True
     """
     options = options or FitOptions()
-    cnp, cnp_image = given = _looked_at(ground, image)
-    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(cnp))
+    given = _looked_at(ground, image)
+    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(given[0]))
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, weight=weight)
-        errors = Errors()
-        if held_out is not None:
-            errors.add(solution.rpc.project(held_out[0]) - held_out[1])
-        for residual in solution.leave_one_out() if held_out is None else ():
-            errors.add(residual)
-        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
-        fit = _certified(solution, errors, errors.largest, loop, size)
-        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None else fit.rpc
-        return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
+        fit = _certified_on_points(solve(*given, options, method, weight=weight), held_out, size)
+        rpc = _limited_to_altitudes(fit.rpc, given[0][:, 2]) if options.precision is None else fit.rpc
+        return replace(fit, rpc=rpc, axes=axes)
 
     fit = _best_method(attempt, options, strict, exact=False)
     seen = partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
+
+
+def _certified_on_points(
+    solution: FitSolution, held_out: tuple[Array, Array] | None, size: tuple[int, int] | None
+) -> RpcFit:
+    """Return a fit to given points with its certificate, on check points or on each point, left out."""
+    ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
+    if held_out is not None:
+        errors.add(solution.rpc.project(held_out[0]) - held_out[1])
+    for residual in solution.leave_one_out() if held_out is None else ():
+        errors.add(residual)
+    loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
+    fit = _certified(solution, errors, errors.largest, loop, size)
+    return replace(fit, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
 
 
 def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:
