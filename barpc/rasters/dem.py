@@ -217,16 +217,7 @@ class Dem:
         """
         said = None if geoid is None else os.fspath(geoid)
         grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, Path)) else path)]
-        taken: list[str | None] = [said] * len(grids)
-        if len(grids) > 1 and said is not None:
-            taken = [said if _needs_geoid(grid.vertical, said) else None for grid in grids]
-            if not any(taken):
-                names = ", ".join(os.fspath(grid.path) for grid in grids)
-                raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
-        taken = [
-            heights if of is None and not grid.vertical.stated else of for grid, of in zip(grids, taken, strict=True)
-        ]
-        first, *others = [cls._of(*both) for both in zip(grids, taken, strict=True)]
+        first, *others = [cls._of(*both) for both in zip(grids, _given_geoids(grids, said, heights), strict=True)]
         words, known = "; ".join(one.description for one in (first, *others)), all(o.known for o in (first, *others))
         return replace(first, description=words, known=known, after=tuple(others))
 
@@ -331,6 +322,15 @@ class Dem:
             return posts, -np.inf, np.inf
         bend = float(np.ptp(lift[np.isfinite(lift)]))  # of the geoid: between the lines' ends no more again
         return posts, lowest + float(np.nanmin(lift)) - bend, highest + float(np.nanmax(lift)) + bend
+
+
+def _given_geoids(grids: Sequence[HeightGrid], said: str | None, heights: str | None) -> list[str | None]:
+    """Return the geoid that the user gives each DEM, None: none; InputError where several need none of the one said."""
+    needy = [grid for grid in grids if said is not None and (len(grids) == 1 or _needs_geoid(grid.vertical, said))]
+    if said is not None and not needy:
+        names = ", ".join(os.fspath(grid.path) for grid in grids)
+        raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
+    return [said if grid in needy else None if grid.vertical.stated else heights for grid in grids]
 
 
 def _needs_geoid(own: Vertical, said: str) -> bool:

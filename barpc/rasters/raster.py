@@ -314,14 +314,13 @@ class Mosaic:
             return None
         dataset = self._dataset(file := files.pop())
         whole = (0, 0, self.width, self.height)
-        for band, mask in ((b, b is self._vrt.mask) for b in (*self._vrt.bands, self._vrt.mask) if b):
-            source = Source(file, 1 if mask else self._vrt.bands.index(band) + 1, mask, whole, whole)
-            found = [replace(s, src=s.src or whole, dst=s.dst or whole) for s in band.sources]
-            if found != [source]:
-                return None
-        nodata = ([v if v is None else float(v) for v in d.nodatavals] for d in (dataset, self))
+        wanted = [(Source(file, number, False, whole, whole),) for number in self.indexes]
+        wanted += [(Source(file, 1, True, whole, whole),)] * (self._vrt.mask is not None)
+        shown = [tuple(replace(s, src=s.src or whole, dst=s.dst or whole) for s in b.sources) for b in self._vrt.all]
         same = (dataset.shape, dataset.dtypes) == (self.shape, self.dtypes)
-        return file if same and len({str(values) for values in nodata}) == 1 else None  # as text: NaN is NaN
+        nodata = ([v if v is None else float(v) for v in d.nodatavals] for d in (dataset, self))
+        same &= len({str(values) for values in nodata}) == 1  # as text: NaN is NaN
+        return file if same and shown == wanted else None
 
     def _box(self, window: Window | None) -> Rect:
         if window is None:

@@ -180,24 +180,28 @@ def rpc_from_fields(
     """
     if options is not None and options.first_pixel is not None:
         first_pixel = options.first_pixel
-    lists = LISTS if any(key in fields for key in DIRECT) else COEFFICIENTS
-    for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in lists)]:
+    lists = LISTS if fields.keys() & set(DIRECT) else COEFFICIENTS
+    _require_fields(fields, lists, name)
+    single = np.array([fields[key][0] for key in OFFSETS + SCALES])
+    single[:2] -= first_pixel
+    bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
+    try:
+        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
+        return RPC.of_numbers([*single, *(fields[key] for key in COEFFICIENTS)], bias, rand, direct)
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: {error}") from error
+
+
+def _require_fields(fields: Mapping[str, Sequence[float]], lists: Sequence[str], name: str) -> None:
+    for key, count in (dict.fromkeys(OFFSETS + SCALES, 1) | dict.fromkeys(lists, 20)).items():
         found = len(fields.get(key, ()))
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
             raise RpcFormatError(f"{name}: {key} {what}")
     for axis in ("LAT", "LONG", "HEIGHT"):
-        both = [getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")]
-        if None in both and set(both) - {None, 1.0}:
+        both = {getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")}
+        if None in both and both - {None, 1.0}:
             raise RpcFormatError(f"{name}: of {axis}_OFF and {axis}_SCALE one states a unit, the other none")
-    try:
-        image = [fields[key][0] - first_pixel for key in OFFSETS[:2]]
-        numbers = [*image, *(fields[key][0] for key in OFFSETS[2:] + SCALES), *(fields[key] for key in COEFFICIENTS)]
-        bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
-        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
-        return RPC.of_numbers(numbers, bias, rand, direct)
-    except RpcError as error:
-        raise RpcFormatError(f"{name}: {error}") from error
 
 
 def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:

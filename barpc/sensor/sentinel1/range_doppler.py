@@ -22,6 +22,7 @@ from numpy.polynomial import Polynomial
 from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
+    EVERYWHERE,
     NEWTON_STEPS,
     NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
@@ -298,7 +299,7 @@ class RangeDoppler(Clocked):
     @property
     def all_ground(self) -> tuple[float, float] | None:
         """Altitudes of all ground on Earth [m], which an RPC of a swath holds to 5e-3 px; None of a GRD."""
-        return None if self.advice else (-500.0, 9000.0)
+        return None if self.advice else EVERYWHERE
 
     @property
     def advice(self) -> str:
