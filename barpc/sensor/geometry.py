@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import (
+    NEWTON_STEPS,
     Array,
     BoolArray,
     IntArray,
@@ -32,6 +33,7 @@ CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _RAYS = 41  # of a line
 LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
+GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
@@ -55,7 +57,7 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 
 
 def image_grid(
-    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
+    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = GRID_NODES
 ) -> tuple[Array, Array]:
     """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
@@ -221,7 +223,7 @@ class Several:
 
 
 def ground_grids(
-    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = (11, 5)
+    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = GRID_NODES
 ) -> list[Array]:
     """Return ground points over images and their altitudes and where their cameras see them: rows (n, 5) of each.
 
@@ -432,7 +434,7 @@ def triangulate(
     sigma: Array | None = None,
     *,
     alt: float | npt.ArrayLike = 0.0,
-    steps: int = 10,
+    steps: int = NEWTON_STEPS,
 ) -> Triangulation:
     """Intersect the rays of tracks: batched Gauss-Newton on the reprojection error.
 
@@ -492,7 +494,7 @@ def _intersect(
     return ground, ok
 
 
-def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array, steps: int = 10) -> Array:
+def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array) -> Array:
     """Return the ground points (n, 3) [deg, deg, m] of matches of two images, as `triangulate` finds their tracks.
 
     Parameters
@@ -508,7 +510,7 @@ def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Arr
         ground = pair[0].localize(image[0], alt)
         lost = np.isnan(ground[:, 0])
         ground[lost] = pair[1].localize(image[1][lost], alt[lost])
-        for _ in range(steps):
+        for _ in range(NEWTON_STEPS):
             scale = metres_per_unit(ground)
             seen, slopes = zip(*(sensor.project_jacobian(ground) for sensor in pair), strict=True)
             residual = np.concatenate([one.T for one in seen]) - goal
