@@ -209,25 +209,25 @@ def fit_rpc_points(
     >>> bool(barpc.fit_rpc_points(ground, image).max_ckp.max() < 1e-3)
     True
     """
-    options = options or FitOptions()
-    given = _looked_at(ground, image)
+    options, given = options or FitOptions(), _looked_at(ground, image)
     axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(given[0]))
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
-        fit = _certified_on_points(solve(*given, options, method, weight=weight), held_out, size)
-        rpc = _limited_to_altitudes(fit.rpc, given[0][:, 2]) if options.precision is None else fit.rpc
-        return replace(fit, rpc=rpc, axes=axes)
+        solution = solve(*given, options, method, weight=weight)
+        return replace(_certified_on_points(solution, held_out, size, options.precision is None), axes=axes)
 
-    fit = _best_method(attempt, options, strict, exact=False)
-    seen = partial(_check_errors, held_out, *given)
+    fit, seen = _best_method(attempt, options, strict, exact=False), partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
 
 
 def _certified_on_points(
-    solution: FitSolution, held_out: tuple[Array, Array] | None, size: tuple[int, int] | None
+    solution: FitSolution, held_out: tuple[Array, Array] | None, size: tuple[int, int] | None, limited: bool
 ) -> RpcFit:
-    """Return a fit to given points with its certificate, on check points or on each point, left out."""
+    """Return a fit to given points with its certificate, on check points or on each point, left out.
+
+    Its RPC is perhaps `limited` to the altitudes of the points.
+    """
     ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
     if held_out is not None:
         errors.add(solution.rpc.project(held_out[0]) - held_out[1])
@@ -235,7 +235,8 @@ def _certified_on_points(
         errors.add(residual)
     loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
     fit = _certified(solution, errors, errors.largest, loop, size)
-    return replace(fit, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
+    rpc = _limited_to_altitudes(fit.rpc, ground[:, 2]) if limited else fit.rpc
+    return replace(fit, rpc=rpc, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
 
 
 def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:

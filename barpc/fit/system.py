@@ -269,8 +269,7 @@ def _nitf_coeffs(coeffs: Array) -> Array:
 
 
 def _rpcm_normalization(norm: Normalization) -> Normalization:
-    fields = (norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
-    return Normalization(*(np.round(value, 12) for value in fields))
+    return Normalization(*(np.round(getattr(norm, name), 12) for name in norm._given()))
 
 
 class Precision(NamedTuple):
