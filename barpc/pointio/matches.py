@@ -106,7 +106,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
         raise InputError(f"{path}: cannot be read as tie points ({plain(error)})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
-    if not links.joins_views and not _named_after_pairs(path, views):
+    if not links.joins_views and all(pair_of(one, views) is None for one in pair_files(path)):
         others = ", ".join(name[:60] for name in [*views.strangers][:3])
         found = f"; it names {others}, and the images are {', '.join(views.names[:3])}" if others else ""
         raise InputError(f"{path}: {_NO_TRACK}{found}")
@@ -164,10 +164,6 @@ def _read_by_kind(path: Path, views: ViewNames) -> Links:
     if ending == ".npz" or pair_files(path):
         return Links.of_pairs(read_pair_files([path], views))
     return _read_matches_csv(path, views)
-
-
-def _named_after_pairs(path: Path, views: ViewNames) -> bool:
-    return any(pair_of(one, views) is not None for one in pair_files(path))
 
 
 def _read_matches_csv(path: Path, views: ViewNames) -> Links:

@@ -392,8 +392,9 @@ def open_sicd(path: Path) -> Monostatic:
         raise RpcFormatError(f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground")
     first = [_integer(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
     center = [_integer(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
+    arp = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
     model = Monostatic(
-        orbit=_read_orbit(root),
+        orbit=Curve.polynomial(arp.T, 0.0, root.positive("Timeline/CollectDuration")),
         formation=_formation(root, scp),
         spacing=(root.positive("Grid/Row/SS"), root.positive("Grid/Col/SS")),
         origin=(center[0] - first[0], center[1] - first[1]),
@@ -444,12 +445,6 @@ def _accuracy(root: XmlFields, scp: Array) -> tuple[float, float] | None:
 def _error(root: XmlFields, path: str) -> float:
     """Return a standard deviation [m]; 0 where it is not stated."""
     return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
-
-
-def _read_orbit(root: XmlFields) -> Curve:
-    """Read ARPPoly over the time of the collection."""
-    coeffs = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
-    return Curve.polynomial(coeffs.T, 0.0, root.positive("Timeline/CollectDuration"))
 
 
 def _polynomial(root: XmlFields, path: str, variables: int) -> Array:

@@ -320,18 +320,15 @@ def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int
 
     Of tracks that only both see, where there are enough: in others a third view may be what does not compare.
     """
-    counts = [(pair_counts(_of_two(tracks)), pair_counts(tracks)) for tracks in (linked, registered)]
-    found = []
+    counts, found = [], []
+    for tracks in (linked, registered):
+        of_two = tracks.select(np.bincount(tracks.point, minlength=tracks.num_points)[tracks.point] == 2)
+        counts.append((pair_counts(of_two), pair_counts(tracks)))
     for pair in pairs:
         kind = 0 if counts[0][0].get(pair, 0) >= FEW else 1
         before, after = (count[kind].get(pair, 0) for count in counts)
         found += [pair] if after < min(0.5 * before, MANY) else []
     return found
-
-
-def _of_two(tracks: Tracks) -> Tracks:
-    """Return the tracks of two views."""
-    return tracks.select(np.bincount(tracks.point, minlength=tracks.num_points)[tracks.point] == 2)
 
 
 def _with_pictures(

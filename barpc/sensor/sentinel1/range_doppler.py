@@ -33,9 +33,9 @@ from barpc.base.geodesy import (
     pointwise,
     up,
 )
-from barpc.sensor.curve import Curve, Orbit, fit_orbit
+from barpc.sensor.curve import Curve, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
-from barpc.sensor.sentinel1.annotation import Annotation, StateVectors, burst_rows, read_annotation, read_orbit_file
+from barpc.sensor.sentinel1.annotation import Annotation, burst_rows, read_annotation, read_orbit_file
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
@@ -442,8 +442,9 @@ def swaths_model(
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
     of_orbit = ORBITS.get(states.source, ORBITS["Downlink"])
     left = RESIDUAL_DELAYS[0][atmosphere], RESIDUAL_DELAYS[1][bistatic == "full"]
+    start, stop = (float(seconds(t, epoch)) for t in (nearest.first_line_time, nearest.last_line_time))
     model = RangeDoppler(
-        orbit=_fitted_orbit(nearest, states, epoch),
+        orbit=fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop)),
         epoch=epoch,
         frame=_range_frame(nearest, epoch),
         size=size,
@@ -463,11 +464,6 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
     lines = (azimuth_time - seconds(grid.time, model.epoch)) / annotation.azimuth_time_interval
     return np.stack([samples, lines], axis=1)
-
-
-def _fitted_orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -> Orbit:
-    start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
-    return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
 
 
 def _range_frame(annotation: Annotation, epoch: np.datetime64) -> RangeFrame:
