@@ -99,7 +99,7 @@ def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Cam
     read = {key: _parse_choice(opener.choices[key], key, text, file) for key, text in texts.items()}
     camera = opener.open(file, **{**read, **choices})
     if holder is not None:
-        camera = _at_tile(camera, path)
+        camera = _of_tile(camera, path)
     if isinstance(size, str):
         size = _parse_choice(_parse_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
@@ -119,7 +119,7 @@ def _opener_of(file: PathOrUrl, given: Mapping[str, Any], tags: Mapping[str, str
     return opener
 
 
-def _at_tile(camera: Camera, image: PathOrUrl) -> Camera:
+def _of_tile(camera: Camera, image: PathOrUrl) -> Camera:
     """Return the camera of a tile, where its file holds that of the whole image."""
     tile = at_tile(image, camera.path, camera.model) if isinstance(camera.model, RPC) else None
     return replace(camera, model=tile[0], notes=(*camera.notes, tile[1]), size=None) if tile else camera

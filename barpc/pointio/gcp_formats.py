@@ -347,14 +347,14 @@ def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> GcpTab
     for key, name in ((key, words[i]) for key, i in columns.items()):
         cells = [of.get(name) for of in rows]
         try:
-            read[key] = _texts(cells) if key in TEXTS else [_value(key, cell) for cell in cells]
+            read[key] = _as_texts(cells) if key in TEXTS else [_value(key, cell) for cell in cells]
         except ValueError as error:
             raise InputError(f"{path}: {name!r} of a point: {plain(error)}") from error
     return of_columns(path, read, empty)._replace(crs=crs)
 
 
 def _properties(feature: Any) -> dict[str, Any]:
-    """Return what a feature says of its point by the names of columns; whatever error where it is none."""
+    """Return the coordinates and properties of a feature by the names of columns; any error where it is none."""
     of, spread = dict(feature["properties"] or {}), {"ji": ("col", "row"), "sigma_m": ("sx", "sy", "sz")}
     if feature.get("id") is not None and not {key.lower() for key in of} & set(GCP_NAMES["id"]):
         of["id"] = feature["id"]
@@ -364,7 +364,7 @@ def _properties(feature: Any) -> dict[str, Any]:
     return {"lon": x, "lat": y} | ({"alt": z[0]} if z else {}) | of
 
 
-def _texts(cells: Iterable[Any]) -> Texts:
+def _as_texts(cells: Iterable[Any]) -> Texts:
     return Texts.of("" if cell is None else str(cell) for cell in cells)
 
 

@@ -73,7 +73,7 @@ def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[st
 
 
 def _alike(key: str, words: Sequence[str], bare: Sequence[str], taken: Collection[int]) -> int | None:
-    """Return the column not `taken` yet that is called like a quantity; InputError where two could be the altitude."""
+    """Return the column not `taken` yet with a name like a quantity's; InputError where two could be the altitude."""
     free = (i for i, word in enumerate(bare) if i not in taken and not _ERRORS.match(word))
     hits = [i for i in free if _LIKE[key].fullmatch(bare[i])]
     above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]

@@ -170,7 +170,7 @@ def map_crs(given: str | None, middle: Array) -> CRS:
     return found
 
 
-def warped(path: PathOrUrl | str, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
+def reprojected(path: PathOrUrl | str, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
     """Return places (N,) in another CRS, NaN where there is none, as far from a map's zone.
 
     InputError, which names the file `path` that they are of, where one CRS does not lead to the other.

@@ -28,7 +28,7 @@ _RPCM_ATTRIBUTES = [
 ]
 _RPCM_DIRECT = ["lon_num", "lon_den", "lat_num", "lat_den"]
 _ACCURACIES = ["err_bias", "err_rand"]
-_AXES, _POLYNOMIALS = (
+_AXIS_ORDER, _POLYNOMIALS = (
     [1, 0, 3, 2, 4],
     [2, 3, 0, 1],
 )  # of files (row, col, lat, lon, alt; row's first) and, alike, of ours
@@ -108,7 +108,7 @@ class RPC(Pointwise):
 
         An accuracy of zero and below means that nobody knows it, not that it is perfect.
         """
-        offset, scale = (np.array(values[i : i + 5], dtype=np.float64)[_AXES] for i in (0, 5))
+        offset, scale = (np.array(values[i : i + 5], dtype=np.float64)[_AXIS_ORDER] for i in (0, 5))
         bias, rand = (float(error) if error and 0 < error < np.inf else None for error in (bias, rand))
         coeffs = np.array(values[10:], dtype=np.float64)[_POLYNOMIALS]
         return cls(coeffs, offset[2:], scale[2:], offset[:2], scale[:2], bias, rand, direct)
@@ -119,8 +119,8 @@ class RPC(Pointwise):
         Offsets of row, col, lat, lon, alt, their scales, then lists of twenty: numerator and denominator of the row, of
         the column.
         """
-        offset = np.append(self.image_offset, self.ground_offset)[_AXES]
-        scale = np.append(self.image_scale, self.ground_scale)[_AXES]
+        offset = np.append(self.image_offset, self.ground_offset)[_AXIS_ORDER]
+        scale = np.append(self.image_scale, self.ground_scale)[_AXIS_ORDER]
         return [*offset.tolist(), *scale.tolist(), *self.coeffs[_POLYNOMIALS].tolist()]
 
     @classmethod
