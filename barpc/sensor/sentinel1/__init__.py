@@ -19,12 +19,11 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import MAX_XML, PRODUCT, opened, read_head, unread
-from barpc.sensor.curve import Orbit, fit_orbit
+from barpc.sensor.curve import fit_orbit
 from barpc.sensor.document import seconds
-from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
+from barpc.sensor.sentinel1.annotation import Annotation, burst_rows, read_annotation
 from barpc.sensor.sentinel1.range_doppler import (
     Bistatic,
-    Delays,
     GroundFrame,
     RangeDoppler,
     SlantFrame,
@@ -35,10 +34,7 @@ from barpc.sensor.sentinel1.range_doppler import (
 
 __all__ = [
     "Annotation",
-    "BurstRows",
-    "Delays",
     "GroundFrame",
-    "Orbit",
     "RangeDoppler",
     "SlantFrame",
     "burst_rows",
