@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc.base.errors import RpcError, RpcFormatError, plain
 from barpc.base.safe_io import encoding_of, parse_json
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, RPCM_NAMES
 
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
@@ -420,14 +420,9 @@ def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc
 
 
-# The errors are not rpcm's own; it passes over them.
-_RPCM_WORDS = (
-    "err_bias err_rand row_offset col_offset lat_offset lon_offset alt_offset row_scale col_scale lat_scale lon_scale "
-    "alt_scale row_num row_den col_num col_den"
-)
-_RPCM_KEYS = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
-_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 _LOWER_KEYS = {key: key.lower() for key in KEYS}
+_RPCM_KEYS = _LOWER_KEYS | dict(zip(KEYS[2:], RPCM_NAMES, strict=True))  # the errors are not rpcm's own
+_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 
 
 def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:

@@ -22,7 +22,7 @@ _RASTERIO = [
     *(f"{axis}_{part}" for part in ("off", "scale") for axis in ("line", "samp", "lat", "long", "height")),
     *(f"{axis}_{part}_coeff" for axis in ("line", "samp") for part in ("num", "den")),
 ]
-_RPCM_ATTRIBUTES = [
+RPCM_NAMES = [
     *(f"{axis}_{part}" for part in ("offset", "scale") for axis in ("row", "col", "lat", "lon", "alt")),
     *(f"{axis}_{part}" for axis in ("row", "col") for part in ("num", "den")),
 ]
@@ -146,7 +146,7 @@ class RPC(Pointwise):
     def from_rpcm(cls, model: Any) -> RPC:
         """Return the RPC of an ``rpcm.RPCModel``, its localisation RPC with it; RpcError where it lacks a number."""
         direct = [getattr(model, name, None) for name in _RPCM_DIRECT]
-        rpc = cls._of_attributes(model, _RPCM_ATTRIBUTES)
+        rpc = cls._of_attributes(model, RPCM_NAMES)
         return rpc if None in direct else replace(rpc, direct=np.array(direct, dtype=np.float64))
 
     def to_rpcm_dict(self) -> dict[str, Any]:
@@ -159,7 +159,7 @@ class RPC(Pointwise):
         >>> RPC.from_rpcm(SimpleNamespace(**rpc.to_rpcm_dict())) == rpc
         True
         """
-        named = dict(zip(_RPCM_ATTRIBUTES, self.numbers(), strict=True))
+        named = dict(zip(RPCM_NAMES, self.numbers(), strict=True))
         if self.direct is not None:
             named |= dict(zip(_RPCM_DIRECT, self.direct.tolist(), strict=True))
         return named | {key: value for key in _ACCURACIES if (value := getattr(self, key))}
