@@ -102,10 +102,8 @@ def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str
         raise InputError(
             f"{path}: column {stray[:40]!r} is none that is read; accuracies are called {', '.join(SIGMAS)}"
         )
-    place, seen = (
-        {"lon", "lat"} <= columns.keys() or {"east", "north"} <= columns.keys(),
-        {"col", "row"} <= columns.keys(),
-    )
+    place = {"lon", "lat"} <= columns.keys() or {"east", "north"} <= columns.keys()
+    seen = {"col", "row"} <= columns.keys()
     apart = {(True, True): "", (True, False): "ground", (False, True): "image"}.get((place, seen))
     if apart is None or (apart and "id" not in columns):
         needed = ("lon", "lat", "col", "row")[2 * place :]
@@ -141,6 +139,7 @@ def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTa
 
 
 def _switched_on(table: GcpTable, enable: Texts) -> GcpTable:
+    """Return a table without the points that its file switches off."""
     off = [str(text).strip().lower() in ("0", "0.0", "false") for text in enable.different]
     kept = np.flatnonzero(~np.array(off, dtype=bool)[enable.index]).tolist()
     left_out = len(table.names) - len(kept)
@@ -475,8 +474,8 @@ def _read_micmac(path: Path) -> GcpTable:
     except BarpcError as error:
         raise InputError(str(error)) from error
 
-    def stated(point: Element, tag: str, count: int, else_: str = "") -> tuple[float, ...]:
-        numbers = tuple(map(float, (point.findtext(tag) or else_).split()))
+    def stated(point: Element, tag: str, count: int, usual: str = "") -> tuple[float, ...]:
+        numbers = tuple(map(float, (point.findtext(tag) or usual).split()))
         if len(numbers) != count:
             raise ValueError("too many or too few values")
         return numbers
@@ -512,9 +511,7 @@ GCP_FORMATS: dict[str, GcpFormat] = {
     ),
     "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
     MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
-    "ENVI .pts": GcpFormat(
-        lambda text, _: text.startswith(";"), _read_envi_points, 1.5
-    ),  # corner of the first pixel: (1, 1)
+    "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1
     "QGIS .points": GcpFormat(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
     "ODM gcp_list.txt": GcpFormat(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
     "Metashape CSV": GcpFormat(
