@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
+from barpc.base.geodesy import EVERYWHERE as EVERYWHERE
 from barpc.base.remote import PathOrUrl, located, location
 from barpc.base.safe_io import IMAGE, read_head
 from barpc.pointio.correspondences import (
@@ -35,9 +36,6 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
-
-EVERYWHERE = (-500.0, 9000.0)  # m: altitudes of all ground
-
 
 ChoiceReader = Callable[[str], Any]
 
@@ -97,17 +95,11 @@ def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Cam
     texts, tags = dict(texts), choices.pop("tags", None)
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else location(holder)
-    head = b"" if file.is_dir() else read_head(file, IMAGE)
-    known = {**texts, **choices, **({} if tags is None or holder is not None else {"tags": tags})}
-    name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, known))
-    for key in (*texts, *choices):
-        if key not in opener.choices:
-            possible = ", ".join(("camera", "size", *opener.choices))
-            raise InputError(f"{file}: {key} is no choice for the kind {name}; known are {possible}")
+    opener = _opener_of(file, {**texts, **choices}, tags if holder is None else None)
     read = {key: _parse_choice(opener.choices[key], key, text, file) for key, text in texts.items()}
     camera = opener.open(file, **{**read, **choices})
-    if holder is not None and isinstance(camera.model, RPC) and (tile := at_tile(path, camera.path, camera.model)):
-        camera = replace(camera, model=tile[0], notes=(*camera.notes, tile[1]), size=None)
+    if holder is not None:
+        camera = _of_tile(camera, path)
     if isinstance(size, str):
         size = _parse_choice(_parse_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
@@ -115,6 +107,22 @@ def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Cam
     if opener.whole and size not in (None, camera.size):
         raise InputError(f"{path}: is {size} px large, its physical model in {camera.path} of {camera.size}")
     return camera if size is None else replace(camera, size=size)
+
+
+def _opener_of(file: PathOrUrl, given: Mapping[str, Any], tags: Mapping[str, str] | None) -> Opener:
+    """Return the row of `OPENERS` for a file; InputError where it does not have a choice that is given."""
+    head, known = b"" if file.is_dir() else read_head(file, IMAGE), {**given, "tags": tags}
+    name, opener = next((n, o) for n, o in reversed(OPENERS.items()) if o.sniff(file, head, known))
+    if strange := next((key for key in given if key not in opener.choices), None):
+        possible = ", ".join(("camera", "size", *opener.choices))
+        raise InputError(f"{file}: {strange} is no choice for the kind {name}; known are {possible}")
+    return opener
+
+
+def _of_tile(camera: Camera, image: PathOrUrl) -> Camera:
+    """Return the camera of a tile, where its file holds that of the whole image."""
+    tile = at_tile(image, camera.path, camera.model) if isinstance(camera.model, RPC) else None
+    return replace(camera, model=tile[0], notes=(*camera.notes, tile[1]), size=None) if tile else camera
 
 
 def split_spec(spec: str | Path, hosts: Sequence[str] = ()) -> tuple[PathOrUrl, dict[str, str]]:

@@ -162,15 +162,6 @@ class Tracks(Frozen):
         _, point = np.unique(self.point[keep], return_inverse=True)
         return Tracks(self.view[keep], point, self.xy[keep], self.sigma[keep])
 
-    def row_pairs(self) -> tuple[IntArray, IntArray]:
-        """Return the rows (n,), (n,) of all pairs of observations of a track, that of the lower view first."""
-        found, step = [np.empty((2, 0), np.int64)], 1
-        while step < len(self) and len(rows := np.flatnonzero(self.point[step:] == self.point[:-step])):
-            found.append(np.stack([rows, rows + step]))
-            step += 1
-        first, second = np.concatenate(found, axis=1)
-        return first, second
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GroundPoints(Frozen):
@@ -305,6 +296,15 @@ def _observation_words(view: IntArray, sigma: Array) -> str:
     if not len(view):
         return "no observations"
     return f"{len(view)} observations in {len(np.unique(view))} views, to {np.median(sigma):.2g} px"
+
+
+def row_pairs(label: IntArray, most: float = np.inf) -> IntArray:
+    """Return all pairs (2, n) of rows with equal labels, which stand together, at most `most` rows apart."""
+    found, step = [np.empty((2, 0), np.int64)], 1
+    while step < len(label) and step <= most and len(rows := np.flatnonzero(label[step:] == label[:-step])):
+        found.append(np.stack([rows, rows + step]))
+        step += 1
+    return np.concatenate(found, axis=1)
 
 
 def middle_altitude(views: Sequence[View]) -> float:

@@ -301,16 +301,15 @@ class Look:
     scan: float | None = None  # direction in which the rows advance over the ground [deg]; None: the heading
 
 
-def looks(count: int, turn: float = 0.0, altitude: float = 694e3) -> list[Look]:
+def looks(count: int, turn: float = 0.0, altitude: float = Look.altitude) -> list[Look]:
     """Return looks at one place: pitch spread evenly, roll by the golden section, which starts at `turn` [turns]."""
-    flight = Look().heading
     out = []
     for k in range(count):
         pitch = PITCH * (2 * k / (count - 1) - 1.0) if count > 1 else 0.0
         roll = ROLL * (2 * ((turn + 0.5 + 0.381966 * k) % 1.0) - 1.0)
         tangent = np.tan(np.radians([pitch, roll]))
         incidence = float(np.degrees(np.arctan(np.hypot(*tangent))))
-        azimuth = (flight + np.degrees(np.arctan2(tangent[1], tangent[0]))) % 360.0
+        azimuth = (Look.heading + np.degrees(np.arctan2(tangent[1], tangent[0]))) % 360.0
         out.append(Look(incidence, float(azimuth), altitude))
     return out
 

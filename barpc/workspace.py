@@ -158,7 +158,7 @@ class Workspace:
         except OSError as error:
             raise OutputError(f"{self.folder}: cannot be written ({error.strerror or error})") from error
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
-        self._earlier = _read_own(self.folder)  # again: another run may have ended in between
+        self._earlier = noted_outputs(self.folder)  # again: another run may have ended in between
         # what is added to a finished run, or fails to be, leaves it finished: nothing else may replace its files
         before = _read_state(self.folder) if adds else {}
         self._finished = before.get("status") == "done"
@@ -181,7 +181,7 @@ class Workspace:
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
         unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
         self._may_replace = overwrite or unfinished
-        self._earlier, self._named = _read_own(self.folder), set(names)
+        self._earlier, self._named = noted_outputs(self.folder), set(names)
         self._refuse_hiding(self._named)
         if present and not self._adds and not self._may_replace:
             raise OutputError(f"{self.folder}: exists and is not empty; give --overwrite or another -o")
@@ -399,8 +399,11 @@ def _read_state(folder: Path) -> dict[str, Any]:
     return state if isinstance(state, dict) else {}
 
 
-def _read_own(folder: Path) -> dict[str, str]:
-    """Return the outputs of a folder's runs and their sha256; of two contents (a killed run's) the one there."""
+def noted_outputs(folder: Path) -> dict[str, str]:
+    """Return the sha256 of every output as the commands in a folder noted it; none where its state was deleted.
+
+    Of two contents (a killed run's) it is that of the one there.
+    """
     listed = _read_state(folder).get("outputs")
     known: dict[str, dict[str, None]] = {}
     pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []
@@ -419,12 +422,7 @@ def _read_own(folder: Path) -> dict[str, str]:
 
 def own_files(folder: Path) -> set[str]:
     """Return the names of barpc's own files that are in a folder, as it wrote them."""
-    return {name for name, sha in _read_own(folder).items() if _owns(folder, name, sha)}
-
-
-def noted_outputs(folder: Path) -> dict[str, str]:
-    """Return the sha256 of every output as the commands in a folder noted it; none where its state was deleted."""
-    return _read_own(folder)
+    return {name for name, sha in noted_outputs(folder).items() if _owns(folder, name, sha)}
 
 
 def portable(path: str, folder: Path) -> str:

@@ -30,6 +30,8 @@ SPEED_OF_LIGHT = 299792458.0  # in vacuum [m/s]
 _EP2 = WGS84_E2 / (1.0 - WGS84_E2)  # second eccentricity, squared
 ALTITUDES = (-1000.0, 9500.0)
 """The Earth's ground stays inside this [m], with a margin; RPCs that state more are cut to it."""
+EVERYWHERE = (-500.0, 9000.0)
+"""Altitudes of all ground on Earth [m], that a camera of no stated altitudes is used for."""
 GEOID = 110.0
 """m: no geoid lies farther from the ellipsoid."""
 STATED, INFERRED, DEFAULT = "stated", "inferred", "default"

@@ -38,14 +38,7 @@ def export_run(
 ) -> list[Path]:
     """Hand a finished run to another tool, a row of `TARGETS`; return the files written: see `barpc.export`."""
     folder, out = Path(folder), Path(out)
-    if target not in TARGETS:
-        raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")
-    if alt_range is not None and not alt_range[0] < alt_range[1]:
-        raise InputError(f"altitudes {alt_range}: the lower one first, in metres")
-    plain_path(out.absolute())
-    scene = read_scene(folder, alt_range)
-    if out.resolve() == folder.resolve():
-        raise OutputError(f"{out}: the folder of the run; give the export one of its own")
+    scene = _checked_scene(folder, target, out, alt_range)
     files = TARGETS[target](scene, out.absolute())
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
     links = image_links(scene) if target == "colmap" else {}
@@ -61,6 +54,18 @@ def export_run(
             _link_image(out / name, relative_link(image, (out / name).parent))
         workspace.seal(root, {name: content[image] for name, image in links.items() if image in content})
     return [out / name for name in files]
+
+
+def _checked_scene(folder: Path, target: str, out: Path, alt_range: tuple[float, float] | None) -> Scene:
+    if target not in TARGETS:
+        raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")
+    if alt_range is not None and not alt_range[0] < alt_range[1]:
+        raise InputError(f"altitudes {alt_range}: the lower one first, in metres")
+    plain_path(out.absolute())
+    scene = read_scene(folder, alt_range)
+    if out.resolve() == folder.resolve():
+        raise OutputError(f"{out}: the folder of the run; give the export one of its own")
+    return scene
 
 
 def _link_image(path: Path, image: str) -> None:

@@ -23,14 +23,13 @@ from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
-from barpc.sensor.geometry import camera_center, footprint, image_grid, sight_enu
+from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, sight_enu
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Homes
 
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
 _TAIL_PERCENT = 0.5  # per cent of the tie points at either end that do not count for it
-_FIT_NODES = 11, 5  # of the grid on which cameras are fitted; their errors are measured between them, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +108,7 @@ class Scene:
 
     def samples(self, shot: Shot, checked: bool = False) -> Sampled:
         """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
-        nodes = (2 * _FIT_NODES[0] - 1, 2 * _FIT_NODES[1] - 1) if checked else _FIT_NODES
+        nodes = (2 * GRID_NODES[0] - 1, 2 * GRID_NODES[1] - 1) if checked else GRID_NODES  # between them, too
         image, alt = image_grid(shot.size, self.alt_range, nodes)
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)

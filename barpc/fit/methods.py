@@ -91,11 +91,11 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-def solve_lcurve(problem: FitProblem) -> tuple[Array, list[TriangularSystem], float, int]:
+def _lcurve(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
     """Fit col and row with one h: the paper's joint problem of 78 unknowns.
 
-    Gives coefficients (4, 20), the final systems with their penalties, h, and the passes over the points: weighted ones
-    until the RMSE stands still, then from the best such ones of the ICCV kind (eq. 6).
+    The passes over the points are weighted ones until the RMSE stands still, then from the best such ones of the ICCV
+    kind (eq. 6).
     """
     systems = [problem.compressed(axis) for axis in range(2)]
     h = corner(systems)
@@ -112,7 +112,13 @@ def solve_lcurve(problem: FitProblem) -> tuple[Array, list[TriangularSystem], fl
             if not abs(last - rmse) >= RMSE_TOLERANCE:  # nor a number, where a denominator is 0 at a point
                 break
             coeffs, solved, last = _solved_coefficients(problem, following), following, rmse
-    return *best, h, passes
+    coeffs, solved = best
+    return (
+        coeffs if quantize is None else _solved_coefficients(problem, solved, quantize),
+        solved,
+        np.full(2, h),
+        passes,
+    )
 
 
 def _solved_coefficients(
@@ -308,16 +314,6 @@ def _ahead(
         if ahead is not None and region.above(problem.expanded(ahead)[-1]):
             return ahead
     return x
-
-
-def _lcurve(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
-    coeffs, solved, h, passes = solve_lcurve(problem)
-    return (
-        coeffs if quantize is None else _solved_coefficients(problem, solved, quantize),
-        solved,
-        np.full(2, h),
-        passes,
-    )
 
 
 METHODS: dict[str, Callable[[FitProblem, Rounding | None], SolverResult]] = {

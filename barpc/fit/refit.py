@@ -28,6 +28,7 @@ from barpc.fit.points import (
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO
 from barpc.fit.system import FitProblem, Normalization
 from barpc.sensor import SensorModel
+from barpc.sensor.direct_grid import nodes_of
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rational import monomials
@@ -208,26 +209,34 @@ def fit_rpc_points(
     >>> bool(barpc.fit_rpc_points(ground, image).max_ckp.max() < 1e-3)
     True
     """
-    options = options or FitOptions()
-    cnp, cnp_image = given = _looked_at(ground, image)
-    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(cnp))
+    options, given = options or FitOptions(), _looked_at(ground, image)
+    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(given[0]))
     held_out = None if check is None else checked_points(*check)
 
     def attempt(method: str) -> RpcFit:
-        solution = solve(cnp, cnp_image, options, method, weight=weight)
-        errors = Errors()
-        if held_out is not None:
-            errors.add(solution.rpc.project(held_out[0]) - held_out[1])
-        for residual in solution.leave_one_out() if held_out is None else ():
-            errors.add(residual)
-        loop = roundtrip(solution.rpc, cnp[:: max(1, len(cnp) // CHUNK)])
-        fit = _certified(solution, errors, errors.largest, loop, size)
-        rpc = _limited_to_altitudes(fit.rpc, cnp[:, 2]) if options.precision is None else fit.rpc
-        return replace(fit, rpc=rpc, axes=axes, height_px=_height_unknown(*given, float(fit.rmse_cnp.max())))
+        solution = solve(*given, options, method, weight=weight)
+        return replace(_certified_on_points(solution, held_out, size, options.precision is None), axes=axes)
 
-    fit = _best_method(attempt, options, strict, exact=False)
-    seen = partial(_check_errors, held_out, *given)
+    fit, seen = _best_method(attempt, options, strict, exact=False), partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
+
+
+def _certified_on_points(
+    solution: FitSolution, held_out: tuple[Array, Array] | None, size: tuple[int, int] | None, limited: bool
+) -> RpcFit:
+    """Return a fit to given points with its certificate, on check points or on each point, left out.
+
+    Its RPC is perhaps `limited` to the altitudes of the points.
+    """
+    ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
+    if held_out is not None:
+        errors.add(solution.rpc.project(held_out[0]) - held_out[1])
+    for residual in solution.leave_one_out() if held_out is None else ():
+        errors.add(residual)
+    loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
+    fit = _certified(solution, errors, errors.largest, loop, size)
+    rpc = _limited_to_altitudes(fit.rpc, ground[:, 2]) if limited else fit.rpc
+    return replace(fit, rpc=rpc, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
 
 
 def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:
@@ -439,18 +448,13 @@ def wrong_axes(model: SensorModel, size: tuple[int, int], alt_range: tuple[float
 
 def wrong_axes_of_grid(ground: Array, image: Array) -> str:
     """Return the same of points (N, 3), (N, 2) that are all the nodes of a grid; of others nothing is said."""
-    values = (ground[:, 2], image[:, 1], image[:, 0])
-    axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
-    shape = tuple(len(axis) for axis in axes)
-    if len(ground) != np.prod(shape) or np.ptp(axes[0]) < LEAST_RANGE or min(shape[1:]) < _MIN_NODES:
+    (alts, *sides), nodes = nodes_of(ground, image)
+    if nodes is None or np.ptp(alts) < LEAST_RANGE or min(map(len, sides)) < _MIN_NODES:
         return ""
-    nodes = np.full((*shape, 3), np.nan)
-    nodes[places] = ground
     nodes = np.moveaxis(nodes[[0, -1]], 0, 2)  # rows, columns, low and high
-    picked = [
-        [(part * (side - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in shape[1:]
-    ]
-    (row, rows), (col, cols) = picked
+    (row, rows), (col, cols) = (
+        [(part * (len(side) - 1)).round().astype(int) for part in (_LINE_POSITIONS, _POINT_POSITIONS)] for side in sides
+    )
     return _geometry_fault(np.stack([nodes[np.ix_(row, cols)], nodes[np.ix_(rows, col)].swapaxes(0, 1)]))
 
 

@@ -117,8 +117,7 @@ class TriangularSystem:
 def _take_in(triangle: Array, rows: Array) -> Array:
     """Return the triangular factor of `triangle` on top of `rows`."""
     block = min(_HOUSEHOLDER_COLUMNS, len(triangle))
-    factor: Array = scipy.linalg.lapack.dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0]
-    return factor
+    return np.asarray(scipy.linalg.lapack.dtpqrt(0, block, triangle, np.asfortranarray(rows), overwrite_b=True)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,8 +269,7 @@ def _nitf_coeffs(coeffs: Array) -> Array:
 
 
 def _rpcm_normalization(norm: Normalization) -> Normalization:
-    fields = (norm.ground_offset, norm.ground_scale, norm.image_offset, norm.image_scale)
-    return Normalization(*(np.round(value, 12) for value in fields))
+    return Normalization(*(np.round(getattr(norm, name), 12) for name in norm._given()))
 
 
 class Precision(NamedTuple):

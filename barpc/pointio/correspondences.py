@@ -177,8 +177,7 @@ def read_grid(path: PathOrUrl, altitudes: Sequence[float] | None = None) -> Corr
             "are known; give one altitude a layer"
         )
     row, col = np.indices(bands.shape[1:], dtype=np.float64)
-    a, b, c, d, e, f = to_image[:6]
-    nodes = np.stack([a * col + b * row + c, d * col + e * row + f], axis=-1) - 0.5
+    nodes = np.stack(to_image * (col, row), axis=-1) - 0.5
     image = np.broadcast_to(nodes, (layers, *nodes.shape)).reshape(-1, 2)
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)

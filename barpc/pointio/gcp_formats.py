@@ -12,8 +12,10 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -29,7 +31,6 @@ from barpc.pointio.tables import (
     degrees,
     guessed,
     lacking,
-    number_of,
     numbers_of,
     read_columns,
     row_of,
@@ -96,17 +97,17 @@ def named(path: Path, words: Sequence[str], lax: bool = False) -> tuple[dict[str
         columns, said, vertical = guessed(words, KNOWN)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    for word in (word for i, word in enumerate(words) if i not in columns.values() and not lax):
-        if re.match("sigma|std|stdev|acc|err", word.lower()):
-            raise InputError(
-                f"{path}: column {word[:40]!r} is none that is read; accuracies are called {', '.join(SIGMAS)}"
-            )
+    left = [word for i, word in enumerate(words) if i not in columns.values() and not lax]
+    if stray := next(filter(re.compile("sigma|std|stdev|acc|err", re.IGNORECASE).match, left), None):
+        raise InputError(
+            f"{path}: column {stray[:40]!r} is none that is read; accuracies are called {', '.join(SIGMAS)}"
+        )
     place = {"lon", "lat"} <= columns.keys() or {"east", "north"} <= columns.keys()
     seen = {"col", "row"} <= columns.keys()
-    if not (place or seen) or ("id" not in columns and not (place and seen)):
-        needed = (*(() if place else ("lon", "lat")), "col", "row")
+    apart = {(True, True): "", (True, False): "ground", (False, True): "image"}.get((place, seen))
+    if apart is None or (apart and "id" not in columns):
+        needed = ("lon", "lat", "col", "row")[2 * place :]
         raise lacking(path, [name for name in needed if name not in columns], words)
-    apart = "" if place and seen else "ground" if place else "image"
     return columns, GcpTable([], None, np.empty((0, 9)), apart, None, vertical, ", ".join(said))
 
 
@@ -129,20 +130,25 @@ def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTa
     values += [stated("sigma_x", level), stated("sigma_y", level), stated("sigma_z", every)]
     values += [stated("col", NAN), stated("row", NAN), np.where(pixels == -np.inf, IMAGE_SIGMA, pixels)]
     names = [name.strip() for name in columns["id"].per_row()] if "id" in columns else [""] * num
-    crs, said, images, kept = None, empty.said, columns.get("image"), np.arange(num)
-    if "crs" in columns:
-        systems = [str(text).strip() for text in columns["crs"].different]
-        if len(systems) > 1:
-            raise InputError(f"{path}: points of {len(systems)} reference systems, {listed(systems, 3)}; one file each")
-        crs = next((f"EPSG:{text}" if text.isdecimal() else text for text in systems if text), None)
-    if "enable" in columns:
-        off = [str(text).strip().lower() in ("0", "0.0", "false") for text in columns["enable"].different]
-        kept = np.flatnonzero(~np.array(off, dtype=bool)[columns["enable"].index])
-        said += f", points that it switches off: {num - len(kept)}, left out" if len(kept) < num else ""
-        images = images and Texts(images.different, images.index[kept])
-    numbers = np.column_stack(values)[kept]
-    return empty._replace(
-        names=[names[i] for i in kept], images=images, numbers=numbers, crs=crs, said=said.lstrip(", ")
+    systems = [str(text).strip() for text in (columns["crs"].different if "crs" in columns else ())]
+    if len(systems) > 1:
+        raise InputError(f"{path}: points of {len(systems)} reference systems, {listed(systems, 3)}; one file each")
+    crs = "EPSG:" * "".join(systems).isdecimal() + "".join(systems) or None
+    table = empty._replace(names=names, images=columns.get("image"), numbers=np.column_stack(values), crs=crs)
+    return _switched_on(table, columns["enable"]) if "enable" in columns else table
+
+
+def _switched_on(table: GcpTable, enable: Texts) -> GcpTable:
+    """Return a table without the points that its file switches off."""
+    off = [str(text).strip().lower() in ("0", "0.0", "false") for text in enable.different]
+    kept = np.flatnonzero(~np.array(off, dtype=bool)[enable.index]).tolist()
+    left_out = len(table.names) - len(kept)
+    words = f"points that it switches off: {left_out}, left out" if left_out else ""
+    return table._replace(
+        names=[table.names[i] for i in kept],
+        images=table.images and Texts(table.images.different, table.images.index[kept]),
+        numbers=table.numbers[kept],
+        said=", ".join(filter(None, (table.said, words))),
     )
 
 
@@ -282,8 +288,8 @@ def _in_order(path: Path, order: str, lines: Iterable[tuple[int, list[str]]]) ->
         for number, words in lines:
             of = dict(zip(order.split(), words, strict=False))
             try:
-                x, y, col, row = (number_of(of[key]) for key in ("x", "y", "col", "row"))
-                alt = number_of(of.get("alt", "nan"))
+                x, y, col, row = (float(of[key]) for key in ("x", "y", "col", "row"))
+                alt = float(of.get("alt", "nan"))
             except (KeyError, ValueError) as error:
                 raise InputError(f"{path}, line {number}: expected '{order}' ({plain(error)})") from error
             yield of.get("id", ""), of.get("image"), x, y, alt, *ALONE, col, row, IMAGE_SIGMA
@@ -326,16 +332,8 @@ def read_geojson(path: Path) -> GcpTable:
 
 def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> GcpTable:
     """Read features with points and properties: `ji` (col, row) or names as of columns, `sigma_m` of three numbers."""
-    spread, rows = {"ji": ("col", "row"), "sigma_m": ("sx", "sy", "sz")}, list[dict[str, Any]]()
     try:
-        for feature in features:
-            of = dict(feature["properties"] or {})
-            if feature.get("id") is not None and not {key.lower() for key in of} & set(GCP_NAMES["id"]):
-                of["id"] = feature["id"]
-            for key in spread.keys() & of.keys():
-                of |= dict(zip(spread[key], of.pop(key), strict=True))
-            x, y, *z = feature["geometry"]["coordinates"]
-            rows.append({"lon": x, "lat": y} | ({"alt": z[0]} if z else {}) | of)
+        rows = list(map(_properties, features))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(
             f"{path}: not a GeoJSON of points, each with ji = [col, row], filename; sigma_m is [east, north, up], "
@@ -343,24 +341,38 @@ def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> GcpTab
         ) from error
     if not rows:
         return GcpTable.of_rows([])
-    columns, empty = named(path, words := list(dict.fromkeys(key for of in rows for key in of)))
+    columns, empty = named(path, words := list(dict.fromkeys(chain.from_iterable(rows))))
     read: dict[str, Any] = {}
     for key, name in ((key, words[i]) for key, i in columns.items()):
-        cells, needed = [of.get(name) for of in rows], key in ("lon", "lat", "col", "row")
-        if key in TEXTS:
-            read[key] = Texts.of("" if cell is None else str(cell) for cell in cells)
-            continue
+        cells = [of.get(name) for of in rows]
         try:
-            read[key] = [None if cell is None and not needed else _value(key, cell) for cell in cells]
+            read[key] = _as_texts(cells) if key in TEXTS else [_value(key, cell) for cell in cells]
         except ValueError as error:
             raise InputError(f"{path}: {name!r} of a point: {plain(error)}") from error
     return of_columns(path, read, empty)._replace(crs=crs)
 
 
-def _value(key: str, cell: Any) -> float:
+def _properties(feature: Any) -> dict[str, Any]:
+    """Return the coordinates and properties of a feature by the names of columns; any error where it is none."""
+    of, spread = dict(feature["properties"] or {}), {"ji": ("col", "row"), "sigma_m": ("sx", "sy", "sz")}
+    if feature.get("id") is not None and not {key.lower() for key in of} & set(GCP_NAMES["id"]):
+        of["id"] = feature["id"]
+    for key in spread.keys() & of.keys():
+        of |= dict(zip(spread[key], of.pop(key), strict=True))
+    x, y, *z = feature["geometry"]["coordinates"]
+    return {"lon": x, "lat": y} | ({"alt": z[0]} if z else {}) | of
+
+
+def _as_texts(cells: Iterable[Any]) -> Texts:
+    return Texts.of("" if cell is None else str(cell) for cell in cells)
+
+
+def _value(key: str, cell: Any) -> float | None:
+    if cell is None and key not in ("lon", "lat", "col", "row"):
+        return None
     if isinstance(cell, bool) or not isinstance(cell, (str, int, float)):
         raise ValueError(f"{str(cell)[:40]!r} is no number")
-    return degrees(str(cell), key) if key in ("lon", "lat") else number_of(str(cell))
+    return degrees(str(cell), key) if key in ("lon", "lat") else float(str(cell))
 
 
 def _read_vector(path: Path) -> GcpTable:
@@ -461,24 +473,33 @@ def _read_micmac(path: Path) -> GcpTable:
         root = parse_xml(path, strip_namespaces=True)
     except BarpcError as error:
         raise InputError(str(error)) from error
-    ground, rows = dict[str, tuple[float, ...]](), list[Row]()
+
+    def stated(point: Element, tag: str, count: int, usual: str = "") -> tuple[float, ...]:
+        numbers = tuple(map(float, (point.findtext(tag) or usual).split()))
+        if len(numbers) != count:
+            raise ValueError("too many or too few values")
+        return numbers
+
+    def called(element: Element, tag: str = "NamePt") -> str:
+        return element.findtext(tag, "").strip()
+
     try:
-        for point in root.iter("OneAppuisDAF"):
-            x, y, z = map(number_of, (point.findtext("Pt") or "").split())
-            e, n, up = map(number_of, (point.findtext("Incertitude") or "1 1 1").split())
-            ground[(point.findtext("NamePt") or "").strip()] = x, y, z, e, n, up
-        for image in root.iter("MesureAppuiFlottant1Im"):
-            for point in image.iter("OneMesureAF1I"):
-                col, row = map(number_of, (point.findtext("PtIm") or "").split())
-                name, file = (point.findtext("NamePt") or "").strip(), (image.findtext("NameIm") or "").strip()
-                if name in ground or not ground:
-                    rows.append((name, file, *ground.get(name, (*[NAN] * 3, *ALONE)), col, row, IMAGE_SIGMA))
+        points = [*root.iter("OneAppuisDAF")]
+        ground = {called(one): stated(one, "Pt", 3) + stated(one, "Incertitude", 3, "1 1 1") for one in points}
+        seen = [
+            (called(one), called(image, "NameIm"), stated(one, "PtIm", 2))
+            for image in root.iter("MesureAppuiFlottant1Im")
+            for one in image.iter("OneMesureAF1I")
+        ]
     except ValueError as error:
         raise InputError(f"{path}: {MICMAC}, expected Pt of three numbers, PtIm of two ({plain(error)})") from error
-    if not rows and not ground:
+    if not seen and not ground:
         raise InputError(f"{path}: XML without OneAppuisDAF or OneMesureAF1I, so no points of MicMac's")
+    if not ground:
+        return GcpTable.of_rows(((n, file, *[NAN] * 3, *ALONE, *at, IMAGE_SIGMA) for n, file, at in seen), "image")
+    rows = [(n, file, *ground[n], *at, IMAGE_SIGMA) for n, file, at in seen if n in ground]
     alone = ((name, None, *place, NAN, NAN, IMAGE_SIGMA) for name, place in ground.items())
-    return GcpTable.of_rows(rows or alone, "" if rows and ground else "image" if rows else "ground")
+    return GcpTable.of_rows(rows or alone, "" if rows else "ground")
 
 
 GCP_FORMATS: dict[str, GcpFormat] = {
@@ -490,9 +511,7 @@ GCP_FORMATS: dict[str, GcpFormat] = {
     ),
     "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
     MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
-    "ENVI .pts": GcpFormat(
-        lambda text, _: text.startswith(";"), _read_envi_points, 1.5
-    ),  # corner of the first pixel: (1, 1)
+    "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1
     "QGIS .points": GcpFormat(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
     "ODM gcp_list.txt": GcpFormat(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
     "Metashape CSV": GcpFormat(

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import InputError, listed
-from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
+from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, BoolArray, HeightDatum
 from barpc.base.safe_io import TABLE, read_head
-from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, GcpTable, open_gcps
+from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, GcpTable, Row, open_gcps
 from barpc.pointio.names import ViewNames
 from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
 from barpc.rasters.dem import HeightGrid, datum_of
@@ -63,7 +63,7 @@ def read_gcps(path: Path | str, names: Sequence[str], frame: ControlReference | 
         raise InputError(f"{path}: {kind}, {error}") from error
     more = GCP_FORMATS[kind].more
     centre = f"the centre of its first pixel is ({more:g}, {more:g})" if more else ""
-    said = "; ".join(part for part in (centre, table.said, words, views.said()) if part)
+    said = "; ".join(filter(None, (centre, table.said, words, views.said())))
     return replace(points, strangers=tuple(views.strangers), said=(f"{path}: {kind}; {said}",) if said else ())
 
 
@@ -71,24 +71,32 @@ def _with_image_points(path: Path, kind: str, table: GcpTable, given: Sequence[P
     """Return ground points with the image points of their names in the files `given`, or MicMac's beside them."""
     if table.apart == "image":
         raise InputError(f"{path}: {kind}, image points alone; give the file of ground points with another --gcp")
-    files = [one for one in given if open_gcps(one)[1].apart == "image"]
+    files = _of_image_points(given)
     if not files and kind == MICMAC:
-        beside = [one for one in sorted(path.parent.glob("*.xml")) if b"SetOfMesureAppuis" in read_head(one, TABLE)]
-        files = [one for one in beside if one != path and open_gcps(one)[1].apart == "image"]
-    if not files or (len(files) > 1 and not set(files) <= set(given)):
+        beside = (one for one in sorted(path.parent.glob("*.xml")) if one != path)
+        files = _of_image_points([one for one in beside if b"SetOfMesureAppuis" in read_head(one, TABLE)])
+    if len(files) != 1 and not (files and set(files) <= set(given)):
         many = f", and image points in {listed([one.name for one in files])}" if files else ""
         raise InputError(
             f"{path}: {kind}, ground points (no column col, row){many}; give a file of image points with another --gcp"
         )
-    ground = dict(zip(table.names, table.numbers, strict=True))
-    rows = [
-        (name, image, *ground[name][:6], *numbers[6:])
-        for seen in (open_gcps(one)[1] for one in files)
-        for name, image, numbers in zip(seen.names, (seen.images or Texts.of(())).per_row(), seen.numbers, strict=True)
-        if name in ground
-    ]
     said = "; ".join(filter(None, (table.said, f"image points of {listed([one.name for one in files])}")))
+    rows = _joined(table, [open_gcps(one)[1] for one in files])
     return GcpTable.of_rows(rows)._replace(crs=table.crs, vertical=table.vertical, said=said)
+
+
+def _of_image_points(files: Sequence[Path]) -> list[Path]:
+    return [one for one in files if open_gcps(one)[1].apart == "image"]
+
+
+def _joined(table: GcpTable, parts: Sequence[GcpTable]) -> Iterator[Row]:
+    """Yield the ground points of a table at the image points of their names in others."""
+    ground = dict(zip(table.names, table.numbers, strict=True))
+    for seen in parts:
+        images = (seen.images or Texts.of(())).per_row()
+        for name, image, numbers in zip(seen.names, images, seen.numbers, strict=True):
+            if name in ground:
+                yield name, image, *ground[name][:6], *numbers[6:]
 
 
 def _views_of(table: GcpTable, path: Path, views: ViewNames) -> IntArray:
@@ -147,21 +155,27 @@ def _geolocated(place: Array, table: GcpTable, frame: ControlReference) -> tuple
         vertical = own if own.stated else vertical
     ground = place * (1.0, 1.0, vertical.metres)
     known = ~np.isnan(ground[:, 2]) & (ground[:, 2] != 0.0)  # 0 is what tools write where none is known
-    words += ["no altitudes"] if np.isnan(ground[:, 2]).all() else []
-    if vertical.metres != 1.0 and known.any():
-        words.append(f"altitudes in units of {vertical.metres:.12g} m")
     by_person = frame.heights
     if vertical.stated:
         by_person = frame.geoid if vertical.reference != ELLIPSOID else None
-    said = vertical.by(by_person)
-    if said.geoid is not None and known.any():
-        file, done, _ = geoid_of(vertical, said, by_person is not None)
-        words.append(f"altitudes above {vertical.reference if vertical.stated else by_person} {done}")
-        if file is not None:
-            ground[known, 2] += HeightGrid.open(file).sample(*ground[known, :2].T)
+    words += _lift(ground, known, vertical, by_person)
     ground[np.isnan(place[:, 2]), 2] = 0.0
     name = f"{known.sum()} GCP{'s' * int(known.sum() > 1)}"
-    return ground, datum_of(None if by_person else said, ground[known], "gcps", name), "; ".join(words)
+    said = None if by_person else vertical.by(by_person)
+    return ground, datum_of(said, ground[known], "gcps", name), "; ".join(words)
+
+
+def _lift(ground: Array, known: BoolArray, vertical: Vertical, by_person: str | None) -> Iterator[str]:
+    """Add the geoid to the altitudes of those points (N, 3) that are `known`, in place; yield what was done."""
+    if np.isnan(ground[:, 2]).all():
+        yield "no altitudes"
+    if vertical.metres != 1.0 and known.any():
+        yield f"altitudes in units of {vertical.metres:.12g} m"
+    if (said := vertical.by(by_person)).geoid is not None and known.any():
+        file, done, _ = geoid_of(vertical, said, by_person is not None)
+        yield f"altitudes above {vertical.reference if vertical.stated else by_person} {done}"
+        if file is not None:
+            ground[known, 2] += HeightGrid.open(file).sample(*ground[known, :2].T)
 
 
 # --- reference systems ----------------------------------------------------------------------------------

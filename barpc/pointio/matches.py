@@ -29,7 +29,7 @@ from barpc.pointio.third_party_matches import (
     read_hloc,
     read_pair_files,
 )
-from barpc.scene import IntArray, Tracks, connected_labels
+from barpc.scene import IntArray, Tracks, connected_labels, row_pairs
 
 _MATCH_COLUMNS = ("image", "col", "row", "track")
 _NO_TRACK = "no track is seen in two of the views"
@@ -80,13 +80,7 @@ class Links:
     def of_tracks(view: IntArray, track: IntArray, xy: Array, sigma: Array) -> Links:
         """Return the observations of tracks: each is linked to the next ones of its track."""
         order = np.lexsort((view, track))
-        label, ends = track[order], [np.zeros((0, 2), dtype=np.int64)]
-        for step in range(1, min(_MAX_LINKED_DISTANCE, len(view) - 1) + 1):
-            same = np.flatnonzero(label[step:] == label[:-step])
-            if not len(same):
-                break
-            ends.append(np.column_stack([order[same], order[same + step]]))
-        return Links(view, xy, sigma, np.concatenate(ends))
+        return Links(view, xy, sigma, order[row_pairs(track[order], _MAX_LINKED_DISTANCE).T])
 
     @property
     def joins_views(self) -> bool:
@@ -112,7 +106,7 @@ def read_links(path: Path | str, names: Sequence[str]) -> Links:
         raise InputError(f"{path}: cannot be read as tie points ({plain(error)})") from error
     if not (np.isfinite(links.xy).all() and np.isfinite(links.sigma).all() and (links.sigma > 0).all()):
         raise InputError(f"{path}: a coordinate is not finite, or a sigma not positive")
-    if not links.joins_views and not _named_after_pairs(path, views):
+    if not links.joins_views and all(pair_of(one, views) is None for one in pair_files(path)):
         others = ", ".join(name[:60] for name in [*views.strangers][:3])
         found = f"; it names {others}, and the images are {', '.join(views.names[:3])}" if others else ""
         raise InputError(f"{path}: {_NO_TRACK}{found}")
@@ -170,10 +164,6 @@ def _read_by_kind(path: Path, views: ViewNames) -> Links:
     if ending == ".npz" or pair_files(path):
         return Links.of_pairs(read_pair_files([path], views))
     return _read_matches_csv(path, views)
-
-
-def _named_after_pairs(path: Path, views: ViewNames) -> bool:
-    return any(pair_of(one, views) is not None for one in pair_files(path))
 
 
 def _read_matches_csv(path: Path, views: ViewNames) -> Links:

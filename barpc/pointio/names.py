@@ -40,6 +40,24 @@ def unique_names(files: Sequence[PathOrUrl]) -> list[str]:
     ['img.tif', 'img.jp2']
     """
     places = [pure(file) for file in dict.fromkeys(files)]
+    names = _told_apart(places)
+    for name, file in zip(names, places, strict=True):
+        if name.startswith("."):
+            raise InputError(
+                f"{file}: its name in this run, {name!r}, begins with a dot, and files of such names are hidden; "
+                "rename it, or give a link to it"
+            )
+        if len(os.fsencode(name)) > MAX_NAME:
+            raise InputError(
+                f"{file}: its name in this run has more than {MAX_NAME} bytes, too long for the files that carry it;"
+                " rename it, or give a link with a shorter name"
+            )
+    found = dict(zip(dict.fromkeys(files), names, strict=True))
+    return [found[file] for file in files]
+
+
+def _told_apart(places: Sequence[PurePath]) -> list[str]:
+    """Return the stems of files behind as many of their folders as make the names different."""
     stems = Counter((file.parent, _folded(file.stem)) for file in places)
     ends = [file.stem if stems[file.parent, _folded(file.stem)] == 1 else file.name for file in places]
     depth = [1] * len(places)
@@ -57,19 +75,7 @@ def unique_names(files: Sequence[PathOrUrl]) -> list[str]:
         raise InputError(
             f"{places[again[0]]} and {places[twin]}: their names cannot be told apart; rename one, or give a link to it"
         )
-    for name, file in zip(names, places, strict=True):
-        if name.startswith("."):
-            raise InputError(
-                f"{file}: its name in this run, {name!r}, begins with a dot, and files of such names are hidden; "
-                "rename it, or give a link to it"
-            )
-        if len(os.fsencode(name)) > MAX_NAME:
-            raise InputError(
-                f"{file}: its name in this run has more than {MAX_NAME} bytes, too long for the files that carry it;"
-                " rename it, or give a link with a shorter name"
-            )
-    found = dict(zip(dict.fromkeys(files), names, strict=True))
-    return [found[file] for file in files]
+    return names
 
 
 def _folded(name: str) -> str:

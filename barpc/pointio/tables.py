@@ -58,28 +58,28 @@ def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[st
     in words, which were guessed so; and what the altitude's name says of it. InputError where two could be that.
     """
     if {"X", "Y", "x", "y"} <= set(words):  # where the case alone tells them apart, as scripts for Metashape write it
-        words = [
-            f"map_{word}" if word in ("X", "Y", "Z") else f"px_{word}" if word in ("x", "y") else word for word in words
-        ]
+        words = [_BY_CASE.get(word, word) for word in words]
     bare = [_bare(word) for word in words]
-    found = header_of(bare, {**COLUMNS, **known})
-    exact = dict(found)
+    exact = header_of(bare, {**COLUMNS, **known})
+    found = dict(exact)
     if {"x", "y"} <= set(bare) and not {"lon", "lat", "col", "row"} & set(found):
         pair = ("east", "north") if "alt" in found else ("col", "row")
         found |= {key: bare.index(word) for key, word in zip(pair, "xy", strict=True)}
-    for key, pattern in _LIKE.items():
-        free = [i for i, word in enumerate(bare) if i not in found.values() and not _ERRORS.match(word)]
-        hits = [i for i in free if pattern.fullmatch(bare[i])]
-        if key in found or not hits:
-            continue
-        above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]
-        if key == "alt" and len(hits) > 1 and len(above) != 1:
-            raise InputError(
-                f"columns {' and '.join(repr(words[i]) for i in hits)} could be the altitude; rename one alt"
-            )
-        found[key] = (above or hits)[0]
+    for key in (key for key in _LIKE if key not in found):
+        if (place := _alike(key, words, bare, found.values())) is not None:
+            found[key] = place
     said = [f"column {words[i]!r} is {key}" for key, i in found.items() if exact.get(key) != i]
     return found, said, vertical_of_column(words[found["alt"]] if "alt" in found else "")
+
+
+def _alike(key: str, words: Sequence[str], bare: Sequence[str], taken: Collection[int]) -> int | None:
+    """Return the column not `taken` yet with a name like a quantity's; InputError where two could be the altitude."""
+    free = (i for i, word in enumerate(bare) if i not in taken and not _ERRORS.match(word))
+    hits = [i for i in free if _LIKE[key].fullmatch(bare[i])]
+    above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]
+    if key == "alt" and len(hits) > 1 and len(above) != 1:
+        raise InputError(f"columns {' and '.join(repr(words[i]) for i in hits)} could be the altitude; rename one alt")
+    return next(iter(above or hits), None)
 
 
 def vertical_of_column(word: str) -> Vertical:
@@ -142,6 +142,7 @@ _LIKE = {
 """What columns that nobody lists are taken for: the log says so."""
 
 
+_BY_CASE = {"X": "map_X", "Y": "map_Y", "Z": "map_Z", "x": "px_x", "y": "px_y"}
 _PIXELS = re.compile(r"(?i)^\s*([xyuv])\s*[\[(]\s*(px|pix|pixels?)\s*[\])]\s*$")
 
 
@@ -174,23 +175,15 @@ def degrees(text: str, axis: str) -> float:
     found = _DEGREES.fullmatch(text.strip().replace("−", "-"))
     if found is None:
         raise ValueError(f"{text[:40]!r} is no number, and no degrees, minutes and seconds")
-    before, whole, *parts, behind = found.groups()
-    sign, letters = -1.0 if whole.startswith("-") else 1.0, (before or "") + (behind or "")
-    numbers = [float(part.replace(",", ".")) for part in (whole.lstrip("+-"), *parts) if part]
-    if len(letters) > 1 or (letters and (sign < 0 or (letters in "NS") != (axis == "lat"))):
+    before, whole, *parts, behind = found.groups("")
+    signs = before + behind + "-" * whole.startswith("-")
+    numbers = np.array([part.replace(",", ".") for part in (whole.lstrip("+-"), *parts) if part], dtype=np.float64)
+    if signs not in ("", "-", *("NS" if axis == "lat" else "EW")):
         raise ValueError(f"{text[:40]!r} is no {axis}")
-    if any(number >= 60.0 for number in numbers[1:]) or any(number % 1.0 for number in numbers[:-1]):
+    if (numbers[1:] >= 60.0).any() or (numbers[:-1] % 1.0).any():
         raise ValueError(f"{text[:40]!r} is no degrees, minutes and seconds")
-    value = sum(number / 60.0**k for k, number in enumerate(numbers))
-    return float(np.round(value, 12)) * (-1.0 if letters and letters in "SW" else sign)
-
-
-def number_of(text: str) -> float:
-    """Return a cell as a number; ValueError where it is none."""
-    found = numbers_of([text])
-    if found is None:
-        raise ValueError(f"{text[:40]!r} is no number")
-    return found[0]
+    value = (numbers / 60.0 ** np.arange(len(numbers))).sum()
+    return float(np.round(value, 12)) * (-1.0 if signs in ("-", "S", "W") else 1.0)
 
 
 def first_words(head: bytes) -> list[str]:

@@ -161,12 +161,8 @@ def _asp_binary(path: Path) -> tuple[Array, Array]:
         size = _ASP_KEYPOINT_BYTES + 4 * int(np.frombuffer(data, "<u8", 1, 16 + _ASP_KEYPOINT_BYTES - 8)[0])
         if count != other or 16 + 2 * count * size != len(data):
             raise ValueError(f"{len(data)} bytes are not {count} and {other} keypoints of {size} bytes")
-        layout: Any = {
-            "names": ["xy", "length"],
-            "formats": [("<f4", 2), "<u8"],
-            "offsets": [0, _ASP_KEYPOINT_BYTES - 8],
-        }
-        layout["itemsize"] = size
+        layout: Any = {"names": ["xy", "length"], "formats": [("<f4", 2), "<u8"], "itemsize": size}
+        layout["offsets"] = [0, _ASP_KEYPOINT_BYTES - 8]
         records: Any = np.frombuffer(data, np.dtype(layout), 2 * count, 16)
         if len(set(records["length"].tolist())) != 1:
             raise ValueError("descriptors of unlike lengths")

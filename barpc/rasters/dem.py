@@ -19,19 +19,16 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 from rasterio import Affine
-from rasterio._err import CPLE_BaseError
 from rasterio.coords import BoundingBox
 from rasterio.crs import CRS
-from rasterio.errors import CRSError
 from rasterio.transform import array_bounds
-from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
 from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
 from barpc.base.remote import PathOrUrl, location
 from barpc.base.safe_io import GRID, opened
-from barpc.rasters.raster import open_raster
+from barpc.rasters.raster import open_raster, reprojected
 from barpc.rasters.vertical import ELLIPSOID, NO_GEOID, Vertical, geoid_file, geoid_of, vertical_of
 from barpc.sensor import SensorModel
 
@@ -109,32 +106,14 @@ class HeightGrid:
         if self.crs.is_geographic:
             x, y = self.west + np.mod(lon - self.west, 360.0), lat
         else:
-            x, y = self._warped(CRS.from_epsg(4326), self.crs, lon, lat)
-        a, b, c, d, e, f = self.to_pixel[:6]
-        return _snapped(d * x + e * y + f - 0.5), _snapped(a * x + b * y + c - 0.5)
+            x, y = reprojected(self.path, CRS.from_epsg(4326), self.crs, lon, lat)
+        col, row = self.to_pixel * (x, y)
+        return _snapped(row - 0.5), _snapped(col - 0.5)
 
     def place(self, row: Array, col: Array) -> tuple[Array, Array]:
         """Return the lon, lat (N,) [deg] of fractional row, col (N,), the inverse of `locate`."""
-        a, b, c, d, e, f = (~self.to_pixel)[:6]
-        x, y = a * (col + 0.5) + b * (row + 0.5) + c, d * (col + 0.5) + e * (row + 0.5) + f
-        return (x, y) if self.crs.is_geographic else self._warped(self.crs, CRS.from_epsg(4326), x, y)
-
-    def _warped(self, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return places (N,) in another CRS, NaN where there is none, as far from a map's zone."""
-        found, known = np.full((2, len(x)), np.nan), np.isfinite(x) & np.isfinite(y)
-        try:
-            try:
-                found[:, known] = warp_points(start, end, x[known], y[known])
-            except CPLE_BaseError:  # of one place: GDAL does not say of which
-                from pyproj import Transformer
-
-                to = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True)
-                both = np.array(to.transform(x[known].tolist(), y[known].tolist()))
-                known[known] = np.isfinite(both).all(axis=0)
-                found[:, known] = warp_points(start, end, x[known], y[known])
-        except (CRSError, CPLE_BaseError) as error:
-            raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
-        return found[0], found[1]
+        x, y = ~self.to_pixel * (col + 0.5, row + 0.5)
+        return (x, y) if self.crs.is_geographic else reprojected(self.path, self.crs, CRS.from_epsg(4326), x, y)
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:
         """Return the bilinear heights (...) [m] at lon, lat (...) [deg]; NaN outside and where a void has weight."""
@@ -238,16 +217,7 @@ class Dem:
         """
         said = None if geoid is None else os.fspath(geoid)
         grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, Path)) else path)]
-        taken: list[str | None] = [said] * len(grids)
-        if len(grids) > 1 and said is not None:
-            taken = [said if _needs_geoid(grid.vertical, said) else None for grid in grids]
-            if not any(taken):
-                names = ", ".join(os.fspath(grid.path) for grid in grids)
-                raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
-        taken = [
-            heights if of is None and not grid.vertical.stated else of for grid, of in zip(grids, taken, strict=True)
-        ]
-        first, *others = [cls._of(*both) for both in zip(grids, taken, strict=True)]
+        first, *others = [cls._of(*both) for both in zip(grids, _given_geoids(grids, said, heights), strict=True)]
         words, known = "; ".join(one.description for one in (first, *others)), all(o.known for o in (first, *others))
         return replace(first, description=words, known=known, after=tuple(others))
 
@@ -352,6 +322,15 @@ class Dem:
             return posts, -np.inf, np.inf
         bend = float(np.ptp(lift[np.isfinite(lift)]))  # of the geoid: between the lines' ends no more again
         return posts, lowest + float(np.nanmin(lift)) - bend, highest + float(np.nanmax(lift)) + bend
+
+
+def _given_geoids(grids: Sequence[HeightGrid], said: str | None, heights: str | None) -> list[str | None]:
+    """Return the geoid that the user gives each DEM, None: none; InputError where several need none of the one said."""
+    needy = [grid for grid in grids if said is not None and (len(grids) == 1 or _needs_geoid(grid.vertical, said))]
+    if said is not None and not needy:
+        names = ", ".join(os.fspath(grid.path) for grid in grids)
+        raise InputError(f"{names}: each says what its heights count from; leave out the geoid {said}")
+    return [said if grid in needy else None if grid.vertical.stated else heights for grid in grids]
 
 
 def _needs_geoid(own: Vertical, said: str) -> bool:

@@ -20,12 +20,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rasterio
+from rasterio._err import CPLE_BaseError
 from rasterio.control import GroundControlPoint
 from rasterio.coords import BoundingBox
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import array_bounds
+from rasterio.warp import transform as warp_points
 from rasterio.windows import Window
 
 from barpc.base import identity
@@ -168,6 +170,27 @@ def map_crs(given: str | None, middle: Array) -> CRS:
     return found
 
 
+def reprojected(path: PathOrUrl | str, start: CRS, end: CRS, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return places (N,) in another CRS, NaN where there is none, as far from a map's zone.
+
+    InputError, which names the file `path` that they are of, where one CRS does not lead to the other.
+    """
+    found, known = np.full((2, len(x)), np.nan), np.isfinite(x) & np.isfinite(y)
+    try:
+        try:
+            found[:, known] = warp_points(start, end, x[known], y[known])
+        except CPLE_BaseError:  # of one place: GDAL does not say of which
+            from pyproj import Transformer
+
+            to = Transformer.from_crs(start.to_wkt(), end.to_wkt(), always_xy=True)
+            both = np.array(to.transform(x[known].tolist(), y[known].tolist()))
+            known[known] = np.isfinite(both).all(axis=0)
+            found[:, known] = warp_points(start, end, x[known], y[known])
+    except (CRSError, CPLE_BaseError) as error:
+        raise InputError(f"{path}: lon, lat cannot be brought into its CRS ({error})") from error
+    return found[0], found[1]
+
+
 def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
@@ -291,14 +314,13 @@ class Mosaic:
             return None
         dataset = self._dataset(file := files.pop())
         whole = (0, 0, self.width, self.height)
-        for band, mask in ((b, b is self._vrt.mask) for b in (*self._vrt.bands, self._vrt.mask) if b):
-            source = Source(file, 1 if mask else self._vrt.bands.index(band) + 1, mask, whole, whole)
-            found = [replace(s, src=s.src or whole, dst=s.dst or whole) for s in band.sources]
-            if found != [source]:
-                return None
-        nodata = ([v if v is None else float(v) for v in d.nodatavals] for d in (dataset, self))
+        wanted = [(Source(file, number, False, whole, whole),) for number in self.indexes]
+        wanted += [(Source(file, 1, True, whole, whole),)] * (self._vrt.mask is not None)
+        shown = [tuple(replace(s, src=s.src or whole, dst=s.dst or whole) for s in b.sources) for b in self._vrt.all]
         same = (dataset.shape, dataset.dtypes) == (self.shape, self.dtypes)
-        return file if same and len({str(values) for values in nodata}) == 1 else None  # as text: NaN is NaN
+        nodata = ([v if v is None else float(v) for v in d.nodatavals] for d in (dataset, self))
+        same &= len({str(values) for values in nodata}) == 1  # as text: NaN is NaN
+        return file if same and shown == wanted else None
 
     def _box(self, window: Window | None) -> Rect:
         if window is None:

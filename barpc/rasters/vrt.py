@@ -136,9 +136,14 @@ class Vrt:
     gcps: tuple[dict[str, str], ...]  # their attributes, as they stand
 
     @property
+    def all(self) -> list[Band]:
+        """The bands and, where there is one, the mask."""
+        return [*self.bands, *filter(None, [self.mask])]
+
+    @property
     def sources(self) -> list[Source]:
         """Sources of all bands and of the mask."""
-        return [s for band in (*self.bands, *([self.mask] if self.mask else [])) for s in band.sources]
+        return [source for band in self.all for source in band.sources]
 
 
 def read_vrt(path: Path, *, name: str | None = None) -> Vrt:

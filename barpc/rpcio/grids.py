@@ -198,8 +198,7 @@ def _interpolated(pixels: PixelArray, known: BoolArray, place: Array) -> Array:
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
     coefficients = spline_filter(values, order=3, mode="mirror")
-    found: Array = map_coordinates(coefficients, place, order=3, mode="mirror", prefilter=False)
-    return found
+    return map_coordinates(coefficients, place, order=3, mode="mirror", prefilter=False)
 
 
 def _stored(values: Array, shown: BoolArray, dtype: np.dtype[Any], nodata: float | None) -> PixelArray:

@@ -216,9 +216,7 @@ def _copy_window(dataset: Any, partial: Path, target: Path, window: Window) -> N
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **TIFF_PROFILE}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
     if dataset.crs is not None:
-        a, b, x, d, e, y = dataset.transform[:6]
-        col, row = window.col_off, window.row_off
-        moved = rasterio.Affine(a, b, x + a * col + b * row, d, e, y + d * col + e * row)
+        moved = dataset.transform * rasterio.Affine.translation(window.col_off, window.row_off)
         profile |= {"crs": dataset.crs, "transform": moved}
 
     def part(block: Window) -> Window:

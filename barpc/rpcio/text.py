@@ -17,7 +17,7 @@ import numpy as np
 
 from barpc.base.errors import RpcError, RpcFormatError, plain
 from barpc.base.safe_io import encoding_of, parse_json
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, RPCM_NAMES
 
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
@@ -180,24 +180,28 @@ def rpc_from_fields(
     """
     if options is not None and options.first_pixel is not None:
         first_pixel = options.first_pixel
-    lists = LISTS if any(key in fields for key in DIRECT) else COEFFICIENTS
-    for key, count in [*((k, 1) for k in OFFSETS + SCALES), *((k, 20) for k in lists)]:
+    lists = LISTS if fields.keys() & set(DIRECT) else COEFFICIENTS
+    _require_fields(fields, lists, name)
+    single = np.array([fields[key][0] for key in OFFSETS + SCALES])
+    single[:2] -= first_pixel
+    bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
+    try:
+        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
+        return RPC.of_numbers([*single, *(fields[key] for key in COEFFICIENTS)], bias, rand, direct)
+    except RpcError as error:
+        raise RpcFormatError(f"{name}: {error}") from error
+
+
+def _require_fields(fields: Mapping[str, Sequence[float]], lists: Sequence[str], name: str) -> None:
+    for key, count in (dict.fromkeys(OFFSETS + SCALES, 1) | dict.fromkeys(lists, 20)).items():
         found = len(fields.get(key, ()))
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
             raise RpcFormatError(f"{name}: {key} {what}")
     for axis in ("LAT", "LONG", "HEIGHT"):
-        both = [getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")]
-        if None in both and set(both) - {None, 1.0}:
+        both = {getattr(fields[f"{axis}_{part}"][0], "size", None) for part in ("OFF", "SCALE")}
+        if None in both and both - {None, 1.0}:
             raise RpcFormatError(f"{name}: of {axis}_OFF and {axis}_SCALE one states a unit, the other none")
-    try:
-        image = [fields[key][0] - first_pixel for key in OFFSETS[:2]]
-        numbers = [*image, *(fields[key][0] for key in OFFSETS[2:] + SCALES), *(fields[key] for key in COEFFICIENTS)]
-        bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
-        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
-        return RPC.of_numbers(numbers, bias, rand, direct)
-    except RpcError as error:
-        raise RpcFormatError(f"{name}: {error}") from error
 
 
 def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
@@ -416,14 +420,9 @@ def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc
 
 
-# The errors are not rpcm's own; it passes over them.
-_RPCM_WORDS = (
-    "err_bias err_rand row_offset col_offset lat_offset lon_offset alt_offset row_scale col_scale lat_scale lon_scale "
-    "alt_scale row_num row_den col_num col_den"
-)
-_RPCM_KEYS = dict(zip(KEYS, _RPCM_WORDS.split(), strict=True))
-_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 _LOWER_KEYS = {key: key.lower() for key in KEYS}
+_RPCM_KEYS = _LOWER_KEYS | dict(zip(KEYS[2:], RPCM_NAMES, strict=True))  # the errors are not rpcm's own
+_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 
 
 def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:

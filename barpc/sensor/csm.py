@@ -41,13 +41,11 @@ _EXTRA_SAMPLES = 4  # samples before and after the image: readers interpolate th
 _ATTITUDE_COLUMNS = 9  # of a row, through which its attitude goes
 
 _DEFAULT_STATE: dict[str, Any] = {
-    "m_centerEphemerisTime": 0.0,
+    **{f"m_starting{what}": 0.0 for what in ("DetectorLine", "DetectorSample", "EphemerisTime")},
+    **dict.fromkeys(("m_centerEphemerisTime", "m_detectorLineOrigin", "m_detectorSampleOrigin"), 0.0),
+    **dict.fromkeys(("m_detectorLineSumming", "m_detectorSampleSumming", "m_zDirection"), 1.0),
     "m_covariance": [0.0] * 256,
     "m_currentParameterValue": [0.0] * 16,
-    "m_detectorLineOrigin": 0.0,
-    "m_detectorLineSumming": 1.0,
-    "m_detectorSampleOrigin": 0.0,
-    "m_detectorSampleSumming": 1.0,
     "m_distortionType": 0,
     "m_ikCode": 0,
     "m_imageIdentifier": "",
@@ -62,12 +60,8 @@ _DEFAULT_STATE: dict[str, Any] = {
     "m_platformIdentifier": "",
     "m_sensorIdentifier": "barpc",
     "m_sensorName": "USGSAstroLineScanner",
-    "m_startingDetectorLine": 0.0,
-    "m_startingDetectorSample": 0.0,
-    "m_startingEphemerisTime": 0.0,
     "m_sunPosition": [0.0] * 3,
     "m_sunVelocity": [0.0] * 3,
-    "m_zDirection": 1.0,
 }
 
 

@@ -89,16 +89,11 @@ class DirectGrid(Pointwise):
     @classmethod
     def from_points(cls, ground: npt.ArrayLike, image: npt.ArrayLike) -> DirectGrid:
         """Return the grid of nodes ground (N, 3), image (N, 2) in any order; RpcError if one is missing."""
-        ground = np.asarray(ground, dtype=np.float64)
-        image = np.asarray(image, dtype=np.float64)
-        values = (ground[:, 2], image[:, 1], image[:, 0])
-        axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
-        shape = tuple(len(axis) for axis in axes)
-        if len(ground) != np.prod(shape):
-            raise RpcError(f"localisation grid: {len(ground)} points do not fill a grid of {shape} nodes")
-        lonlat = np.full((*shape, 2), np.nan)
-        lonlat[places] = ground[:, :2]
-        return cls(axes[2], axes[1], axes[0], lonlat)
+        (alts, rows, cols), nodes = nodes_of(np.asarray(ground, np.float64), np.asarray(image, np.float64))
+        if nodes is None:
+            shape = len(alts), len(rows), len(cols)
+            raise RpcError(f"localisation grid: {len(np.asarray(ground))} points do not fill a grid of {shape} nodes")
+        return cls(cols, rows, alts, nodes[..., :2])
 
     @classmethod
     def of(
@@ -183,6 +178,20 @@ class DirectGrid(Pointwise):
         (a, b), (c, d) = self._value(image, alt, (0, 0, 1)).T, self._value(image, alt, (0, 1, 0)).T
         det = a * d - b * c
         return np.stack([d / det, -b / det], axis=1), np.stack([-c / det, a / det], axis=1)
+
+
+def nodes_of(ground: Array, image: Array) -> tuple[list[Array], Array | None]:
+    """Return the altitudes, rows and columns of points (N, 3), (N, 2), and these as nodes (L, H, W, 3), if they fill a
+    grid; a node without a point is NaN.
+    """
+    values = (ground[:, 2], image[:, 1], image[:, 0])
+    axes, places = zip(*(np.unique(value, return_inverse=True) for value in values), strict=True)
+    shape = tuple(len(axis) for axis in axes)
+    if len(ground) != np.prod(shape):
+        return list(axes), None
+    nodes = np.full((*shape, 3), np.nan)
+    nodes[places] = ground
+    return list(axes), nodes
 
 
 def _inverse_cubic(axes: tuple[Array, Array, Array], lonlat: Array) -> Array:

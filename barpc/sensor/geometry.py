@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import (
+    NEWTON_STEPS,
     Array,
     BoolArray,
     IntArray,
@@ -32,6 +33,7 @@ CenterMethod = Literal["line", "projective", "nominal", "stated"]
 _RAYS = 41  # of a line
 LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
+GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
@@ -55,7 +57,7 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
 
 
 def image_grid(
-    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = (11, 5)
+    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = GRID_NODES
 ) -> tuple[Array, Array]:
     """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
     col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
@@ -63,31 +65,21 @@ def image_grid(
     return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
 
 
-def footprint(sensor: SensorModel, size: tuple[int, int], alt: float | npt.ArrayLike, per_side: int = 8) -> Array:
-    """Return the outline of an image on the ground.
+def footprint(sensor: SensorModel, size: tuple[int, int], alt: npt.ArrayLike) -> Array:
+    """Return the outline (32, 2) of an image of `size` (width, height) on the ground: lon, lat [deg], not closed.
 
-    Parameters
-    ----------
-    size : (width, height) [px]
-    alt : float or (4 per_side,), altitude of the ground [m above the ellipsoid]
-    per_side : int, points on each side; an edge is a curve on the ground
-
-    Returns
-    -------
-    ring : (4 per_side, 2), lon, lat [deg], not closed; longitudes run on across the antimeridian
+    `alt` [m above the ellipsoid]: of the ground, or of each point (32,) of the outline (`image_border`). Longitudes run
+    on across the antimeridian.
     """
-    border = image_border(size, per_side)
-    ring = sensor.localize(border, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(border)))[:, :2]
-    ring[:, 0] = wrap_longitude(ring[:, 0], ring[0, 0])
-    return ring
+    return np.asarray(footprints([sensor], [size], alt)[0])
 
 
 def footprints(sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt: npt.ArrayLike) -> Array:
-    """Return the outlines (N, 32, 2) of images on the ground at an altitude [m], or each at its own: `footprint`s."""
+    """Return the outlines (N, 32, 2) of images on the ground, at an altitude [m] or one each (N, 1): `footprint`s."""
     borders = np.array([image_border(size) for size in sizes]).reshape(len(sizes), -1, 2)
-    alts = np.repeat(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(sizes)), borders.shape[1])
+    alts = np.broadcast_to(np.asarray(alt, dtype=np.float64), borders.shape[:2])
     bounds = borders.shape[1] * np.arange(len(sizes) + 1)
-    rings = localize_stack(sensors, borders.reshape(-1, 2), alts, bounds)[:, :2].reshape(borders.shape)
+    rings = localize_stack(sensors, borders.reshape(-1, 2), alts.ravel(), bounds)[:, :2].reshape(borders.shape)
     rings[..., 0] = wrap_longitude(rings[..., 0], rings[:, :1, 0])
     return rings
 
@@ -231,7 +223,7 @@ class Several:
 
 
 def ground_grids(
-    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = (11, 5)
+    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = GRID_NODES
 ) -> list[Array]:
     """Return ground points over images and their altitudes and where their cameras see them: rows (n, 5) of each.
 
@@ -442,7 +434,7 @@ def triangulate(
     sigma: Array | None = None,
     *,
     alt: float | npt.ArrayLike = 0.0,
-    steps: int = 10,
+    steps: int = NEWTON_STEPS,
 ) -> Triangulation:
     """Intersect the rays of tracks: batched Gauss-Newton on the reprojection error.
 
@@ -502,7 +494,7 @@ def _intersect(
     return ground, ok
 
 
-def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array, steps: int = 10) -> Array:
+def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array) -> Array:
     """Return the ground points (n, 3) [deg, deg, m] of matches of two images, as `triangulate` finds their tracks.
 
     Parameters
@@ -518,7 +510,7 @@ def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Arr
         ground = pair[0].localize(image[0], alt)
         lost = np.isnan(ground[:, 0])
         ground[lost] = pair[1].localize(image[1][lost], alt[lost])
-        for _ in range(steps):
+        for _ in range(NEWTON_STEPS):
             scale = metres_per_unit(ground)
             seen, slopes = zip(*(sensor.project_jacobian(ground) for sensor in pair), strict=True)
             residual = np.concatenate([one.T for one in seen]) - goal

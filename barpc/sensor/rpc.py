@@ -22,12 +22,16 @@ _RASTERIO = [
     *(f"{axis}_{part}" for part in ("off", "scale") for axis in ("line", "samp", "lat", "long", "height")),
     *(f"{axis}_{part}_coeff" for axis in ("line", "samp") for part in ("num", "den")),
 ]
-_RPCM_ATTRIBUTES = [
+RPCM_NAMES = [
     *(f"{axis}_{part}" for part in ("offset", "scale") for axis in ("row", "col", "lat", "lon", "alt")),
     *(f"{axis}_{part}" for axis in ("row", "col") for part in ("num", "den")),
 ]
 _RPCM_DIRECT = ["lon_num", "lon_den", "lat_num", "lat_den"]
 _ACCURACIES = ["err_bias", "err_rand"]
+_AXIS_ORDER, _POLYNOMIALS = (
+    [1, 0, 3, 2, 4],
+    [2, 3, 0, 1],
+)  # of files (row, col, lat, lon, alt; row's first) and, alike, of ours
 _ACCURACY = 1e-9  # px: a localised point must project this near to where it was asked (plus rounding)
 _MAX_BATCHED_POINTS = 1024  # points of a view: its own inverse is sooner made
 _NEWTON_SHRINK = 0.25  # of the step before: nothing singular is near (Kantorovich: a half)
@@ -104,18 +108,10 @@ class RPC(Pointwise):
 
         An accuracy of zero and below means that nobody knows it, not that it is perfect.
         """
-        row, col, lat, lon, alt, *scales = values[:10]
-        row_num, row_den, col_num, col_den = values[10:]
-        return cls(
-            np.array([col_num, col_den, row_num, row_den], dtype=np.float64),
-            np.array([lon, lat, alt], dtype=np.float64),
-            np.array([scales[i] for i in (3, 2, 4)], dtype=np.float64),
-            np.array([col, row], dtype=np.float64),
-            np.array([scales[i] for i in (1, 0)], dtype=np.float64),
-            float(bias) if bias and 0 < bias < np.inf else None,
-            float(rand) if rand and 0 < rand < np.inf else None,
-            direct,
-        )
+        offset, scale = (np.array(values[i : i + 5], dtype=np.float64)[_AXIS_ORDER] for i in (0, 5))
+        bias, rand = (float(error) if error and 0 < error < np.inf else None for error in (bias, rand))
+        coeffs = np.array(values[10:], dtype=np.float64)[_POLYNOMIALS]
+        return cls(coeffs, offset[2:], scale[2:], offset[:2], scale[:2], bias, rand, direct)
 
     def numbers(self) -> list[Any]:
         """Return fourteen values in the order of RPC files.
@@ -123,14 +119,9 @@ class RPC(Pointwise):
         Offsets of row, col, lat, lon, alt, their scales, then lists of twenty: numerator and denominator of the row, of
         the column.
         """
-        (col, row), (lon, lat, alt) = self.image_offset.tolist(), self.ground_offset.tolist()
-        (col_scale, row_scale), (lon_scale, lat_scale, alt_scale) = (
-            self.image_scale.tolist(),
-            self.ground_scale.tolist(),
-        )
-        col_num, col_den, row_num, row_den = self.coeffs.tolist()
-        scales = [row_scale, col_scale, lat_scale, lon_scale, alt_scale]
-        return [row, col, lat, lon, alt, *scales, row_num, row_den, col_num, col_den]
+        offset = np.append(self.image_offset, self.ground_offset)[_AXIS_ORDER]
+        scale = np.append(self.image_scale, self.ground_scale)[_AXIS_ORDER]
+        return [*offset.tolist(), *scale.tolist(), *self.coeffs[_POLYNOMIALS].tolist()]
 
     @classmethod
     def from_rasterio(cls, rpcs: Any) -> RPC:
@@ -155,7 +146,7 @@ class RPC(Pointwise):
     def from_rpcm(cls, model: Any) -> RPC:
         """Return the RPC of an ``rpcm.RPCModel``, its localisation RPC with it; RpcError where it lacks a number."""
         direct = [getattr(model, name, None) for name in _RPCM_DIRECT]
-        rpc = cls._of_attributes(model, _RPCM_ATTRIBUTES)
+        rpc = cls._of_attributes(model, RPCM_NAMES)
         return rpc if None in direct else replace(rpc, direct=np.array(direct, dtype=np.float64))
 
     def to_rpcm_dict(self) -> dict[str, Any]:
@@ -168,7 +159,7 @@ class RPC(Pointwise):
         >>> RPC.from_rpcm(SimpleNamespace(**rpc.to_rpcm_dict())) == rpc
         True
         """
-        named = dict(zip(_RPCM_ATTRIBUTES, self.numbers(), strict=True))
+        named = dict(zip(RPCM_NAMES, self.numbers(), strict=True))
         if self.direct is not None:
             named |= dict(zip(_RPCM_DIRECT, self.direct.tolist(), strict=True))
         return named | {key: value for key in _ACCURACIES if (value := getattr(self, key))}

@@ -312,8 +312,7 @@ class Monostatic(Clocked):
 def _solve_systems(matrix: Array, right: Array) -> Array:
     """Return the solutions (2, N) of 2 x 2 systems (2, 2, N)."""
     (a, b), (c, d) = matrix
-    solved: Array = np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
-    return solved
+    return np.asarray(np.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c))
 
 
 _ORDER = 30  # no polynomial of a document has so high a power
@@ -393,8 +392,9 @@ def open_sicd(path: Path) -> Monostatic:
         raise RpcFormatError(f"{path}: GeoData/SCP/ECF is {altitude:.0f} m above the ellipsoid, not on the ground")
     first = [_integer(root, f"ImageData/First{axis}") for axis in ("Row", "Col")]
     center = [_integer(root, f"ImageData/SCPPixel/{axis}") for axis in ("Row", "Col")]
+    arp = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
     model = Monostatic(
-        orbit=_read_orbit(root),
+        orbit=Curve.polynomial(arp.T, 0.0, root.positive("Timeline/CollectDuration")),
         formation=_formation(root, scp),
         spacing=(root.positive("Grid/Row/SS"), root.positive("Grid/Col/SS")),
         origin=(center[0] - first[0], center[1] - first[1]),
@@ -445,12 +445,6 @@ def _accuracy(root: XmlFields, scp: Array) -> tuple[float, float] | None:
 def _error(root: XmlFields, path: str) -> float:
     """Return a standard deviation [m]; 0 where it is not stated."""
     return max([0.0, *(float(one.numbers(".")[0]) for one in root.all(f"ErrorStatistics/{path}"))])
-
-
-def _read_orbit(root: XmlFields) -> Curve:
-    """Read ARPPoly over the time of the collection."""
-    coeffs = padded(_polynomial(root, f"Position/ARPPoly/{axis}", 1) for axis in "XYZ")
-    return Curve.polynomial(coeffs.T, 0.0, root.positive("Timeline/CollectDuration"))
 
 
 def _polynomial(root: XmlFields, path: str, variables: int) -> Array:

@@ -64,8 +64,7 @@ class Stretch:
             scaled = _contrast_stretched(pixels, self.low, self.high)
         if not valid.all():
             scaled = np.where(valid, scaled, scaled[valid].mean() if valid.any() else np.float32(0.0))
-        picture: ByteImage = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
-        return picture
+        return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
 def _contrast_stretched(pixels: Pixels, low: float, high: float) -> FloatImage:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -277,19 +278,23 @@ class _ReferenceWork:
             reports.append(report)
             if kept is not None:
                 rows.append((np.full(len(kept[0]), i), *kept))
-        control, sigma = None, float(accuracy.place or 0.0)
-        if rows:
-            view_of, point, xy, xy_sigma = (np.concatenate(column) for column in zip(*rows, strict=True))
-            used, closed = np.unique(point, return_inverse=True)
-            shown = [r.heights for r in reports if r.points and r.shows_heights(accuracy.height)]
-            height, bias = max([accuracy.height, *shown]), max([accuracy.heights, *shown])
-            single = np.tile([0.1 * self.step, 0.1 * self.step, height], (len(used), 1))
-            ground = np.column_stack([places[used], heights[used]])
-            names = tuple(f"reference_{n}" for n in used)
-            points = GroundPoints(names, ground, single, closed, view_of, xy, xy_sigma)
-            offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
-            control = Reference(points, np.array([sigma, sigma, bias]), offset, (2 * HALF + 1) * self.step)
-        return ReferenceControl(control, tuple(reports), self.step, sigma)
+        ground = np.column_stack([places, heights])
+        control = self._control(ground, reports, list(zip(*rows, strict=True)), accuracy) if rows else None
+        return ReferenceControl(control, tuple(reports), self.step, float(accuracy.place or 0.0))
+
+    def _control(
+        self, ground: Array, reports: Sequence[ViewMatch], columns: Sequence[Sequence[Any]], accuracy: Accuracy
+    ) -> Reference:
+        """Return those of the places (n, 3) that views show: by views' columns view, point, image point and sigma."""
+        view_of, point, xy, xy_sigma = map(np.concatenate, columns)
+        used, closed = np.unique(point, return_inverse=True)
+        shown = [r.heights for r in reports if r.points and r.shows_heights(accuracy.height)]
+        height, bias, sigma = max([accuracy.height, *shown]), max([accuracy.heights, *shown]), accuracy.place or 0.0
+        single = np.tile([0.1 * self.step, 0.1 * self.step, height], (len(used), 1))
+        names = tuple(f"reference_{n}" for n in used)
+        points = GroundPoints(names, ground[used], single, closed, view_of, xy, xy_sigma)
+        offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
+        return Reference(points, np.array([sigma, sigma, bias]), offset, (2 * HALF + 1) * self.step)
 
     def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
         """Return the places (n, 2) [deg] on a grid over views, where the reference is, and their heights (n,)."""

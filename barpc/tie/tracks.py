@@ -14,7 +14,7 @@ from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, kd_tree
-from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude
+from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude, row_pairs
 from barpc.sensor.geometry import triangulate
 from barpc.tie.detail import Seen, seen_detail
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
@@ -109,14 +109,13 @@ def _registered_tracks(
 ) -> tuple[Tracks, dict[tuple[int, int], int]]:
     """Link, thin and register the matches of the pairs tried; return also how many could not be registered."""
     looks, area, most = trials.looks, scope.area, options.points_per_image
-    tried = [(looks.ends[views], *trials.tried[views][1:]) for views in sorted(trials.tried)]
-    linked = tracks_inside(looks.views, link([ends for ends, _, _ in tried], [found for _, found, _ in tried]), area)
-    spreads = {ends: report.spread for ends, _, report in tried if report.status == "ok"}
+    matches, tried = trials.by_looks
     sizes = [view.size for view in looks.views]
-    linked = thin(linked, sizes, most)
-    structural = [ends for ends, _, report in tried if report.structural]
-    theirs = {looks.ends[views] for views, (*_, report) in trials.tried.items() if report.matcher == GIVEN_PAIR}
-    verified = {ends: found for ends, found, _ in tried if len(found)}
+    linked = thin(tracks_inside(looks.views, link(list(matches), list(matches.values())), area), sizes, most)
+    spreads = {ends: report.spread for ends, report in tried.items() if report.status == "ok"}
+    structural = [ends for ends, report in tried.items() if report.structural]
+    theirs = {ends for ends, report in tried.items() if report.matcher == GIVEN_PAIR}
+    verified = {ends: found for ends, found in matches.items() if len(found)}
     tracks = refine(looks.views, linked, spreads, options, structural=structural, work=work)
     if unlike := _with_pictures(
         looks.views, _unlike(linked, tracks, sorted(theirs & set(verified))), options.band, work
@@ -126,13 +125,16 @@ def _registered_tracks(
         if trials.rematch({pair: counts.get(pair, 0) for pair in _unlike(linked, tracks, unlike)}):
             return _registered_tracks(trials, scope, options, work)
     needed = theirs | _needed(looks, tracks, list(verified), options.min_matches)
-    known = {ends: found for ends, found in verified.items() if ends in needed}
-    exact, tracks = pair_counts(tracks), _with_unregistered(looks.views, tracks, known, options)
-    bare = {
-        (int(looks.of[i]), int(looks.of[j])): count - exact.get((i, j), 0)
-        for (i, j), count in pair_counts(tracks).items()
-    }
-    return looks.tracks(thin(tracks_inside(looks.views, tracks, area), sizes, most)), bare
+    whole = _with_unregistered(
+        looks.views, tracks, {ends: verified[ends] for ends in verified if ends in needed}, options
+    )
+    return looks.tracks(thin(tracks_inside(looks.views, whole, area), sizes, most)), _lost(looks, tracks, whole)
+
+
+def _lost(looks: Looks, registered: Tracks, tracks: Tracks) -> dict[tuple[int, int], int]:
+    """Return how many tracks of pairs of views are not registered."""
+    exact, of = pair_counts(registered), looks.of.tolist()
+    return {(of[i], of[j]): count - exact.get((i, j), 0) for (i, j), count in pair_counts(tracks).items()}
 
 
 def _needed(looks: Looks, tracks: Tracks, pairs: Sequence[tuple[int, int]], least: int) -> set[tuple[int, int]]:
@@ -165,16 +167,10 @@ class _Trials:
         assert self._work.store is not None
         self._keypoints = [KeypointFiles(self._work.store)] * len(self.looks.views)
         sizes = [view.size for view in self.looks.views]
-        dates = several_dates(self._views)
+        dates, num = several_dates(self._views), len(self._views)
         self._coarse = self._compares and not dates and worth_a_first_look(sizes, self._options)
-        num, most = len(self._views), self._options.neighbours
         twice = self._compares and dates
-        chosen = pool if all_of_them else best_pairs(pool, num, most)
-        if twice and len(chosen) < len(pool):
-            self._locate(pool)
-            chosen = best_pairs(self._judged(best_pairs(pool, num, COMPARED)), num, most, twice)
-        else:
-            self._locate(chosen)
+        chosen = self._located(pool, all_of_them, twice)
         for tries in (*TRIES, 0):
             self._try(chosen)
             left = [pair for pair in pool if pair.views not in self.tried]
@@ -183,6 +179,14 @@ class _Trials:
             chosen = further_pairs(crossing, num, links, tries, twice)
             if not chosen:
                 break
+
+    def _located(self, pool: Sequence[Pair], all_of_them: bool, twice: bool) -> Sequence[Pair]:
+        """Return the pairs to begin with, their keypoints found; of several dates (`twice`) a few of all pairs tell."""
+        num, most = len(self._views), self._options.neighbours
+        chosen = pool if all_of_them else best_pairs(pool, num, most)
+        compared = twice and len(chosen) < len(pool)
+        self._locate(pool if compared else chosen)
+        return best_pairs(self._judged(best_pairs(pool, num, COMPARED)), num, most, twice) if compared else chosen
 
     def _verify(self, known: Sequence[Pair]) -> None:
         """Verify the matches given; pairs of which too few are right are matched as if none were given, too."""
@@ -232,6 +236,12 @@ class _Trials:
         """The pairs tried, ascending, and their reports."""
         tried = [self.tried[views] for views in sorted(self.tried)]
         return [pair for pair, _, _ in tried], [report for _, _, report in tried]
+
+    @property
+    def by_looks(self) -> tuple[dict[tuple[int, int], Matches], dict[tuple[int, int], PairReport]]:
+        """The matches and reports of the pairs tried, ascending, by the looks at which they were compared."""
+        tried = {self.looks.ends[views]: self.tried[views] for views in sorted(self.tried)}
+        return {ends: one[1] for ends, one in tried.items()}, {ends: one[2] for ends, one in tried.items()}
 
     def _judged(self, pairs: Sequence[Pair]) -> list[Pair]:
         """Return the pairs with their quick scores, where keypoints can tell."""
@@ -310,18 +320,15 @@ def _unlike(linked: Tracks, registered: Tracks, pairs: Collection[tuple[int, int
 
     Of tracks that only both see, where there are enough: in others a third view may be what does not compare.
     """
-    counts = [(pair_counts(_of_two(tracks)), pair_counts(tracks)) for tracks in (linked, registered)]
-    found = []
+    counts, found = [], []
+    for tracks in (linked, registered):
+        of_two = tracks.select(np.bincount(tracks.point, minlength=tracks.num_points)[tracks.point] == 2)
+        counts.append((pair_counts(of_two), pair_counts(tracks)))
     for pair in pairs:
         kind = 0 if counts[0][0].get(pair, 0) >= FEW else 1
         before, after = (count[kind].get(pair, 0) for count in counts)
         found += [pair] if after < min(0.5 * before, MANY) else []
     return found
-
-
-def _of_two(tracks: Tracks) -> Tracks:
-    """Return the tracks of two views."""
-    return tracks.select(np.bincount(tracks.point, minlength=tracks.num_points)[tracks.point] == 2)
 
 
 def _with_pictures(
@@ -482,6 +489,6 @@ def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
     """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
-    (first, second), num = tracks.row_pairs(), int(tracks.view.max(initial=0)) + 1
+    (first, second), num = row_pairs(tracks.point), int(tracks.view.max(initial=0)) + 1
     keys, counts = np.unique(tracks.view[first] * num + tracks.view[second], return_counts=True)
     return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}

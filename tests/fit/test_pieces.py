@@ -14,7 +14,7 @@ from barpc.base.errors import FitError, InputError, RpcError
 from barpc.base.geodesy import metres_per_unit
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.certificate import coverage, roundtrip
-from barpc.fit.methods import solve_lcurve
+from barpc.fit.methods import METHODS
 from barpc.fit.points import (
     Errors,
     control_points,
@@ -443,6 +443,6 @@ def test_the_papers_solver_counts_its_passes_over_the_points(camera: Camera, mon
     calls = []
     compressed = FitProblem.compressed
     monkeypatch.setattr(FitProblem, "compressed", lambda self, *given: calls.append(1) or compressed(self, *given))
-    *_, passes = solve_lcurve(FitProblem(ground, image, norm))
+    *_, passes = METHODS["lcurve-joint"](FitProblem(ground, image, norm), None)
     assert 2 * passes == len(calls)  # of col and of row
     assert passes >= 5

@@ -218,10 +218,16 @@ def _answered(answer: HTTPResponse, start: int, stop: int) -> Part | str | None:
         raise OSError("its host hands out no parts of files (range requests); fetch it, and give the copy")
     if status != 206:
         raise OSError(f"its host answers {status}")
+    return _part_of(answer, start, stop, tag)
+
+
+def _part_of(answer: HTTPResponse, start: int, stop: int, tag: str) -> Part:
+    """Return the bytes that were asked for, or to the end of the file; OSError for others."""
     found = re.fullmatch(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18})", answer.headers.get("Content-Range", ""))
     first, last, size = map(int, found.groups()) if found else (0, 0, 0)
     wanted = min(stop, size) - start
-    if (first, last + 1) != (start, start + wanted) or wanted < 1 or length not in ("", str(wanted)):
+    stated = answer.headers.get("Content-Length", "")
+    if (first, last + 1) != (start, start + wanted) or wanted < 1 or stated not in ("", str(wanted)):
         raise OSError("its host answers with other bytes than were asked")
     return Part(_body(answer, wanted), size, tag)
 

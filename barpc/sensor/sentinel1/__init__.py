@@ -10,21 +10,20 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, RpcError, RpcFormatError, plain, visible
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import MAX_XML, PRODUCT, opened, read_head, unread
-from barpc.sensor.curve import Orbit, fit_orbit
+from barpc.sensor.curve import fit_orbit
 from barpc.sensor.document import seconds
-from barpc.sensor.sentinel1.annotation import Annotation, BurstRows, burst_rows, read_annotation
+from barpc.sensor.sentinel1.annotation import Annotation, burst_rows, read_annotation
 from barpc.sensor.sentinel1.range_doppler import (
     Bistatic,
-    Delays,
     GroundFrame,
     RangeDoppler,
     SlantFrame,
@@ -35,10 +34,7 @@ from barpc.sensor.sentinel1.range_doppler import (
 
 __all__ = [
     "Annotation",
-    "BurstRows",
-    "Delays",
     "GroundFrame",
-    "Orbit",
     "RangeDoppler",
     "SlantFrame",
     "burst_rows",
@@ -159,21 +155,18 @@ def open_product(
         raise type(error)(f"{guilty}: {error}") from error
 
 
-@dataclass(frozen=True, order=True)
-class _File:
-    """An annotation: its swath, its polarisation, and where it is."""
+class _File(NamedTuple):
+    """An annotation: its swath, its polarisation, and how it is read."""
 
     swath: str
     polarisation: str
-    path: Path
-    member: str | None = None
+    read: Callable[[], Annotation]
 
-    def read(self) -> Annotation:
-        if self.member is None:
-            return read_annotation(self.path)
-        member, name = self.member, PurePosixPath(self.member).name
-        data = _from_zip(self.path, name, lambda archive: archive.open(member).read(MAX_XML + 1))
-        return read_annotation(data, name=name)
+
+def _read_member(path: Path, member: str) -> Annotation:
+    name = PurePosixPath(member).name
+    data = _from_zip(path, name, lambda archive: archive.open(member).read(MAX_XML + 1))
+    return read_annotation(data, name=name)
 
 
 def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
@@ -187,28 +180,24 @@ def _from_zip(path: Path, what: str, use: Callable[[zipfile.ZipFile], T]) -> T:
 
 
 def _annotations(path: Path) -> list[_File]:
-    """Return the annotations of a product, in order of swath and polarisation."""
+    """Return the annotations of a product."""
     if path.name == "manifest.safe":
         path = path.parent
     if path.is_dir():
-        files = [_annotation_file(file, None) for file in path.glob("annotation/*.xml")]
+        readers = [(file.name, partial(read_annotation, file)) for file in path.glob("annotation/*.xml")]
     elif read_head(path, PRODUCT, 4) in (b"PK\3\4", b"PK\5\6"):
-        names = _from_zip(path, "a zip file that", zipfile.ZipFile.namelist)
-        files = [_annotation_file(path, name) for name in names if PurePosixPath(name).parent.name == "annotation"]
+        places = [(PurePosixPath(one), one) for one in _from_zip(path, "a zip file that", zipfile.ZipFile.namelist)]
+        inside = [(place.name, one) for place, one in places if place.parent.name == "annotation"]
+        readers = [(name, partial(_read_member, path, one)) for name, one in inside]
     else:
         annotation = read_annotation(path)
         if (polarisation := annotation.polarisation.lower()) not in _POLARISATIONS:
             raise RpcFormatError(
                 f"{path}: polarisation {visible(polarisation[:60])} is none of {', '.join(_POLARISATIONS)}"
             )
-        files = [_File(annotation.swath.lower(), polarisation, path)]
-    return sorted(file for file in files if file is not None)
-
-
-def _annotation_file(path: Path, member: str | None) -> _File | None:
-    """Return the file, if its name is that of an annotation."""
-    match = _ANNOTATION_PATTERN.fullmatch(path.name if member is None else PurePosixPath(member).name)
-    return match and _File(match["swath"].lower(), match["pol"].lower(), path, member)
+        return [_File(annotation.swath.lower(), polarisation, lambda: annotation)]
+    known = ((_ANNOTATION_PATTERN.fullmatch(name), read) for name, read in readers)
+    return [_File(match["swath"].lower(), match["pol"].lower(), read) for match, read in known if match]
 
 
 def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
@@ -217,7 +206,7 @@ def _choose(path: Path, polarisation: str | None) -> dict[str, _File]:
         raise RpcFormatError(f"{path}: no Sentinel-1 annotation (annotation/s1?-*.xml) in it{unread(path)}")
     there = sorted({f.polarisation for f in files}, key=_POLARISATIONS.index)
     wanted = polarisation.lower() if polarisation else there[0]
-    chosen = {f.swath: f for f in files if f.polarisation == wanted}
+    chosen = {f.swath: f for f in sorted(files, key=lambda f: f.swath) if f.polarisation == wanted}
     if not chosen:
         raise InputError(f"{path}: no polarisation {wanted}; choose one of {', '.join(there)}")
     if len(chosen) < sum(f.polarisation == wanted for f in files):

@@ -117,8 +117,7 @@ class Annotation:
             index = np.clip(rest // self.lines_per_burst, 0, len(start) - 1).astype(np.int64)
             rest = rest - index * self.lines_per_burst
         since = np.rint(rest * self.azimuth_time_interval * 1e9).astype("timedelta64[ns]")
-        times: TimeArray = start[index] + since
-        return times
+        return np.asarray(start[index] + since)
 
 
 def burst_rows(annotation: Annotation) -> list[BurstRows]:

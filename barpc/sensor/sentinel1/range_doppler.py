@@ -22,6 +22,7 @@ from numpy.polynomial import Polynomial
 from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
+    EVERYWHERE,
     NEWTON_STEPS,
     NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
@@ -32,9 +33,9 @@ from barpc.base.geodesy import (
     pointwise,
     up,
 )
-from barpc.sensor.curve import Curve, Orbit, fit_orbit
+from barpc.sensor.curve import Curve, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
-from barpc.sensor.sentinel1.annotation import Annotation, StateVectors, burst_rows, read_annotation, read_orbit_file
+from barpc.sensor.sentinel1.annotation import Annotation, burst_rows, read_annotation, read_orbit_file
 from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
@@ -298,7 +299,7 @@ class RangeDoppler(Clocked):
     @property
     def all_ground(self) -> tuple[float, float] | None:
         """Altitudes of all ground on Earth [m], which an RPC of a swath holds to 5e-3 px; None of a GRD."""
-        return None if self.advice else (-500.0, 9000.0)
+        return None if self.advice else EVERYWHERE
 
     @property
     def advice(self) -> str:
@@ -441,8 +442,9 @@ def swaths_model(
     states = nearest.states if orbit is None else read_orbit_file(orbit, nearest)
     of_orbit = ORBITS.get(states.source, ORBITS["Downlink"])
     left = RESIDUAL_DELAYS[0][atmosphere], RESIDUAL_DELAYS[1][bistatic == "full"]
+    start, stop = (float(seconds(t, epoch)) for t in (nearest.first_line_time, nearest.last_line_time))
     model = RangeDoppler(
-        orbit=_fitted_orbit(nearest, states, epoch),
+        orbit=fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop)),
         epoch=epoch,
         frame=_range_frame(nearest, epoch),
         size=size,
@@ -462,11 +464,6 @@ def grid_residuals(annotation: Annotation, model: RangeDoppler) -> Array:
     samples = (range_time - grid.range_time) * annotation.range_sampling_rate
     lines = (azimuth_time - seconds(grid.time, model.epoch)) / annotation.azimuth_time_interval
     return np.stack([samples, lines], axis=1)
-
-
-def _fitted_orbit(annotation: Annotation, states: StateVectors, epoch: np.datetime64) -> Orbit:
-    start, stop = (float(seconds(t, epoch)) for t in (annotation.first_line_time, annotation.last_line_time))
-    return fit_orbit(seconds(states.time, epoch), states.position, states.velocity, (start, stop))
 
 
 def _range_frame(annotation: Annotation, epoch: np.datetime64) -> RangeFrame:

@@ -77,8 +77,7 @@ class _Described:
 
     def sector(self, turn: float) -> IntArray:
         """Return the sectors (n,), twice the allowed turn wide, of orientations turned by an angle [rad]."""
-        sector: IntArray = np.floor((np.angle(self.direction) + turn) / (2.0 * _MAX_TURN)).astype(np.int64) % _SECTORS
-        return sector
+        return np.asarray(np.floor((np.angle(self.direction) + turn) / (2.0 * _MAX_TURN)).astype(np.int64) % _SECTORS)
 
     def is_turned_like(self, other: _Described, rows: IntArray, cols: IntArray) -> BoolArray:
         """Return the mask of pairs (P,) of rows and others' cols with the predicted orientation."""

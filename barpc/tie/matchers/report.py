@@ -98,24 +98,27 @@ def require_matches(
 
     Views that are `joined` are one group without matches.
     """
-    failed = [report for report in reports if report.status != "ok"]
     links = [pair.views for pair, report in zip(pairs, reports, strict=True) if report.status == "ok"]
     placings = {pair.views: report.placings for pair, report in zip(pairs, reports, strict=True)}
     said = misplaced(views, links, placings)
+    failed = [report for report in reports if report.status != "ok"]
+    why = "; ".join(f"{view.path}: {said[view.name]}" for view in views if view.name in said) or _failures(failed)
+    if len(views) == 2 and failed:
+        raise TiePointError(f"too few tie points: {why}")
+    links += pairwise(joined)
+    require_connected(views, links, f"no tie points between them: {why}", said)
+
+
+def _failures(failed: Sequence[PairReport]) -> str:
     listed = "; ".join(
         f"{r.names[0]} - {r.names[1]}: {r.status} ({r.keypoints[0]} and {r.keypoints[1]} keypoints, "
         f"{r.verified} of {r.matches} matches verified)"
         for r in failed[:4]
     )
     bare = [r for r in failed if r.status == "too few keypoints"]
-    blank = sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n})
+    if blank := sorted({name for r in bare for name, n in zip(r.names, r.keypoints, strict=True) if not n}):
+        return (
+            f"{listed}: no detail in {', '.join(blank[:4])} (one value? no valid pixels? clouds?): look at the images"
+        )
     loosen = "loosen ratio, search or min_matches ([tie] of a file given with --options)"
-    advice = f"look at the images (clouds? dates? band?), or {loosen}"
-    if blank:
-        names = ", ".join(blank[:4])
-        advice = f"no detail in {names} (one value? no valid pixels? clouds?): look at the images"
-    why = "; ".join(f"{view.path}: {said[view.name]}" for view in views if view.name in said) or f"{listed}: {advice}"
-    if len(views) == 2 and failed:
-        raise TiePointError(f"too few tie points: {why}")
-    links += pairwise(joined)
-    require_connected(views, links, f"no tie points between them: {why}", said)
+    return f"{listed}: look at the images (clouds? dates? band?), or {loosen}"

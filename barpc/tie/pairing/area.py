@@ -40,8 +40,7 @@ class Area:
     def contains(self, lonlat: Array) -> BoolArray:
         """Return the points (N, 2), lon, lat [deg], that lie inside; NaN does not."""
         shapely.prepare(self.outline)
-        inside: BoolArray = shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
-        return inside
+        return shapely.contains_xy(self.outline, wrap_longitude(lonlat[:, 0]), lonlat[:, 1])
 
 
 def read_area(path: str | os.PathLike[str]) -> Area:

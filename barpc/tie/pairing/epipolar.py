@@ -33,8 +33,7 @@ class EpipolarSegments:
 
     def turn(self, xy: Array) -> Array:
         """Return the coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
-        turned: Array = xy @ _rotation(self.axis)
-        return turned
+        return xy @ _rotation(self.axis)
 
     def moved(self, across: Array | float) -> EpipolarSegments:
         """Return the frame with its points moved across the epipolar lines [px]."""
@@ -43,8 +42,7 @@ class EpipolarSegments:
     def place(self, along: Array) -> Array:
         """Return the points of B (N, 2) [px] on the epipolar lines, `along` (N,) [px] from the middle altitude's."""
         turned = np.stack([self.along + along, self.across + self.slope * along], axis=-1)
-        out: Array = turned @ _rotation(self.axis).T
-        return out
+        return turned @ _rotation(self.axis).T
 
     def errors(self, xy: Array) -> Array:
         """Return the distances along and across (N, 2) of points of B (N, 2) from their predictions."""
@@ -91,8 +89,7 @@ def linear_map(first: View, second: View, xy: Array) -> Array:
     ground = first.sensor.localize(xy, np.full(xy.shape[:-1], alt))
     by_a, by_b = (view.sensor.project_jacobian(ground)[1][..., :2] for view in (first, second))
     usable = np.isfinite(by_a + by_b).all(axis=(-2, -1), keepdims=True)
-    out: Array = np.where(usable, by_b, np.eye(2)) @ np.linalg.inv(np.where(usable, by_a, np.eye(2)))
-    return out
+    return np.where(usable, by_b, np.eye(2)) @ np.linalg.inv(np.where(usable, by_a, np.eye(2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +103,7 @@ class Affine:
 
     def __call__(self, xy: Array) -> Array:
         """Values (N,) at points (N, 2)."""
-        value: Array = _design(xy, self.middle, self.scale) @ self.coefficients
-        return value
+        return _design(xy, self.middle, self.scale) @ self.coefficients
 
 
 def _design(xy: Array, middle: Array, scale: Array) -> Array:
@@ -144,8 +140,7 @@ def gradient(xy: Array, values: Array) -> Array:
         return np.zeros(2)
     far = np.asarray(kd_tree(xy).query(xy, k=[FEW])[1])[:, 0]
     fitted = robust_affine(xy[far] - xy, values[far] - values)
-    out: Array = fitted.coefficients[1:] / fitted.scale
-    return out
+    return fitted.coefficients[1:] / fitted.scale
 
 
 def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import compress, pairwise
 from math import isfinite
 from typing import Any
@@ -286,26 +287,28 @@ def best_pairs(pairs: Sequence[Pair], num_views: int, neighbours: int, twice: bo
     """
     ranked = sorted(pairs, key=_order)
     tree = {ranked[k].views for k in forests([pair.views for pair in ranked], num_views, 1)}
+    chosen = _partners(ranked, num_views, neighbours, tree)
+    for more in (_connecting_pairs, partial(further_pairs, twice=True)) if twice else ():
+        left = [pair for pair in ranked if pair.views not in chosen]
+        chosen |= {pair.views: pair for pair in more(left, num_views, list(chosen), TRIES[0])}
+    return [chosen[views] for views in sorted(chosen)]
+
+
+def _partners(ranked: Sequence[Pair], num_views: int, neighbours: int, tree: set[Link]) -> dict[Link, Pair]:
+    """Return the given pairs, those of the best partners of every view, and those of a `tree` that connects all."""
     chosen = {pair.views: pair for pair in ranked if pair.reason == GIVEN_PAIR}
     taken, half = [0] * num_views, (neighbours + 1) // 2
     seen: set[Link] = set()
-    for again in (False, True):
-        for pair in ranked:
-            i, j = pair.views
-            most = half if pair.reason == SAME_DATE and not again else neighbours
-            wanted = min(taken[i], taken[j]) < most
-            if pair.views not in seen and (wanted or pair.views in tree):
-                seen.add(pair.views)
-                chosen.setdefault(pair.views, pair if wanted else replace(pair, reason=CONNECTS))
-                taken[i] += 1
-                taken[j] += 1
-    left = [pair for pair in ranked if pair.views not in chosen]
-    more = _connecting_pairs(left, num_views, list(chosen), TRIES[0]) if twice else []
-    links = [*chosen, *(pair.views for pair in more)]
-    known = set(links)
-    left = [pair for pair in left if pair.views not in known]
-    more += further_pairs(left, num_views, links, TRIES[0], twice=True) if twice else []
-    return sorted([*chosen.values(), *more], key=lambda pair: pair.views)
+    for pair, again in [*((pair, False) for pair in ranked), *((pair, True) for pair in ranked)]:
+        i, j = pair.views
+        most = half if pair.reason == SAME_DATE and not again else neighbours
+        wanted = min(taken[i], taken[j]) < most
+        if pair.views not in seen and (wanted or pair.views in tree):
+            seen.add(pair.views)
+            chosen.setdefault(pair.views, pair if wanted else replace(pair, reason=CONNECTS))
+            taken[i] += 1
+            taken[j] += 1
+    return chosen
 
 
 def _connecting_pairs(left: Sequence[Pair], num_views: int, links: Sequence[Link], count: int) -> list[Pair]:

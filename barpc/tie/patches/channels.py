@@ -15,15 +15,12 @@ from functools import lru_cache, reduce
 import cv2
 import numpy as np
 from rasterio import Affine
-from rasterio._err import CPLE_BaseError
 from rasterio.crs import CRS
-from rasterio.errors import CRSError
-from rasterio.warp import transform as warp_points
 
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, metres_per_unit
-from barpc.rasters.raster import open_raster
+from barpc.rasters.raster import open_raster, reprojected
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.pixels import FloatImage, OpenReaders, grow, levelled
@@ -171,13 +168,8 @@ class Sheet:
 
     def image(self, lonlat: Array) -> Array:
         """Return the col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
-        lon, lat = lonlat.reshape(-1, 2).T
-        try:
-            x, y = np.array(warp_points("EPSG:4326", self.crs, lon, lat))
-        except (CRSError, CPLE_BaseError) as error:
-            raise InputError(f"{self.path}: lon, lat cannot be brought into its CRS ({error})") from error
-        a, b, c, d, e, f = self.to_pixel[:6]
-        return np.stack([a * x + b * y + c, d * x + e * y + f], axis=1).reshape(lonlat.shape) - 0.5
+        places = reprojected(self.path, CRS.from_epsg(4326), self.crs, *lonlat.reshape(-1, 2).T)
+        return np.stack(self.to_pixel * places, axis=1).reshape(lonlat.shape) - 0.5
 
     def shows(self, lonlat: Array) -> BoolArray:
         """Return whether places (..., 2) [deg] lie on the orthoimage."""

@@ -185,8 +185,7 @@ def _part_mask(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> Bool
 
 def _back(one: Array, place: Array) -> Array:
     """Return the image points (n, 2) of places (n, 2) in the frame."""
-    out: Array = (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
-    return out
+    return (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
 
 
 def _resampled(

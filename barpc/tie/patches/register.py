@@ -18,7 +18,7 @@ import numpy as np
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
-from barpc.scene import BoolArray, IntArray, Tracks, View
+from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
 from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
@@ -200,8 +200,7 @@ def register_patches(
 def _at(mask: BoolArray, xy: Array) -> BoolArray:
     col, row = np.rint(np.nan_to_num(xy, nan=-1.0)).astype(np.int64).T
     inside = (col >= 0) & (row >= 0) & (col < mask.shape[1]) & (row < mask.shape[0])
-    out: BoolArray = inside & mask[row.clip(0, mask.shape[0] - 1), col.clip(0, mask.shape[1] - 1)]
-    return out
+    return np.asarray(inside & mask[row.clip(0, mask.shape[0] - 1), col.clip(0, mask.shape[1] - 1)])
 
 
 def _upsampled(image: FloatImage) -> FloatImage:
@@ -443,8 +442,7 @@ class _Registrations:
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
-        torn: BoolArray = compared & ~agreed
-        return torn
+        return compared & ~agreed
 
     def scaled(self, found: PatchRegistration, good: BoolArray) -> Array:
         """Return the sigmas [px] made larger where the distances from the epipolar lines are."""
@@ -461,8 +459,7 @@ class _Registrations:
 def _usual(places: Array, sigma: Array) -> Array:
     """Return the median of the sigmas (N,) of the nearest places (N, 2)."""
     near = kd_tree(places).query(places, k=min(FEW, len(places)))[1]
-    out: Array = np.median(sigma[near.reshape(len(places), -1)], axis=1)
-    return out
+    return np.asarray(np.median(sigma[near.reshape(len(places), -1)], axis=1))
 
 
 def _shared_variance(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Array, sigma: Array) -> Tracks:
@@ -488,11 +485,10 @@ def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_vie
     key = np.array([min(pair) * num_views + max(pair) for pair in spreads] or [-1], dtype=np.int64)
     spread = np.array(list(spreads.values()) or [0.0])[np.argsort(key)]
     key = np.sort(key)
-    first, second = tracks.row_pairs()
+    first, second = row_pairs(tracks.point)
     wanted = tracks.view[first] * num_views + tracks.view[second]
     place = np.searchsorted(key, wanted).clip(0, len(key) - 1)
     unlike = np.where(key[place] == wanted, spread[place], 2.0 * spread.max())
     cost = np.bincount(np.append(first, second), weights=np.append(unlike, unlike), minlength=len(tracks))
     order = np.lexsort((cost, tracks.point))
-    best: IntArray = order[np.searchsorted(tracks.point, np.arange(tracks.num_points))]
-    return best
+    return order[np.searchsorted(tracks.point, np.arange(tracks.num_points))]
