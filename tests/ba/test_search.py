@@ -195,7 +195,7 @@ def test_terms_are_named_that_together_explain_most_though_another_does_by_itsel
 
 @pytest.mark.parametrize("seed", rest_slow([45, 41, 43, 5]))
 def test_lines_lost_in_two_of_four_views_are_given_back_to_both(seed: int) -> None:
-    """Tens of pixels of two images, with cameras of other code: rows displaced in others would fit most ties as well."""
+    """Tens of pixels of two images, with cameras of other code: rows of two others would explain most ties as well."""
     world = make("lost", seed)
     adjusted = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     first, second = sorted(world.plan.injected, key=lambda one: one.views)

@@ -40,9 +40,9 @@ class TrackGroup:
     by_unknown: Array  # (T, n, 2, q)
 
     def all_but(self, some: IntArray, view: int) -> tuple[Array, Array]:
-        """Return 1 or 0 (T, 2n, 1) for values of some tracks, 0 in a view, and what ground points follow (T, 3, 2n).
+        """Return weights (T, 2n, 1) of some tracks, 0 for observations of a view, and the ground points' basis (T, 3, 2n).
 
-        All count in tracks of two views.
+        In tracks of two views all have weight 1.
         """
         n = self.rows.shape[1]
         of_view = self.view[some] == view

@@ -75,7 +75,7 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
 
 
 def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
-    """Return the solution, of observations at `rows` (K,), as a mixture: its noise, and what was cut in each view.
+    """Return the solution as a mixture of the observations at `rows` (K,): its noise, and the share cut in each view.
 
     One noise for all observations, cooled from gross errors, would take in many that are displaced, and hide which.
     """
