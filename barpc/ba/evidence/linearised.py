@@ -40,7 +40,7 @@ class TrackGroup:
     by_unknown: Array  # (T, n, 2, q)
 
     def all_but(self, some: IntArray, view: int) -> tuple[Array, Array]:
-        """Return weights (T, 2n, 1) of some tracks, 0 for observations of a view, and the ground points' basis (T, 3, 2n).
+        """Return weights (T, 2n, 1) of some tracks, 0 for those of a view, and the ground points' basis (T, 3, 2n).
 
         In tracks of two views all have weight 1.
         """
