@@ -92,7 +92,8 @@ def measured(command: list[str], folder: Path, log: Path) -> tuple[float, float,
     with log.open("w") as out:
         process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(process.pid, 0)
-    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0, os.waitstatus_to_exitcode(status)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0, process.returncode
 
 
 def delivered(scene: Scene, place: Path) -> tuple[Cameras, list[str]]:
@@ -358,15 +359,15 @@ def _rows_of_corners(xml: Path, check: Path, place: Path) -> Iterator[Row]:
     rpcs = as_rasterio(read_rpc(xml), np.zeros(2))
     ground = [(said[f"{one}LON"], said[f"{one}LAT"], rpcs.height_off + up) for up in (-100, 100) for one in CORNERS]
     write_image(place / "rpc.tif", np.ones((8, 8), np.uint8), rpcs)
-    yield Row("delivered", _across(formula(check).Rpc(place / "rpc.tif").project(np.array(ground)), seen))
+    yield Row("delivered", across(formula(check).Rpc(place / "rpc.tif").project(np.array(ground)), seen))
     np.savetxt(place / "points.csv", ground, delimiter=",", header="lon,lat,alt", comments="", fmt="%.10f")
     command = [sys.executable, "-m", "barpc", "project", f"{xml},model=physical", "--points", str(place / "points.csv")]
     cpu, peak, code = measured(command, ROOT, place / "project.log")
     found = np.loadtxt(place / "project.log", delimiter=",", skiprows=1)
-    yield Row("barpc", _across(found, seen), cpu, peak, code, "the physical model of the file")
+    yield Row("barpc", across(found, seen), cpu, peak, code, "the physical model of the file")
 
 
-def _across(projected: np.ndarray, seen: np.ndarray) -> str:
+def across(projected: np.ndarray, seen: np.ndarray) -> str:
     """Median and spread of the distance of image points (N, 2) from lines through N points, then N others, (2 N, 2)."""
     low, high = np.split(projected, 2)
     along = (high - low) / np.linalg.norm(high - low, axis=1)[:, None]
