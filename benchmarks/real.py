@@ -218,14 +218,14 @@ def by_cars(interpreter: str, arguments: list[str], place: Path) -> list[tuple[R
         for name, path in zip(names, arguments, strict=True):
             geom = next(iter(sorted((place / "cars").rglob(f"*{name}*.geom"))), None)
             if geom is not None:
-                _shift(geom, path, back)
-                shifted[Path(path)] = geom
+                shifted[Path(path)] = place / f"{name}_{back}.geom"
+                shifted[Path(path)].write_text(_shifted(geom, path, back))
         cameras = dict.fromkeys(names, Path("absent")) | converted(shifted, place / f"cars_{back}")
         found.append((Row(f"cars, {kind}", "", cpu, peak, code, said), cameras))
     return found
 
 
-def _shift(geom: Path, image: str, pixels: float) -> None:
+def _shifted(geom: Path, image: str, pixels: float) -> str:
     """Take pixels from the places of an image in its .geom, and the crop's corner where it is that of a whole image."""
     with rasterio.open(image) as file:
         corner = (file.transform.c, file.transform.f) if file.rpcs is None and file.crs is None else (0.0, 0.0)
@@ -234,7 +234,7 @@ def _shift(geom: Path, image: str, pixels: float) -> None:
     for line in geom.read_text().splitlines():
         key, _, value = line.partition(":")
         lines.append(f"{key}: {float(value) - less[key.strip()]!r}" if key.strip() in less else line)
-    geom.write_text("\n".join(lines) + "\n")
+    return "\n".join(lines) + "\n"
 
 
 def by_sba(checkout: Path, arguments: list[str], place: Path) -> tuple[Row, Cameras]:
