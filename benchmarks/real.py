@@ -65,6 +65,14 @@ ABSENT = {
     "cars": "no interpreter given (--cars)", "orthority": "no interpreter given (--orthority)",
     "sba": "no checkout given (--sba); the package index has none",
 }  # fmt: skip
+BESIDE = """
+import json, resource, subprocess, sys
+code = subprocess.call(sys.argv[2:])
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+with open(sys.argv[1], "w") as file:
+    json.dump([used.ru_utime + used.ru_stime, used.ru_maxrss / 1024.0, code], file)
+"""
+"""Runs a command for a process of any size, whose own peak the system would count as that of the command."""
 CORNERS = ("UL", "UR", "LR", "LL")
 Features = tuple[np.ndarray, np.ndarray | None]
 """Places (N, 2) [px] and descriptors of an image's keypoints."""
@@ -89,11 +97,12 @@ class Row:
 
 def measured(command: list[str], folder: Path, log: Path) -> tuple[float, float, int]:
     """CPU seconds, peak memory [MB] and exit code of a command, run in a folder, its output in a file."""
+    told = log.with_suffix(".used")
     with log.open("w") as out:
-        process = subprocess.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    return usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024.0, process.returncode
+        start = [sys.executable, "-c", BESIDE, str(told), *command]
+        subprocess.run(start, cwd=folder, stdout=out, stderr=subprocess.STDOUT, check=True)
+    cpu, peak, code = json.loads(told.read_text())
+    return cpu, peak, code
 
 
 def delivered(scene: Scene, place: Path) -> tuple[Cameras, list[str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy import ndimage
 
 from barpc.rpcio import read_rpc
 from barpc.sensor.rpc import RPC
-from benchmarks.real import Row, across, by_sba, delivered, features, held_out, matched
+from benchmarks.real import Row, across, by_sba, delivered, features, held_out, matched, measured
 from benchmarks.real_sets import Change, Scene, as_rasterio, changed, correlated, write_image
 from benchmarks.surfaces import between, heights
 from tests.fit.cameras import synthetic_rpc
@@ -169,6 +170,16 @@ def test_every_control_point_is_held_out_once_and_alone(tmp_path: Path) -> None:
     row = held_out(refine, tmp_path / "check.py", tmp_path / "points.json", tmp_path / "runs")
     assert (row.tool, row.cpu) == ("mean", 2.0)
     assert row.offset == "GCPs {:.2f}, {:.2f} (3)".format(*np.sqrt([(4 + 16 + 4) / 3, (16 + 16 + 64) / 3]))
+
+
+def test_memory_of_a_command_is_not_that_of_who_measures_it(tmp_path: Path) -> None:
+    held = np.ones(40_000_000)  # 320 MB
+    code = "import sys; a = bytearray(b'x' * 60_000_000); sum(range(10**6)); sys.exit(7)"
+    cpu, peak, ended = measured([sys.executable, "-c", code], tmp_path, tmp_path / "log")
+    assert ended == 7
+    assert 0.01 < cpu < 10
+    assert 60 < peak < 180
+    assert held.size
 
 
 def test_a_checkout_gets_images_and_rpcs_in_two_folders_and_its_answer_is_read(tmp_path: Path) -> None:
