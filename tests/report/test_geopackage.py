@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from barpc.report.runfiles import read_tables
 
 def layer(path: Path, name: str) -> tuple[list[shapely.Geometry], list[dict[str, object]]]:
     """Geometries and columns of a layer, read as the standard says a geometry is encoded."""
-    with sqlite3.connect(path) as data:
+    with closing(sqlite3.connect(path)) as data:
         found = data.execute(f"SELECT * FROM {name} ORDER BY fid")
         names, rows = [column[0] for column in found.description], found.fetchall()
     for row in rows:
@@ -58,7 +59,7 @@ def test_a_footprint_across_the_antimeridian_is_two_parts_of_one_map(antimeridia
 
 
 def test_the_standard_s_tables_name_every_layer_and_none_that_is_empty(block_run):
-    with sqlite3.connect(block_run.folder / "map.gpkg") as data:
+    with closing(sqlite3.connect(block_run.folder / "map.gpkg")) as data:
         assert data.execute("PRAGMA application_id").fetchone()[0] == int.from_bytes(b"GPKG", "big")
         assert data.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert data.execute("PRAGMA foreign_key_check").fetchall() == []
@@ -75,7 +76,7 @@ def test_the_standard_s_tables_name_every_layer_and_none_that_is_empty(block_run
 
 def test_numbers_that_are_not_known_are_null():
     found = geopackage([Layer("a", point_shapes(np.array([[1.0, 2.0, 3.0]])), ["x DOUBLE"], [(float("nan"),)])])
-    with sqlite3.connect(":memory:") as data:
+    with closing(sqlite3.connect(":memory:")) as data:
         data.deserialize(found)
         assert data.execute("SELECT x FROM a").fetchall() == [(None,)]
 
