@@ -263,9 +263,9 @@ def parse_json(text: str, most: int = Kind.values) -> Any:
     if _depth(text) > MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {MAX_DEPTH} levels are read")
     found = json.loads(text, parse_constant=_refuse_constant, parse_int=_parse_integer, parse_float=_parse_float)
-    if _SURROGATE.search(text):  # half of a pair is taken by json, and by nothing that writes it
+    if _SURROGATE.search(text):  # json takes half of a pair, what writes it only such as a name's odd bytes become
         try:
-            json.dumps(found, ensure_ascii=False).encode()
+            json.dumps(found, ensure_ascii=False).encode(errors="surrogateescape")
         except UnicodeEncodeError as error:
             raise ValueError(f"{error.object[error.start]!a} is half of a character") from None
     return found

@@ -170,6 +170,11 @@ def test_half_a_character_is_refused_in_names_and_texts_of_json(half):
             parse_json(text)
 
 
+def test_bytes_of_a_name_that_are_no_text_come_back_from_json():
+    name = os.fsdecode(b"\x80t\xff")
+    assert parse_json(json.dumps([name, {name: 1}])) == [name, {name: 1}]
+
+
 def test_a_whole_pair_and_an_escape_of_an_escape_are_characters():
     text = r'["\ud83d\ude00", "\\ud800", "\u00e9", "\u0d80"]'
     assert parse_json(text) == ["\U0001f600", r"\ud800", "\u00e9", "\u0d80"]
