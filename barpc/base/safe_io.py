@@ -11,6 +11,7 @@ import io
 import json
 import math
 import os
+import re
 import stat
 import unicodedata
 from array import array
@@ -237,6 +238,7 @@ MAX_NUMBER = 1e100
 
 MAX_DEPTH = 100
 """Levels of JSON and XML."""
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _BRACKET_STEPS = bytes.maketrans(b"[]{}", b"\x01\xff\x01\xff")  # one level down or up, as signed bytes
 
@@ -251,13 +253,22 @@ def read_json(path: Path | str, kind: Kind) -> Any:
 
 
 def parse_json(text: str, most: int = Kind.values) -> Any:
-    """Parse a JSON text; ValueError for numbers that are not finite or beyond 64 bits, too many values or levels."""
+    """Parse a JSON text.
+
+    ValueError for numbers that are not finite or beyond 64 bits, too many values or levels, and halves of characters.
+    """
     values = sum(map(text.count, ",:[{"))  # one, or the name of one, behind each
     if values > most:
         raise ValueError(f"{values} values, at most {most} are read")
     if _depth(text) > MAX_DEPTH:  # how deep json itself goes differs between versions of Python
         raise ValueError(f"nested too deep, at most {MAX_DEPTH} levels are read")
-    return json.loads(text, parse_constant=_refuse_constant, parse_int=_parse_integer, parse_float=_parse_float)
+    found = json.loads(text, parse_constant=_refuse_constant, parse_int=_parse_integer, parse_float=_parse_float)
+    if _SURROGATE.search(text):  # json takes half of a pair, what writes it only such as a name's odd bytes become
+        try:
+            json.dumps(found, ensure_ascii=False).encode(errors="surrogateescape")
+        except UnicodeEncodeError as error:
+            raise ValueError(f"{error.object[error.start]!a} is half of a character") from None
+    return found
 
 
 def _depth(text: str) -> int:

@@ -140,6 +140,15 @@ class Scene:
         return [relative_link(shot.file, out) for shot in self.shots]
 
 
+def _check_names(folder: Path, *names: str) -> None:
+    """Raise InputError, which names the summary, for names that not every tool takes."""
+    for name in names:
+        try:
+            plain_path(name)
+        except InputError as error:
+            raise InputError(f"{folder / 'summary.json'}: {error}") from error
+
+
 def relative_link(target: Path | str, folder: Path) -> str:
     """Return the path of a file relative to a folder, with slashes, so that both may move; a URL as it is."""
     if is_url(str(target)):
@@ -171,7 +180,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         alt_range = _scene_altitudes(files.points[:, 2], summary)
     shots = []
     for number, view in enumerate(summary.views):
-        plain_path(view.name)
+        _check_names(folder, view.name, view.path)
         if PurePath(view.name).name != view.name or view.name == "..":
             raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
         rpc = written_rpc(folder, view)

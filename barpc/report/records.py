@@ -79,6 +79,8 @@ class Record:
             return msgspec.convert(found, cls)
         except (msgspec.ValidationError, OverflowError) as error:
             raise ValueError(str(error)) from error
+        except UnicodeEncodeError as error:
+            raise ValueError(f"the name {error.object!a} is no text") from error
 
 
 @cache

@@ -40,6 +40,7 @@ def _has(*patterns: str) -> Callable[[str], bool]:
     return lambda content: all(re.search(pattern, content) for pattern in patterns)
 
 
+_TEXT_ENDS = ("_RPC.TXT", ".rpc", ".txt", ".rpc_adj")  # the last: of SAT-BA, beside the .rpc that it adjusted
 _BESIDE = "gdal, beside an image"
 # OSSIM's keys, in small letters, have two digits
 _TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
@@ -48,7 +49,7 @@ _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _is_maxar = _has(r"<(\w+:)?LINENUMCOEF")
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
 _SYNTAXES = (
-    Format("txt", ("_RPC.TXT", ".rpc", ".txt"), _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
+    Format("txt", _TEXT_ENDS, _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
     Format("xml", (".XML",), _is_maxar, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),

@@ -213,3 +213,43 @@ def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(mo
     np.testing.assert_array_equal(found.state.points, state.points)
     np.testing.assert_array_equal(found.state.params, state.params)
     assert found.state.cost == found.reduced.cost == min(found.state.history)
+
+
+@pytest.mark.parametrize("nearer", [False, True])
+def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_near(
+    monkeypatch, caplog, nearer
+) -> None:
+    """Whether a matrix of astray points is positive definite depends on the version of LAPACK."""
+    options, made = AdjustOptions(), simulate_block(3, 60, attitude=1e-6, position=0.2)
+    block = join(made.views, made.tracks, None, options)
+    problem = make_problem(block, options, None, None)
+    state, _ = first_state(problem, block, options, None)
+    whole, fails = solve.la.cholesky, []
+
+    def cholesky(matrix: Any, **given: Any) -> Any:
+        if fails:
+            raise np.linalg.LinAlgError("a leading minor is not positive definite")
+        return whole(matrix, **given)
+
+    def tries(residual: Any, start: Any, jacobian: Any, **given: Any) -> Any:
+        step = -np.linalg.lstsq(jacobian(start), residual(start), rcond=None)[0]  # Gauss and Newton's
+        fails.append(True)
+        far = float((residual(start + (step if nearer else 1e3)) ** 2).sum())
+        fails.clear()
+        assert far == problem.reduce(*tried[-1]).cost > 1e3 * float((residual(start) ** 2).sum())
+        return least_squares(residual, start, jacobian, **given)
+
+    tried, reduce, least_squares = [], type(problem).reduce, scipy.optimize.least_squares
+
+    def followed(self: Any, *given: Any) -> Any:
+        if fails:
+            tried.append(given)
+        return reduce(self, *given)
+
+    monkeypatch.setattr(type(problem), "reduce", followed)
+    monkeypatch.setattr(solve.la, "cholesky", cholesky)
+    monkeypatch.setattr(scipy.optimize, "least_squares", tries)
+    found = solve.minimise(problem, state, block.use / block.sigma, "scipy")
+    assert found.settled
+    assert ("scipy" in found.status) is not nearer
+    assert ("going on by Levenberg-Marquardt" in caplog.text) is nearer

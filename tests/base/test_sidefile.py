@@ -163,6 +163,23 @@ def test_brackets_in_the_strings_of_json_are_no_levels(inner):
         parse_json(f'["{inner}\\\\", {"[" * 100}')
 
 
+@pytest.mark.parametrize("half", [r"\ud800", r"\uDFFF", r"\udc00\ud800", r"\ud83d \ude00"])
+def test_half_a_character_is_refused_in_names_and_texts_of_json(half):
+    for text in (f'["a{half}"]', f'{{"a": {{"{half}": 1}}}}'):
+        with pytest.raises(ValueError, match=r"^'\\ud[8-f]\w\w' is half of a character$"):
+            parse_json(text)
+
+
+def test_bytes_of_a_name_that_are_no_text_come_back_from_json():
+    name = os.fsdecode(b"\x80t\xff")
+    assert parse_json(json.dumps([name, {name: 1}])) == [name, {name: 1}]
+
+
+def test_a_whole_pair_and_an_escape_of_an_escape_are_characters():
+    text = r'["\ud83d\ude00", "\\ud800", "\u00e9", "\u0d80"]'
+    assert parse_json(text) == ["\U0001f600", r"\ud800", "\u00e9", "\u0d80"]
+
+
 def test_json_of_many_values_is_not_deep():
     assert parse_json(json.dumps([[[k, k]] for k in range(1000)]))[999] == [[999, 999]]
 

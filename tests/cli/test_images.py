@@ -14,7 +14,7 @@ from barpc.base.errors import InputError
 from barpc.cameras import open_camera
 from barpc.cli import main
 from barpc.cli.flags import image_paths
-from barpc.rpcio import write_rpc, write_rpc_copy
+from barpc.rpcio import find_rpc, write_rpc, write_rpc_copy
 from barpc.verbs.images import expanded
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -150,7 +150,7 @@ def test_another_folder_is_no_zarr_store(tmp_path, capsys):
 # --- lists ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("layout", [".rpc", ".json"])
+@pytest.mark.parametrize("layout", [".rpc", ".rpc_adj", ".json"])
 def test_a_list_names_cameras_in_a_folder_of_their_own_wherever_it_is_read(folder, tmp_path, monkeypatch, layout):
     """As sets for bundle adjustment and neural surfaces come: rpcs/NAME.rpc, and JSON that holds more than an RPC."""
     lines = []
@@ -162,6 +162,7 @@ def test_a_list_names_cameras_in_a_folder_of_their_own_wherever_it_is_read(folde
             more = {"img": f"img {number}.tif", "min_alt": 5, "keypoints": {"2d_coordinates": [[1.0, 2.0]]}}
             path.write_text(json.dumps({**more, "rpc": told.get("rpc", told)}))
         lines.append(f"images/img {number}.tif,camera=rpcs/{path.name}")
+        assert find_rpc(path.parent, folder / "images" / f"img {number}.tif") == path
     lines.append(f"images/img 2.tif,camera={path.absolute()},size=60:40")
     (folder / "images.txt").write_text("\n".join(lines))
     (tmp_path / "elsewhere").mkdir()

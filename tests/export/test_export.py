@@ -138,6 +138,13 @@ def in_one_folder(run: Path, tmp_path: Path, folder: str = "/images") -> Path:
     return copy
 
 
+def test_an_image_s_path_that_is_no_text_is_refused_by_the_summary_s_name(run_dir, tmp_path):
+    odd = in_one_folder(run_dir, tmp_path, "/images/\udce9")
+    with pytest.raises(InputError, match=r"summary\.json: .* its path holds bytes that are not UTF-8"):
+        exported(odd, "satnerf", tmp_path)
+    assert not (tmp_path / "satnerf").exists()
+
+
 @pytest.mark.slow
 def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")

@@ -96,6 +96,7 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
         raise SystemExit(f"the undisturbed run ended with {code}: {log.read_text()}")
     truth = outputs(out)
     identical = killed = leftovers = resumed = 0
+    odd: set[str] = set()
     for _ in range(trials):
         shutil.rmtree(out)
         pid = start(command, log)
@@ -110,11 +111,16 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
         again = finish(start(command, log))  # 1: it had been finished, and is not written over
         state = json.loads((out / ".barpc/state.json").read_text())["status"]
         clean = not any(out.glob(".barpc/partial/*/*"))
-        identical += again in (0, 1) and state == "done" and clean and outputs(out) == truth
+        found = outputs(out)
+        right = {f"exit code {again}": again in (0, 1), f"state {state}": state == "done", "partial files": clean}
+        right |= {name: found.get(name) == truth.get(name) for name in found | truth}
+        identical += all(right.values())
+        odd |= {what for what, is_so in right.items() if not is_so}
     unchanged = [sha256(path.read_bytes()).digest() for path in images] == before
     return {
         "trials": trials,
         "identical": identical,
+        "odd": sorted(odd),
         "killed_at_work": killed,
         "resumed_from_kept_results": resumed,
         "left_partial_files": leftovers,
@@ -206,9 +212,12 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if given.every_output:
-            print(json.dumps(at_every_output(given.every_output, Path(folder))))
-            return
-        print(json.dumps(sweep(given.trials, given.seed, given.jobs, Path(folder))))
+            found = at_every_output(given.every_output, Path(folder))
+            print(json.dumps(found))
+            sys.exit(any(one["identical"] < one["killed"] for one in found.values()))
+        told = sweep(given.trials, given.seed, given.jobs, Path(folder))
+        print(json.dumps(told))
+        sys.exit(bool(told["odd"]) or not told["inputs_unchanged"])
 
 
 if __name__ == "__main__":

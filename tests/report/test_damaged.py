@@ -146,6 +146,14 @@ def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, tmp_pat
     assert "of \\udce9t\\udce9" in remake_report(folder).read_text()
 
 
+@pytest.mark.parametrize(("half", "said"), [("\ud800", "is half of a character"), ("\udce9", "is no text")])
+def test_a_key_that_is_no_text_is_named_in_one_line(half, said, block_run, tmp_path):
+    (tmp_path / "summary.json").write_text(json.dumps({**block_run.summary, f"a{half}": 1}))
+    with pytest.raises(InputError, match=rf"summary\.json: .*{said}") as told:
+        read_summary(tmp_path)
+    assert "codec" not in str(told.value)
+
+
 @pytest.mark.parametrize("at", [(), ("views", 2), ("views", 0, "correction", "ellipse"), ("scene",), ("tracks",)])
 def test_a_key_that_no_record_has_is_named_and_passed_over(at: tuple[Any, ...], block_run: Finished, tmp_path: Path):
     summary = deepcopy(block_run.summary)

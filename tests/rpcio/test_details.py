@@ -517,7 +517,10 @@ def test_numbered_coefficients_are_gathered_from_0_or_1_on() -> None:
             collect_numbered(pairs, "a")
 
 
-@pytest.mark.parametrize(("name", "row"), [("a_RPC.TXT", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)])
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [("a_RPC.TXT", "txt"), ("a.rpc_adj", "txt"), ("A.rpb", "rpb"), ("a.JSON", "json"), ("a.doc", None)],
+)
 def test_the_end_of_a_name_tells_its_format(name: str, row: str | None) -> None:
     found = format_for(name)
     assert (found is None) if row is None else (found is FORMATS[row])

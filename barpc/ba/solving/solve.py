@@ -242,7 +242,15 @@ class _WhitenedProblem:
         if reduced.cost <= self.lowest[1].cost:
             self.lowest = key, state, reduced
         self.state, self.reduced = state, reduced
-        self._compress(la.cholesky(self.reduced.plain(self.problem.free), check_finite=False))
+        try:
+            upper = la.cholesky(self.reduced.plain(self.problem.free), check_finite=False)
+        except np.linalg.LinAlgError:
+            if key == self.lowest[0]:
+                raise
+            # a step so far astray that its matrix is rounding is refused for its cost, whatever its derivative
+            self.whitened, self.rest = np.zeros(len(x)), np.sqrt(reduced.cost)
+            return
+        self._compress(upper)
 
     def residual(self, x: Array) -> Array:
         """Return the N q + 1 residuals."""
