@@ -95,6 +95,16 @@ def test_the_true_noise_and_the_true_share_of_outliers_are_found() -> None:
     assert 0.75 < found.right.mean() < 0.85
 
 
+def test_noise_ends_where_it_is_held_and_explains_less_then() -> None:
+    block = linear_of(noise_px=0.8, tracks=400)
+    free = fit_mixture(block)
+    held = fit_mixture(block, noisiest=0.5 * free.noise)
+    assert held.noise == 0.5 * free.noise
+    assert held.evidence < free.evidence
+    assert held.right.sum() < free.right.sum()
+    assert fit_mixture(block, noisiest=2.0 * free.noise).noise == free.noise
+
+
 def test_an_unknown_that_explains_nothing_costs_the_room_that_it_takes(linear: Linear) -> None:
     base = fit_mixture(linear)
     extra = np.zeros((2, 1, len(linear.view)))

@@ -63,14 +63,16 @@ def fit_mixture(
     sigma: Array | None = None,
     warm: MixtureFit | None = None,
     group: Group | None = None,
+    noisiest: float = np.inf,
 ) -> MixtureFit:
     """Fit cameras and extra unknowns, which move observations by `extra` (2, e, K) [px] a unit, to a block as
     a mixture.
 
     Their prior standard deviations are `sigma` (e,) [px]. From a fit that is `warm`, whose unknowns may be fewer, it
-    is cooled again only from where the further ones begin; with a `group` that moves from the top.
+    is cooled again only from where the further ones begin; with a `group` that moves from the top. Its noise ends at
+    `noisiest` at most.
     """
-    return Mixture(linear, extra, sigma, warm, group).run()
+    return Mixture(linear, extra, sigma, warm, group, noisiest).run()
 
 
 def moving(linear: Linear, extra: Array, group: Group, found: MixtureFit) -> Array:
@@ -271,8 +273,9 @@ class Mixture:
         sigma: Array | None,
         warm: MixtureFit | None,
         group: Group | None = None,
+        noisiest: float = np.inf,
     ) -> None:
-        self.linear, self.group = linear, group
+        self.linear, self.group, self.noisiest = linear, group, noisiest
         self.extra = np.zeros((2, 0, len(linear.sigma))) if extra is None else extra / linear.sigma
         own = np.zeros(0) if sigma is None else 1.0 / sigma**2
         further = own if group is None else np.append(own, 1.0 / group.sigma**2)
@@ -382,7 +385,7 @@ class Mixture:
     def _noise(self, seen: _Expectations, known: float) -> bool:
         """Return the noise and the shares of wrong observations, estimated anew; whether the noise stands."""
         still = seen.kinds[0]
-        found = max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), LEAST_NOISE)
+        found = min(max(float(np.sqrt(still.squares / max(still.freedom - known, 1.0))), LEAST_NOISE), self.noisiest)
         cold = self.noise <= found
         noise = found if cold else max(found, self.cooled * self.noise)
         wrong = np.bincount(self.linear.view[self.part], 1.0 - seen.right[self.part], minlength=self.linear.views)

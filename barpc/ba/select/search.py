@@ -64,8 +64,7 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base = fit_mixture(linear, warm=_as_solved(linear, outcome, rows))
-        few = linear.thinned(SAMPLE)
+        base, few = _as_solved(linear, outcome, rows), linear.thinned(SAMPLE)
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
@@ -75,14 +74,17 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
 
 
 def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
-    """Return the solution as a mixture of the observations at `rows` (K,): its noise, and the share cut in each view.
+    """Return the solution as a mixture of the observations at `rows` (K,), none noisier than those it kept.
 
-    One noise for all observations, cooled from gross errors, would take in many that are displaced, and hide which.
+    Where many observations are displaced more noise for all may explain more, but hides which. Its evidence is what
+    the terms have to gain over.
     """
     right, count = outcome.inlier[rows].astype(np.float64), np.bincount(linear.view, minlength=linear.views)
     wrong = np.bincount(linear.view, 1.0 - right, linear.views) / np.maximum(count, 1)
     nothing, eps = np.zeros(0), np.clip(wrong, SLIGHT, 1.0 - SLIGHT)
-    return MixtureFit(-np.inf, np.zeros(linear.shape), nothing, outcome.noise, eps, right)
+    solved = MixtureFit(-np.inf, np.zeros(linear.shape), nothing, outcome.noise, eps, right)
+    kept, free = (fit_mixture(linear, warm=solved, noisiest=most) for most in (outcome.noise, np.inf))
+    return replace(kept, evidence=max(kept.evidence, free.evidence))
 
 
 def _neighbour_views(block: Block, view: int) -> IntArray:
