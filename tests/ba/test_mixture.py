@@ -96,7 +96,7 @@ def test_the_true_noise_and_the_true_share_of_outliers_are_found() -> None:
 
 
 def test_noise_ends_where_it_is_held_and_explains_less_then() -> None:
-    block = linear_of(noise_px=0.8, tracks=400)
+    block = linear_of(tracks=400)
     free = fit_mixture(block)
     held = fit_mixture(block, noisiest=0.5 * free.noise)
     assert held.noise == 0.5 * free.noise
