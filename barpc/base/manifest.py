@@ -2,10 +2,10 @@
 
 ::
 
-    # barpc 0.3.0, code 58c1f0d2a9b3e647
+    # barpc 0.4.0, code 58c1f0d2a9b3e647
     # <sha256>  report.html                                         replaced by a later layer
     <sha256>  summary.json
-    # barpc 0.3.0, code 58c1f0d2a9b3e647, after <root>
+    # barpc 0.4.0, code 58c1f0d2a9b3e647, after <root>
     <sha256>  report.html
     <sha256>  dsm.tif
 
