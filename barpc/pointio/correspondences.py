@@ -31,7 +31,7 @@ from barpc.pointio.tables import (
     vertical_of_column,
 )
 from barpc.rasters.dem import HeightGrid, datum_of
-from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.raster import driver_of, open_raster, transformed
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of
 from barpc.scene import Altimetry
 
@@ -177,7 +177,7 @@ def read_grid(path: PathOrUrl, altitudes: Sequence[float] | None = None) -> Corr
             "are known; give one altitude a layer"
         )
     row, col = np.indices(bands.shape[1:], dtype=np.float64)
-    nodes = np.stack(to_image * (col, row), axis=-1) - 0.5
+    nodes = np.stack(transformed(to_image, col, row), axis=-1) - 0.5
     image = np.broadcast_to(nodes, (layers, *nodes.shape)).reshape(-1, 2)
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)

@@ -28,7 +28,7 @@ from barpc.base.errors import BarpcWarning, ImageError, InputError
 from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
 from barpc.base.remote import PathOrUrl, location
 from barpc.base.safe_io import GRID, opened
-from barpc.rasters.raster import open_raster, reprojected
+from barpc.rasters.raster import open_raster, reprojected, transformed
 from barpc.rasters.vertical import ELLIPSOID, NO_GEOID, Vertical, geoid_file, geoid_of, vertical_of
 from barpc.sensor import SensorModel
 
@@ -107,12 +107,12 @@ class HeightGrid:
             x, y = self.west + np.mod(lon - self.west, 360.0), lat
         else:
             x, y = reprojected(self.path, CRS.from_epsg(4326), self.crs, lon, lat)
-        col, row = self.to_pixel * (x, y)
+        col, row = transformed(self.to_pixel, x, y)
         return _snapped(row - 0.5), _snapped(col - 0.5)
 
     def place(self, row: Array, col: Array) -> tuple[Array, Array]:
         """Return the lon, lat (N,) [deg] of fractional row, col (N,), the inverse of `locate`."""
-        x, y = ~self.to_pixel * (col + 0.5, row + 0.5)
+        x, y = transformed(~self.to_pixel, col + 0.5, row + 0.5)
         return (x, y) if self.crs.is_geographic else reprojected(self.path, self.crs, CRS.from_epsg(4326), x, y)
 
     def sample(self, lon: npt.ArrayLike, lat: npt.ArrayLike) -> Array:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rasterio
+from rasterio import Affine
 from rasterio._err import CPLE_BaseError
 from rasterio.control import GroundControlPoint
 from rasterio.coords import BoundingBox
@@ -191,6 +192,12 @@ def reprojected(path: PathOrUrl | str, start: CRS, end: CRS, x: Array, y: Array)
     return found[0], found[1]
 
 
+def transformed(transform: Affine, x: Any, y: Any) -> tuple[Any, Any]:
+    """Return coordinates x, y by an affine transformation: of arrays, which releases of `affine` multiply otherwise."""
+    a, b, c, d, e, f = transform[:6]
+    return a * x + b * y + c, d * x + e * y + f
+
+
 def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
@@ -252,8 +259,7 @@ class Mosaic:
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
         self.crs = self._crs(vrt.srs)
-        affine = rasterio.Affine
-        self.transform = affine.from_gdal(*vrt.transform) if vrt.transform else affine.identity()
+        self.transform = Affine.from_gdal(*vrt.transform) if vrt.transform else Affine.identity()
         self.bounds = BoundingBox(*array_bounds(self.height, self.width, self.transform))
         self.mask_flag_enums = ([MaskFlags.per_dataset if vrt.mask else MaskFlags.all_valid],) * self.count
 

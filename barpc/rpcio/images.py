@@ -35,7 +35,7 @@ from barpc.base.errors import ImageError, OutputError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import IMAGE, opened, plain_path, read_head
-from barpc.rasters.raster import Mosaic, identify, open_raster
+from barpc.rasters.raster import Mosaic, identify, open_raster, transformed
 from barpc.rasters.vrt import GDAL_TYPES
 from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
 from barpc.rpcio.xml import rpc_domain
@@ -216,7 +216,9 @@ def _copy_window(dataset: Any, partial: Path, target: Path, window: Window) -> N
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **TIFF_PROFILE}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
     if dataset.crs is not None:
-        moved = dataset.transform * rasterio.Affine.translation(window.col_off, window.row_off)
+        a, b, _, d, e, _ = dataset.transform[:6]
+        x, y = transformed(dataset.transform, window.col_off, window.row_off)
+        moved = rasterio.Affine(a, b, x, d, e, y)
         profile |= {"crs": dataset.crs, "transform": moved}
 
     def part(block: Window) -> Window:

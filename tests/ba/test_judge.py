@@ -254,7 +254,7 @@ def test_exact_points_meet_in_the_strip_and_beside_it() -> None:
 
 @pytest.mark.slow
 def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any) -> None:
+    def fails(*_: Any, **__: Any) -> None:
         raise np.linalg.LinAlgError("7-th leading minor")
 
     monkeypatch.setattr("barpc.ba.select.search.fit_mixture", fails)

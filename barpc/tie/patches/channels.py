@@ -20,7 +20,7 @@ from rasterio.crs import CRS
 from barpc.base.errors import InputError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, metres_per_unit
-from barpc.rasters.raster import open_raster, reprojected
+from barpc.rasters.raster import open_raster, reprojected, transformed
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.pixels import FloatImage, OpenReaders, grow, levelled
@@ -169,7 +169,7 @@ class Sheet:
     def image(self, lonlat: Array) -> Array:
         """Return the col, row (..., 2) [px] of lon, lat (..., 2) [deg]."""
         places = reprojected(self.path, CRS.from_epsg(4326), self.crs, *lonlat.reshape(-1, 2).T)
-        return np.stack(self.to_pixel * places, axis=1).reshape(lonlat.shape) - 0.5
+        return np.stack(transformed(self.to_pixel, *places), axis=1).reshape(lonlat.shape) - 0.5
 
     def shows(self, lonlat: Array) -> BoolArray:
         """Return whether places (..., 2) [deg] lie on the orthoimage."""
