@@ -37,7 +37,7 @@ HEAD = """# Speed
 
 What the scripts in `benchmarks/` printed in one run, barpc and each peer in turns, one thread, CPU seconds (not the
 clock): {machine}. {versions}.
-Other processes used the machine at the same time (load {load:.1f} on {cores} cores): take the ratios, not the seconds.
+Load {load:.1f} on {cores} cores: take the ratios.
 
 `python benchmarks/speed.py --data DATA --peers PYTHON --rpcfit SITE_PACKAGES --write` makes this page again.
 """
@@ -61,7 +61,7 @@ def benchmarks(data: Path | None, peers: str | None, rpcfit: str | None, cars: s
         Benchmark("ba.py", "The same, plain, beside Ceres", ("--ceres",), "adjustment.md"),
         Benchmark("ba.py", "With defaults, beside release 0.1", ("--against", FIRST), "adjustment.md"),
         Benchmark("ba.py", "A jump, and views of one place", ("--jump", "--series", "1000"), "adjustment.md"),
-        Benchmark("tail.py", "Whole runs, matches given, by the number of images", (), "report.md"),
+        Benchmark("tail.py", "Whole runs, matches given, by the number of images", ("--totals",), "report.md"),
         Benchmark("simulate.py", "Simulation", (), "simulate.md"),
         Benchmark("report.py", "Summary, tables and report", ("--views", "3", "50"), "report.md"),
     ]

@@ -181,6 +181,7 @@ def main() -> None:
     parser.add_argument("--matching", type=int, metavar="SIDE", help="match images of so many pixels a side")
     parser.add_argument("--blank", type=int, metavar="SIDE", help="verify matches given of blank images of this side")
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
+    parser.add_argument("--totals", action="store_true", help="no table of the stages")
     parser.add_argument("--folder", type=Path, help="where the files go and stay; default: a temporary one")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -202,7 +203,8 @@ def main() -> None:
                 f"{counts}  {found.cpu:7.1f}  {found.wall:9.1f}  {found.memory:11.0f}  {found.page:16.2f}",
                 flush=True,
             )
-    by_stage(trials)
+    if not options.totals:
+        by_stage(trials)
 
 
 def by_stage(trials: dict[int, Trial]) -> None:

@@ -59,20 +59,6 @@ def test_a_clean_block_is_solved_twice_and_nothing_is_looked_at_again(clean, mon
     assert exact <= 1e-6
 
 
-def test_wrong_observations_are_cut_before_the_first_pass_weighs_the_others() -> None:
-    """Two passes are as many as without them, and the cameras are those without them to a part of their sigmas."""
-    made, rng = simulate_block(8, 2000, seed=2), np.random.default_rng(2)
-    wrong = rng.random(len(made.tracks)) < 0.02
-    off = wrong[:, None] * rng.normal(0.0, 20.0, made.tracks.xy.shape)
-    tracks = replace(made.tracks, xy=made.tracks.xy + off), made.tracks
-    foul, clean = (adjust_tracks(made.views, some, AdjustOptions(min_convergence=0.0)) for some in tracks)
-    assert [one.status.split(" of")[0] for one in (foul, clean)] == ["2 passes"] * 2
-    assert (foul.inlier & wrong).sum() < 0.02 * wrong.sum()
-    sigma = np.sqrt(clean.covariance.variances())
-    assert np.abs((foul.params - clean.params) / sigma).max() < 1.0
-    assert foul.noise == pytest.approx(clean.noise, rel=0.02)
-
-
 def test_least_squares_are_exact_at_once(clean, monkeypatch) -> None:
     solves = seen(monkeypatch, rounds, "minimise")
     found = solve(clean, **CALM, loss="linear", estimate_noise=False)

@@ -128,6 +128,8 @@ class Rounds:
         self.state, self.residual, self.counted, self.noise, self.projected = _robust(
             start, self.observations, given, self.use, self.smooth
         )
+        # with those that are cut next: a view of which many are displaced must not hold the others
+        self.misfit = self.smooth.test(self.residual, self.use).rms
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
         """Return one pass; the outcome where it is the last."""
@@ -188,8 +190,6 @@ class Rounds:
             s = self.observations.squared(scatter, self.use.astype(np.float64))
             near = self.observations.is_near(s, CRITICAL * self.noise)
             self.use = self.observations.tied(self.everything & near)
-            if self.passes == 1 and not self.is_known:  # what wrong ones are off by is no misfit
-                self.misfit = self.smooth.test(self.residual, self.use).rms
 
     def _solve(self) -> Minimum:
         """Return the least squares of the observations in use; the second pass, which always comes, is exact."""
