@@ -108,7 +108,9 @@ class Rounds:
         self.is_known = known is not None
         self.projected = projected  # of the state, until the first pass moves it
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
-        self.misfit: Array | float = known.smooth.rms if known is not None and self.goes_on and self.robust else 0.0
+        self.misfit: Array | float = 0.0
+        if known is not None and self.goes_on and self.robust:
+            self.misfit = known.smooth.misfit()
         self.scatter: Array | None = None  # residuals without smooth parts, where they are known
         self.weight = self.counted
 
@@ -129,7 +131,7 @@ class Rounds:
             start, self.observations, given, self.use, self.smooth
         )
         # with those that are cut next: a view of which many are displaced must not hold the others
-        self.misfit = self.smooth.test(self.residual, self.use).rms
+        self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
         """Return one pass; the outcome where it is the last."""
@@ -217,7 +219,7 @@ class Rounds:
             fitted = 2 * NUM_TERMS * len(fit)
             self.scatter = self._scatter(fit)
             self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
-            self.misfit = tested.rms
+            self.misfit = tested.misfit()
         else:
             self.noise = self.observations.noise(self.residual, self.use, self.problem)
         return tested

@@ -109,6 +109,10 @@ class SmoothTest:
         """Return the errors (N,) of the cameras themselves that residuals show in part: smooth, or shared [px]."""
         return np.maximum(self.rms, self.shared) / np.sqrt(self.redundancy)
 
+    def misfit(self) -> Array:
+        """Return the smooth parts (N,) [px] beyond chance, which scattered wrong observations leave, too."""
+        return np.where(self.found(0.0), self.rms, 0.0)
+
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
         """Return the views (N,) with a significant smooth part above `least` [px]."""
         return np.asarray((self.rms > least) & (self.significance < level))
