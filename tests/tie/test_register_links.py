@@ -90,9 +90,9 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
     links = _Registrations(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
     across = rng.normal(0, noise, count)
-    found = PatchRegistration.none(xy[1::2] + np.column_stack([rng.uniform(-5, 5, count), across]))
+    found = PatchRegistration.none(xy[1::2])
     found.sigma[:] = 0.1
-    sigma = links.scaled(found, np.ones(count, dtype=bool))
+    sigma = links.scaled(found, np.ones(count, dtype=bool), across)
     np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
 
 
@@ -148,16 +148,17 @@ def test_what_is_verified_is_at_its_altitude_and_no_less_certain_than_others_on_
         aside = np.array([-where.axis[1], where.axis[0]])
     found = PatchRegistration(xy, np.ones(120), np.full(120, 0.1), np.ones(120, dtype=bool))
     every = np.ones(120, dtype=bool)
-    assert links.verified(found, every).all()
+    assert links.verified(found, every)[0].all()
     few = every.copy()
     few[::3] = False
-    np.testing.assert_array_equal(links.verified(found, few), few)
+    np.testing.assert_array_equal(links.verified(found, few)[0], few)
     off = PatchRegistration(xy.copy(), found.correlation, found.sigma.copy(), found.ok)
     off.xy[20] += 0.15 * aside  # off its line: a camera's error or a match's, as the adjustment judges
     off.xy[51] += 3.0 * np.array([aside[1], -aside[0]])  # along it: at another altitude than its neighbour
     off.sigma[80], off.sigma[90] = 0.21, 0.19  # of the median 0.1 twice is tolerated
-    left = links.verified(off, every)
+    left, across = links.verified(off, every)
     assert np.flatnonzero(~left).tolist() == [50, 51, 80]
+    assert across[20] == pytest.approx(0.15, abs=1e-6) and np.abs(np.delete(across, 20)).max() < 1e-6
 
 
 def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_points() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -350,8 +351,8 @@ def refine(
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
     found = links.register(options.band, options.tile, work)
-    good = links.verified(found, found.ok)
-    sigma = links.scaled(found, good)
+    good, across = links.verified(found, found.ok)
+    sigma = links.scaled(found, good, across)
     return _shared_variance(tracks, of_track, other[good], found.xy[good], sigma[good])
 
 
@@ -368,7 +369,7 @@ class _Registrations:
     def __len__(self) -> int:
         return len(self.other)
 
-    @property
+    @cached_property
     def origin(self) -> Array:
         """Whole pixels at which the reference patches stand."""
         return np.rint(self.tracks.xy[self.reference])
@@ -404,28 +405,27 @@ class _Registrations:
             found.put(part, one)
         return found
 
-    def errors(self, found: PatchRegistration, group: IntArray) -> tuple[Array, Array]:
-        """Return distances along and across epipolar lines (M, 2) [px] of two views, and half the segments (M,)."""
-        where = epipolar_segments(*self.of(group), self.origin[group])
-        return where.errors(found.xy[group]), where.after
-
-    def verified(self, found: PatchRegistration, good: BoolArray) -> BoolArray:
+    def verified(self, found: PatchRegistration, good: BoolArray) -> tuple[BoolArray, Array]:
         """Return the mask of observations as certain as their neighbours and at one altitude with their track.
+
+        And their distances (M,) [px] across epipolar lines.
 
         Those off their epipolar line stay: whether the match or the camera is wrong, the adjustment judges, and what it
         holds out is not to agree by selection.
         """
         verified = np.zeros(len(self), dtype=bool)
-        altitude, reach = np.zeros((2, len(self)))  # from the middle of the range, in its halves
+        altitude, reach, across = np.zeros((3, len(self)))  # from the middle of the range, in its halves
         for group in self.groups():
             group = group[good[group]]
             if len(group):
                 usual = _usual(self.origin[group], found.sigma[group])
                 group = group[found.sigma[group] <= _DISTORTED * usual]
                 verified[group] = True
-                errors, reach[group] = self.errors(found, group)
-                altitude[group] = errors[:, 0] / np.maximum(reach[group], 1e-9)
-        return verified & ~self._torn(verified, altitude, reach)
+                where = epipolar_segments(*self.of(group), self.origin[group])
+                along, across[group] = where.errors(found.xy[group]).T
+                reach[group] = where.after
+                altitude[group] = along / np.maximum(where.after, 1e-9)
+        return verified & ~self._torn(verified, altitude, reach), across
 
     def _torn(self, good: BoolArray, altitude: Array, reach: Array) -> BoolArray:
         """Return the links that disagree in altitude with all neighbours in the track, up to an affine function."""
@@ -444,14 +444,13 @@ class _Registrations:
                 agreed[end[agree]] = True
         return compared & ~agreed
 
-    def scaled(self, found: PatchRegistration, good: BoolArray) -> Array:
-        """Return the sigmas [px] made larger where the distances from the epipolar lines are."""
+    def scaled(self, found: PatchRegistration, good: BoolArray, across: Array) -> Array:
+        """Return the sigmas [px] made larger where the distances `across` epipolar lines are."""
         sigma = found.sigma.copy()
         for group in self.groups():
             group = group[good[group]]
             if len(group) >= FEW:
-                across = self.errors(found, group)[0][:, 1]
-                residual = coherent(self.origin[group], across, oriented.SIGMA)[1]
+                residual = coherent(self.origin[group], across[group], oriented.SIGMA)[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
