@@ -39,7 +39,9 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
     if not asks or size > SMALL:
         asks += [one.view for one in periods_of(outcome, block)]
     if size <= SMALL:
-        return _searched_among(outcome, block, floor, views) if asks else Selection()
+        # ground that moves need not end at a row or a column
+        systematic = outcome.smooth.found(floor).any()
+        return _searched_among(outcome, block, floor, views) if asks or systematic else Selection()
     found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
     for view in dict.fromkeys(asks):
