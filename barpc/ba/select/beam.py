@@ -88,6 +88,10 @@ class _SearchState:
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
+    def may_exceed(self, noise: float) -> bool:
+        """Return whether further terms, none gaining more than the best taken, may gain more than correlated noise."""
+        return self.gain + (TRIED - len(self.taken)) * max(row.gain for row in self.taken) > noise
+
     def adds_to(self, best: _SearchState, beside: list[_Candidate]) -> bool:
         """Return whether its last term gains as much beside the best: it is no rival then."""
         last, one = self.taken[-1], self.taken[-1].term
@@ -205,8 +209,8 @@ class TermSearch:
     def run(self) -> Selection:
         """Return all terms that are taken."""
         first, ended = self._grown([_SearchState(self.start)])
-        states = first
-        while not ended:
+        states, noise = first, _noise_evidence(self.start)
+        while not ended and any(state.may_exceed(noise) for state in states):
             states, ended = self._grown(states)
         if first[0].moves and states[0].gain_beside_motion < first[0].gain:
             # the terms beside moving ground explain less than it does alone: all compete again without it
