@@ -207,6 +207,18 @@ def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     assert passes == [6, 2]  # no more than six, and never less than two
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
+    """Their smooth part is chance: weights that took it for the views' misfit moved when they were cut."""
+    made, rng = simulate_block(30, 10000, seed=seed, outliers=0.0), np.random.default_rng(seed)
+    wrong = rng.random(len(made.tracks)) < 0.02
+    ties = replace(made.tracks, xy=made.tracks.xy + wrong[:, None] * rng.normal(0, 20, made.tracks.xy.shape))
+    found = adjust_tracks(made.views, ties, AdjustOptions(min_convergence=0.01))
+    assert found.status.startswith("2 passes of cutting")
+    assert found.inlier[wrong].mean() < 0.05
+    assert found.inlier[~wrong].mean() > 0.88  # a tenth is held out
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_accuracies_stated_far_too_well_leave_no_trace_once_they_are_learnt(seed: int) -> None:
     """What views could not follow under them weighed down their ties, and nothing else may go by it at the end."""

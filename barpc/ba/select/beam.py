@@ -115,9 +115,15 @@ class _SearchState:
         return _SearchState(seen, taken, not one.FOLLOWED or len(taken) == TRIED)
 
     def without_noise(self) -> _SearchState:
-        """Return the state with the first terms alone, where correlated noise explains as much as all after them."""
+        """Return the state with the first terms alone, where correlated noise explains as much as all after them.
+
+        With it they must explain more than it alone, and more than it still does beside them: where neighbours share
+        errors, a term gains by each of them as if it were another.
+        """
+        left = _noise_evidence(self.seen) if self.taken else 0.0
         for n, row in enumerate(self.taken):
-            if sum(one.gain for one in self.taken[n:]) <= _noise_evidence(row.before):
+            gain = sum(one.gain for one in self.taken[n:])
+            if gain <= max(left, _noise_evidence(row.before) + SURE - left):
                 return _SearchState(row.before, self.taken[:n])
         return self
 
@@ -179,13 +185,15 @@ def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
 
 
 def _noise_evidence(seen: Residuals) -> float:
-    """Return the evidence for noise that neighbours share, beside the terms taken [nats]."""
+    """Return the evidence for noise that neighbours share where nothing moves, beside the terms taken [nats]."""
     found, linear = seen.base, seen.linear
     off, _ = off_from_right(linear, _residuals(found, linear, seen.extra), found.right)
     track = np.full(len(linear.view), -1)
     for n, tracks in enumerate(linear.tracks):
         track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
     right = (track >= 0) & (found.right > 0.5)
+    if len(found.moving):
+        right &= found.moving < 0.5
     # what exceeds the stated errors of matchers is no noise of theirs
     return correlated_log_ratio(linear.view, seen.place, seen.size, off, right, track)
 
