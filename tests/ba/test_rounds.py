@@ -14,6 +14,7 @@ from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.parameters.priors import CameraPrior
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _weighted_median
+from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State
 from barpc.simulate import SimulatedBlock, simulate_block
@@ -376,7 +377,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     unknowns = problem.cameras.unknowns if same else object()
     known: Any = SimpleNamespace(
         problem=SimpleNamespace(cameras=SimpleNamespace(unknowns=unknowns), camera_prior=wider),
-        inlier=inlier, noise=1.7, smooth=SimpleNamespace(rms=np.array([0.1, 0.2, 0.3])),
+        inlier=inlier, noise=1.7, smooth=SmoothTest(np.array([0.1, 0.2, 0.3]), np.array([1e-9, 0.5, 1e-9]), *np.ones((2, 3))),
         prior="what was learnt",
     )  # fmt: skip
     each = rounds.Rounds(problem, block, state, heights, use, known)
@@ -390,7 +391,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     np.testing.assert_array_equal(each.everything, tied(block.use))
     np.testing.assert_array_equal(each.use, tied(use & inlier & block.use if same else use & block.use))
     np.testing.assert_array_equal(each.counted, each.use & inlier)
-    np.testing.assert_array_equal(each.misfit, [0.1, 0.2, 0.3] if same and loss != "linear" else 0.0)
+    np.testing.assert_array_equal(each.misfit, [0.1, 0.0, 0.3] if same and loss != "linear" else 0.0)
     first = rounds.Rounds(problem, block, state, heights, use)
     assert (first.goes_on, first.is_known, first.noise, first.misfit, first.passes) == (False, False, 1.0, 0.0, 0)
     np.testing.assert_array_equal(first.counted, tied(use & block.use))

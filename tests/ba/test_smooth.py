@@ -161,6 +161,7 @@ def test_noise_alone_leaves_nothing_and_a_wave_its_root_mean_square() -> None:
     assert 1e-3 < found.significance[2] <= 1.0
     assert found.found(0.1).tolist() == [True, True, False, False]
     assert found.found(0.18).tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(found.misfit(), [*found.rms[:2], 0.0, 0.0])
     assert not SmoothTest(found.rms, np.full(4, 1.4e-4), found.by_row, found.shared).found(0.0).any()
     assert SmoothTest(np.ones(4), np.full(4, 7e-5), found.by_row, found.shared).found(0.9).all()
     # what is not used has no say
