@@ -377,8 +377,8 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     unknowns = problem.cameras.unknowns if same else object()
     known: Any = SimpleNamespace(
         problem=SimpleNamespace(cameras=SimpleNamespace(unknowns=unknowns), camera_prior=wider),
-        inlier=inlier, noise=1.7, smooth=SmoothTest(np.array([0.1, 0.2, 0.3]), np.array([1e-9, 0.5, 1e-9]), *np.ones((2, 3))),
-        prior="what was learnt",
+        smooth=SmoothTest(np.array([0.1, 0.2, 0.3]), np.array([1e-9, 0.5, 1e-9]), *np.ones((2, 3))),
+        inlier=inlier, noise=1.7, prior="what was learnt",
     )  # fmt: skip
     each = rounds.Rounds(problem, block, state, heights, use, known)
     assert each.goes_on == same
