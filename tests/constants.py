@@ -85,6 +85,7 @@ SIZES = {
     "rows_together": ("barpc.report.runfiles._TOGETHER",),
     "tracks_in_tables": ("barpc.report.outcome.MAX_TRACKS",),
     "observations_intersected": ("barpc.report.outcome._TOGETHER",),
+    "matches_measured": ("barpc.report.summary.pairs.MAX_PER_PAIR",),
     "shown": (
         "barpc.report.maps.MAX_SHOWN",
         "barpc.report.page.MAX_SHOWN",

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from barpc.base.geodesy import Array
+from barpc.report.page import SECTIONS, Section
 from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
 from barpc.report.summary.ground_points import GcpEntry
@@ -77,6 +78,11 @@ def files_of(
     table = np.array(points, dtype=float).reshape(-1, 4)
     rings = outlines or [()] * len(summary.views)
     return RunFiles(summary, observed or seen([]), table, np.arange(len(table)), rings)
+
+
+def section(files: RunFiles, key: str) -> Section | None:
+    """The part of the page of a run that has a key, if there is one."""
+    return next((found for make in SECTIONS if (found := make(files)) is not None and found.key == key), None)
 
 
 def a_square(lon: float, lat: float, half: float = 0.01) -> list[Array]:
