@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 
 from barpc.ba import AdjustOptions
@@ -224,7 +225,7 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
     block = join(made.views, made.tracks, None, options)
     problem = make_problem(block, options, None, None)
     state, _ = first_state(problem, block, options, None)
-    whole, fails = solve.la.cholesky, []
+    whole, fails = scipy.linalg.cholesky, []
 
     def cholesky(matrix: Any, **given: Any) -> Any:
         if fails:
@@ -247,7 +248,7 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
         return reduce(self, *given)
 
     monkeypatch.setattr(type(problem), "reduce", followed)
-    monkeypatch.setattr(solve.la, "cholesky", cholesky)
+    monkeypatch.setattr(scipy.linalg, "cholesky", cholesky)
     monkeypatch.setattr(scipy.optimize, "least_squares", tries)
     found = solve.minimise(problem, state, block.use / block.sigma, "scipy")
     assert found.settled

@@ -191,6 +191,8 @@ def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
         ("All of it well.", {"err": False, "bold": True, "fg": colour}),
         ("five\ntie-points\nof a view", {"err": False}),
     ]
+    print_summary(a_summary([a_view("A")], status=status))
+    assert spoken[2][0] == "Reprojection\nerror of the\ntie points"
 
 
 COMPARISON: dict[str, Any] = {
