@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 import warnings
+from concurrent.futures import CancelledError
 from types import SimpleNamespace
 
 import click
@@ -222,13 +223,14 @@ def test_after_an_error_nobody_waits_for_workers(error: type[BaseException]) -> 
     host.start()
     with pytest.raises(error), executor_for(2) as pool:
         assert pool is not None
-        for _ in range(2):
-            pool.submit(time.sleep, 30)
+        *_, last = [pool.submit(time.sleep, 30) for _ in range(9)]
         own = {child for child in multiprocessing.active_children() if child.pid != host.pid}
         raise error
     for child in own:
         child.join(60)
     assert {child.exitcode for child in own} == {-signal.SIGKILL}
+    with pytest.raises(CancelledError):
+        last.result(60)
     assert host.is_alive()
     host.kill()
     host.join()
