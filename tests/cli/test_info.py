@@ -228,10 +228,10 @@ def test_without_a_size_no_height_is_asked_for(tmp_path: Path, capsys: pytest.Ca
 def test_a_dem_is_asked_in_the_middle_of_the_image(
     pair: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("info", pair[1], "--dem", str(a_slope(tmp_path / "d.tif")), "--json") == 0
+    assert run("info", pair[1], "--dem", str(a_slope(tmp_path / "d.tif", rise=100.0)), "--json") == 0
     (found,) = json.loads(capsys.readouterr().out)
     lon, lat = found["center_deg"]
-    assert found["center_alt_m"] == pytest.approx(60.0 + 100 * (lon - 5) + 50 * (44 - lat), abs=1e-3)
+    assert found["center_alt_m"] == pytest.approx(100.0 + 1e4 * (lon - 5.4) + 50 * (44 - lat), abs=2e-3)
     seen = open_camera(pair[1]).model.project(np.array([lon, lat, found["center_alt_m"]]))
     assert seen == pytest.approx([999.5, 949.5], abs=1e-2)
     hole = a_slope(tmp_path / "hole.tif", np.s_[70:90, 30:50])

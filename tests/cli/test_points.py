@@ -173,10 +173,10 @@ def test_a_point_without_a_value_is_nan_or_null_and_the_exit_code_3(
     assert capsys.readouterr() == ("col,row\n", "")
 
 
-def a_slope(path: Path, *holes: tuple[slice, slice]) -> Path:
-    """A DEM of 60 m at 5 E, 44 N that rises by 100 m a degree to the east and 50 m to the south."""
+def a_slope(path: Path, *holes: tuple[slice, slice], rise: float = 1.0) -> Path:
+    """A DEM of 100 m at 5.4 E, 44 N: up by `rise` a hundredth of a degree to the east, by half a metre to the south."""
     row, col = np.mgrid[:101, :61]
-    heights = (60.0 + col + 0.5 * row).astype(np.float32)
+    heights = (100.0 + rise * (col - 40) + 0.5 * row).astype(np.float32)
     for hole in holes:
         heights[hole] = -9999.0
     return write_dem(path, 4979, heights)
