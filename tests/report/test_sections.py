@@ -18,7 +18,7 @@ from barpc.report.summary.pairs import OffsetEntry
 from barpc.report.summary.views import CenterEntry, EllipseEntry, FitEntry
 from barpc.report.summary.words import STATUS_WORDS
 
-from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, section, seen
+from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, section, seen, without_points
 
 pytest.importorskip("jinja2")
 
@@ -327,11 +327,9 @@ def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():
 
 
 @pytest.mark.parametrize(("num", "more"), [(400, False), (401, True)])
-def test_a_verdict_of_four_hundred_sentences_is_shown_whole(monkeypatch, num, more):
-    files = files_of(a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num))))
-    monkeypatch.setattr(page, "read_tables", lambda *_: files)
-    monkeypatch.setattr(page, "SECTIONS", ())
-    html = page.report_html(files.summary, "")
+def test_a_verdict_of_four_hundred_sentences_is_shown_whole(tmp_path, num, more):
+    summary = a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num)))
+    html = page.report_html(summary, without_points(tmp_path, len(VIEWS)))
     assert "<li>s399.</li>" in html
     assert ("And 1 more; all are in summary.json." in html) == more
 

@@ -25,7 +25,7 @@ from barpc.report.runfiles import (
     run_key,
 )
 
-from .made import a_pair, a_summary, a_view
+from .made import a_pair, a_summary, a_view, without_points
 
 
 def rows_of(path):
@@ -155,13 +155,8 @@ def read(tmp_path):
     """Reads the tables of a run of the images A and B, of which some texts are given."""
 
     def made(**texts: str):
-        nothing = json.dumps({"features": [{"geometry": None}] * 2})
-        usual = {"footprints.geojson": nothing, "observations.csv": HEAD, "residuals.csv": PLACES}
-        for name, text in {**usual, **{f"{key}.{usual_end[key]}": text for key, text in texts.items()}}.items():
-            (tmp_path / name).write_text(text)
-        return read_tables(a_summary([a_view("A"), a_view("B")]), tmp_path)
+        return read_tables(a_summary([a_view("A"), a_view("B")]), without_points(tmp_path, 2, **texts))
 
-    usual_end = {"footprints": "geojson", "observations": "csv", "residuals": "csv"}
     return made
 
 
