@@ -149,7 +149,7 @@ def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
 )
 def test_as_many_alike_in_a_place_have_the_hypergeometric_chance(found, count, alike, whole) -> None:
     chance = hypergeom(whole, alike, count).sf(found - 1)
-    assert scan._at_least(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
+    assert scan.hypergeometric_tail(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
 
 
 def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
@@ -188,7 +188,7 @@ def test_places_are_halves_of_rows_columns_both_and_cells() -> None:
 def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
     rng = np.random.default_rng(0)
     standard = np.array([[3.0, 1.0], [0.5, 0.2]]) @ rng.normal(size=(2, 300)) + 9.0
-    axes, spread = scan._axes(standard)
+    axes, spread = scan.principal_axes(standard)
     covariance = np.cov(standard, bias=True)
     np.testing.assert_allclose(axes.T @ covariance @ axes, np.diag(spread**2), atol=1e-9)
     assert spread[0] > spread[1] > 0

@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
 SCIPY_UNKNOWNS = (
-    200  # 22 views of nine: beyond, the dense products of `_WhitenedProblem` take over a tenth of an adjustment
+    200  # 22 views of nine: beyond, the dense products of `WhitenedProblem` take over a tenth of an adjustment
 )
 
 
@@ -200,7 +200,7 @@ def _status(state: State, reason: str) -> str:
     return f"sparse Levenberg-Marquardt, {len(state.history)} evaluations in all: {reason}"
 
 
-class _WhitenedProblem:
+class WhitenedProblem:
     """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
 
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
@@ -266,7 +266,7 @@ class _WhitenedProblem:
 def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
     from scipy.optimize import least_squares  # a twentieth of a second, which large blocks do not need
 
-    compressed = _WhitenedProblem(problem, state, weight, projected)
+    compressed = WhitenedProblem(problem, state, weight, projected)
     found = least_squares(
         compressed.residual,
         np.zeros(len(compressed.whitened)),

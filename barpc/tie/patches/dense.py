@@ -142,7 +142,7 @@ def dense_matches(
         disparity, good = _about_coarse(left, right, *about)
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
-    disparity, sigma = _refined_disparity(left, right, disparity, good)
+    disparity, sigma = refined_disparity(left, right, disparity, good)
     # a match a pixel: the mean of those about it that differ by less than a pixel or so, which is one surface
     single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::COLUMNS_PER_PIXEL], np.float32)
     level = cv2.bilateralFilter(single, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
@@ -263,7 +263,7 @@ def _both_ways(
     return there, good
 
 
-def _refined_disparity(
+def refined_disparity(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
 ) -> tuple[FloatImage, FloatImage]:
     """Refine SGBM's disparities [columns] by a step of least squares matching; return also sigmas [px].
