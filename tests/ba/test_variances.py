@@ -86,19 +86,9 @@ def test_what_is_learnt_is_what_the_options_leave_open() -> None:
     assert variances(1, "affine").constants == 0
 
 
-def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
-    v = variances(2, "rotation+translation", 2)
-    found = v._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 12.0]))
-    np.testing.assert_array_equal(found.mean, v.given.mean)
-    np.testing.assert_allclose(found.sigma[:, :6], [[2.0] * 6, [6.0] * 6])
-    # a turn about a centre that flies on is a drift of a hundredth of it
-    np.testing.assert_allclose(found.sigma[:, 6:9], np.hypot(2.0, [[0.02] * 3, [0.06] * 3]))
-    np.testing.assert_allclose(found.sigma[:, 9:], 5.0)
-    # a turn about the line of sight is as wide as it shows, and as the place at least
-    np.testing.assert_allclose(np.ravel(found.wider), [12.0, 4.0])
-    told = replace(v, learns=False)._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 1.0]))
-    np.testing.assert_allclose(told.sigma[:, 6:9], 2.0)
-    search = v.for_search()
+def test_a_search_has_priors_as_given_but_for_wide_drifts() -> None:
+    """A turn about a centre that flies on is a drift of a hundredth of it."""
+    search = variances(2, "rotation+translation", 2).for_search()
     np.testing.assert_allclose(search.sigma[:, :6], 2.0)
     np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(30.0, 0.02))
     np.testing.assert_allclose(search.sigma[:, 9:], 30.0)

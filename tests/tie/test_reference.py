@@ -24,9 +24,9 @@ from barpc.tie.reference import (
     ReferenceControl,
     ViewMatch,
     _ReferenceWork,
+    affine_of_shifts,
     peak,
     register_views,
-    affine_of_shifts,
 )
 from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow

@@ -129,14 +129,6 @@ def test_links_that_disagree_in_altitude_with_all_their_neighbours_are_torn() ->
     assert np.flatnonzero(links._torn(good, wrong, reach)).tolist() == [40, 41]
 
 
-def test_of_four_views_the_link_that_contradicts_two_neighbours_is_torn_alone() -> None:
-    links = links_of(60, 4)
-    altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 3)
-    altitude[30] += 0.2  # the first of its track: its neighbour agrees with the third
-    torn = links._torn(np.ones(180, dtype=bool), altitude, np.full(180, 20.0))
-    assert np.flatnonzero(torn).tolist() == [30]
-
-
 def test_what_is_verified_is_at_its_altitude_and_no_less_certain_than_others_on_its_line_or_not() -> None:
     links = links_of(60, 3)
     altitude = np.repeat(np.random.default_rng(1).uniform(-0.5, 0.5, 60), 2)

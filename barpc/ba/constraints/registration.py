@@ -300,8 +300,8 @@ def registration_at(
 ) -> Registration:
     """Return the registration at a motion (7,) [m]: its covariance, that of an M-estimate, and which heights agree.
 
-    `radius` [m] of the scene; `noise`: by how much the misfit exceeds what is stated; `free` (7, 7) [1/m^2]: what was
-    known of the motion before. LinAlgError where that is not positive definite.
+    `radius` [m] of the scene; `noise`: by how much the misfit exceeds what is stated; `free` (7, 7) [1/m^2]: the prior
+    information on the motion. LinAlgError where that is not positive definite.
     """
     seen = _SurfaceMisfit.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), SURELY)

@@ -234,10 +234,10 @@ class _SubsetSearch:
 
 
 def log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Return the log evidence (B,) of sets of points (B, G) that agree to `scale` times what is stated of them.
+    """Return the log evidence (B,) of sets of points (B, G), and their squared deviations (B, G) and (B,).
 
-    And the squared deviations of all points (B, G) from what each set tells of them, in variances of that, and the sum
-    of squares (B,) of the points in each.
+    The deviations of every point from what each set tells of it, in variances of that, and the sum of squares of the
+    points in a set. Points agree to `scale` times their standard deviations; wrong ones lie anywhere.
     """
     own, motions, variance = offsets.own, offsets.motions, scale**2
     if len(masks) > (room := max(_MAX_SET_POINTS // len(own), 1)):
