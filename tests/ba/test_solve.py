@@ -13,7 +13,7 @@ import scipy.optimize
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.solving import solve
-from barpc.ba.solving.solve import Minimum, State, _has_converged
+from barpc.ba.solving.solve import Minimum, State, has_converged
 from barpc.base.errors import AdjustError
 from barpc.simulate import simulate_block
 from tests.constants import Sized
@@ -102,7 +102,7 @@ def test_a_step_that_gains_what_it_should_is_the_last(monkeypatch, off: float, l
     ],
 )
 def test_a_step_is_the_last_where_what_it_leaves_does_not_matter(gain, before, last) -> None:
-    assert _has_converged(gain, before, 1000.0, 1e-6) == last
+    assert has_converged(gain, before, 1000.0, 1e-6) == last
 
 
 def test_a_step_that_fails_is_damped_and_the_damping_let_go(monkeypatch) -> None:

@@ -45,7 +45,7 @@ def drawn_graticule(plane: Plane) -> Drawing:
 
 
 def drawn_names(places, taken=()) -> Drawing:
-    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps._map_labels(places, taken))}</svg>")
+    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps.map_labels(places, taken))}</svg>")
 
 
 def sheet(lonlat):
@@ -315,17 +315,17 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
     places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
     drawn = drawn_names(places)
     assert drawn.texts("name") == [("view_0137", 36.9, 104.0, "middle"), ("B", 415.9, 54.0, "middle")]
-    assert [row[3] for row in maps._map_labels(places, [(30.0, 90.0, 20.0)])] == [pytest.approx(115.4), 50.0]
+    assert [row[3] for row in maps.map_labels(places, [(30.0, 90.0, 20.0)])] == [pytest.approx(115.4), 50.0]
     (long,) = drawn_names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))]).texts("name")
     assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
     for dx, dy, clear in ((8.3, 0.0, True), (8.1, 0.0, False), (0.0, 14.1, True), (0.0, 13.9, False)):
         two = [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))]
         aside = 15.4 * (not clear)  # of few images each has its name, a line lower where it would cover another
-        assert maps._map_labels(two, [])[1][3] == pytest.approx(50.0 + dy + aside)
+        assert maps.map_labels(two, [])[1][3] == pytest.approx(50.0 + dy + aside)
     crowd = [(a_view("V"), np.array([50.0 + 8.1 * k, 50.0])) for k in range(12)]  # of many those that find room
-    assert [row[2] for row in maps._map_labels(crowd, [])] == pytest.approx([50.0 + 16.2 * k for k in range(6)])
+    assert [row[2] for row in maps.map_labels(crowd, [])] == pytest.approx([50.0 + 16.2 * k for k in range(6)])
     crowd[1] = (a_view("W", status="weak", advice="look"), crowd[1][1])  # and any that needs review
-    assert ("W", pytest.approx(65.4)) in [(name, y) for _, name, _, y in maps._map_labels(crowd, [])]
+    assert ("W", pytest.approx(65.4)) in [(name, y) for _, name, _, y in maps.map_labels(crowd, [])]
 
 
 def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_them():
@@ -337,11 +337,11 @@ def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_the
         "two below": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
         "nowhere": [(50.0, 50.0 + 16.0 * k, 5.0) for k in range(-2, 3)],
     }
-    found = {key: [y for *_, y in maps._map_labels(place, [], marks)] for key, marks in rows.items()}
+    found = {key: [y for *_, y in maps.map_labels(place, [], marks)] for key, marks in rows.items()}
     rows = {"free": 50.0, "below": 65.4, "above": 34.6, "two below": 80.8, "nowhere": 50.0}
     assert found == {key: [pytest.approx(y)] for key, y in rows.items()}
     words = [(50.0, 50.0 + 16.0 * k, 5.0) for k in (-2, -1, 1, 2)]  # where these stand is no room
-    assert maps._map_labels(place, words, [mark])[0][3] == 50.0
+    assert maps.map_labels(place, words, [mark])[0][3] == 50.0
 
 
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():

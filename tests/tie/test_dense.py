@@ -8,9 +8,9 @@ import pytest
 
 from barpc.tie.patches import dense
 from barpc.tie.patches.dense import (
-    _NOISE_VARIANCE,
-    _SLOPE_VARIANCE,
     COLUMNS_PER_PIXEL,
+    NOISE_VARIANCE,
+    SLOPE_VARIANCE,
     _both_ways,
     dense_matches,
     epipolar_frame,
@@ -112,7 +112,7 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
         moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
         inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
         found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
-    np.testing.assert_allclose(np.mean(found, axis=0), [_NOISE_VARIANCE, _SLOPE_VARIANCE], rtol=0.03)
+    np.testing.assert_allclose(np.mean(found, axis=0), [NOISE_VARIANCE, SLOPE_VARIANCE], rtol=0.03)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.7, 40.0), (1.3, -40.0)])

@@ -229,11 +229,6 @@ def test_a_peak_stands_out_by_six_standard_deviations_of_chance(search, count, p
         assert known.significance == pytest.approx(significance, rel=0.03)
 
 
-@pytest.mark.parametrize(("at", "found"), [(15.9, True), (16.1, False), (-15.9, True), (-16.1, False)])
-def test_a_peak_at_the_end_of_the_band_may_go_on_beyond_it(search, at: float, found: bool) -> None:
-    assert (search(Listed(np.full(50, at)))._blind(20.0, 100) is not None) == found
-
-
 def test_passes_grow_wider_until_one_is_clear(search) -> None:
     clear = Listed(spread_out(70, 50))  # more than three tenths
     assert search(clear).offset is not None

@@ -75,7 +75,7 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        shares = _share_log_ratios(whole)
+        shares = share_log_ratios(whole)
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # all of an image is no interval
@@ -161,7 +161,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
     return out - float(np.log(4 * views))
 
 
-def _share_log_ratios(bins: Array) -> Array:
+def share_log_ratios(bins: Array) -> Array:
     """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
 
     `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.

@@ -94,7 +94,7 @@ def minimise(
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `_has_converged`). `solver` is "scipy", "sparse" or "auto"
+    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "scipy", "sparse" or "auto"
     (see the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
@@ -119,11 +119,12 @@ def minimise(
     return result
 
 
-def _has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
-    """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
+def has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
+    """Return whether a step that should lower the cost by `gain`, after one by `before`, is the last.
 
-    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Without noise
-    the cost is rounding alone: the tolerance is a thousandth of a standard deviation at least.
+    `cost` is that before the step, `tolerance` the share of it that does not matter. The gains shrink at least in the
+    proportion of the last two: what the step leaves is gain^2 / before. Without noise the cost is rounding alone: the
+    tolerance is a thousandth of a standard deviation at least.
     """
     cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
@@ -171,7 +172,7 @@ def _levenberg_marquardt(
             damping = max(10.0 * damping, 1e-8)
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
-        if _has_converged(gain, before, state.cost, tolerance):
+        if has_converged(gain, before, state.cost, tolerance):
             status = _status(state, "the next step gains too little")
             return Minimum(ahead, reduced, None if damping else factor, status)
         residual, projected = problem.prepare(ahead.params, ahead.points)
