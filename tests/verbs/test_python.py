@@ -20,11 +20,11 @@ from rasterio.io import MemoryFile
 import barpc
 from barpc.base.declarations import Options, declared
 from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
-from barpc.base.options import FLAG_NAMES, AdjustOptions, FitOptions, RunOptions, TieOptions
+from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
 from barpc.verbs.images import camera_of, every
-from barpc.verbs.options import run_options
+from barpc.verbs.options import FLAG_NAMES, run_options
 from tests.rpcio.conftest import make_rpc
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
