@@ -394,6 +394,9 @@ def test_files_are_made_in_a_room_of_their_view_for_their_place(tmp_path, view) 
     with rasterio.open(out / "scene.vrt") as vrt:
         assert (vrt.width, vrt.height) == view.size
         assert [Path(name).resolve() for name in vrt.files[1:]] == [Path(view.path)]
+    (file := tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"deep/out/scene\.vrt: cannot be written \(Not a directory\)"):
+        outputs.make_files(view, make_rpc(), "vrt", ("txt",), str(out), str(file))
 
 
 @pytest.mark.parametrize(
