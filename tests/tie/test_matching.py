@@ -261,3 +261,11 @@ def test_the_local_band_is_four_standard_deviations_wide_within_its_bounds(searc
     assert found.half_width == pytest.approx(width, rel=0.15)
     where = found.at(np.array([[500.0, 500.0]]))
     np.testing.assert_allclose([where.before, where.after], [[3.0], [11.0]], atol=1e-6)
+
+
+def test_the_best_come_first_and_each_place_once(search) -> None:
+    matcher = Scripted([0.4, 0.3, 0.2, 0.1])
+    matcher.places = np.array([[0.0, 0.0], [0.3, 0.2], [50.0, 0.0], [90.0, 0.0]]).repeat(2, 0).reshape(4, 2, 2)
+    found, _ = search(matcher).trusted(FLAT, 1.0)
+    assert found.xy[:, 0, 0].tolist() == [90.0, 50.0, 0.3]  # the first two are one place, the better stays
+    assert found.score.tolist() == [0.1, 0.2, 0.3]

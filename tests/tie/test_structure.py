@@ -275,6 +275,31 @@ def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_
     assert pitch == step * int((3000 * 3000 / 200) ** 0.5 / step)
 
 
+@pytest.mark.parametrize(("half", "step"), [(20.0, 2), (200.0, 4)])
+def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step) -> None:
+    """Half of the length; a window that B does not see says nothing."""
+
+    def where(at: np.ndarray) -> EpipolarSegments:
+        length = np.where(at[:, 0] < 2000.0, half, np.nan)
+        nothing = np.zeros(len(at))
+        return EpipolarSegments(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
+
+    view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
+    for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2)):
+        search = _GridSearch(view, view, 1, Prediction(where, 3.0, lambda windows=windows: windows))
+        assert search._step == found
+
+
+@pytest.mark.parametrize(("side", "step"), [(480, 8), (479, 4), (240, 4), (239, 2), (100, 2), (20, 2)])
+def test_a_picture_has_sixty_pixels_a_side_where_it_can(side, step) -> None:
+    assert level(10.0, 1000, side, probes=1500, band=120.0)[0] == step
+
+
+def test_points_are_eight_pixels_apart_at_least() -> None:
+    assert level(10.0, 200, 200)[1] == 2 * 8
+    assert level(200.0, 500, 500)[1] == 4 * 8
+
+
 @pytest.mark.parametrize(
     ("start", "axis", "most", "expected"),
     [
