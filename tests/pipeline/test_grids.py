@@ -418,6 +418,16 @@ def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> N
         grids.grid_correction(make_rpc(), sample)  # type: ignore[arg-type]
 
 
+def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
+    rpc = make_rpc()
+    sample = grids.Sample.of(rpc, (2000, 1900), (30.0, 300.0), cells=5)
+    beside = SimpleNamespace(project=lambda ground: rpc.project(ground) + [3.0, -4.0])
+    rms, largest, where = grids._largest_miss(sample, beside)  # type: ignore[arg-type]
+    assert rms == pytest.approx(5.0, abs=1e-5)
+    assert largest == pytest.approx(5.0, abs=1e-5)
+    assert where.shape[1] == 3
+
+
 @pytest.mark.parametrize(("asked", "resampled"), [(True, False), (False, True), (True, True)])
 def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch, asked, resampled) -> None:
     """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
