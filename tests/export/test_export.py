@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.export import TARGETS, export_run
+from barpc.export import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.sources import light_of
 from barpc.sensor.geometry import image_grid
@@ -190,25 +190,22 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
     assert theirs.read_bytes() == b"mine"
 
 
-def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(southern, tmp_path, monkeypatch, caplog):
-    out = tmp_path / "out"
-    for folder in ("/images", "/others"):
-        export_run(in_one_folder(southern, tmp_path / folder[1:], folder), "colmap", out, overwrite=True)
-        assert {link.readlink().parent.name for link in (out / "images").iterdir()} == {folder[1:]}
-    first = min((out / "images").iterdir())
-    first.unlink()
-    first.write_text("mine")
+def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path, monkeypatch, caplog):
+    link = tmp_path / "sparse/images/a.tif"
+    for image in ("../../a.tif", "../../b.tif"):
+        _link_image(link, image)
+        assert str(link.readlink()) == image
+    (tmp_path / "mine.tif").write_text("mine")
     with pytest.raises(OutputError, match="is there already and no link of an earlier export"):
-        export_run(southern, "colmap", out, overwrite=True)
-    assert first.read_text() == "mine"
+        _link_image(tmp_path / "mine.tif", "a.tif")
+    assert (tmp_path / "mine.tif").read_text() == "mine"
 
     def refuse(*_: object) -> None:
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    export_run(southern, "colmap", tmp_path / "new")
-    assert f"images/{first.name}: no link to " in caplog.text
-    assert " (Operation not permitted): copy the image there" in caplog.text
+    _link_image(tmp_path / "c.tif", "a.tif")
+    assert "c.tif: no link to a.tif (Operation not permitted): copy the image there" in caplog.text
 
 
 def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
