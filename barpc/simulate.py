@@ -338,7 +338,7 @@ def fly(target: Array, look: Look, size: tuple[int, int], gsd: float) -> Pushbro
     count = 2 * _ORBIT_DEGREE + 1  # times at which the guided motion is sampled
     times = stop * np.cos(np.pi * (np.arange(count) + 0.5) / count)[::-1]
 
-    position = _circle(place, _horizontal(heading) @ enu, rate, times)
+    position = circular_orbit(place, _horizontal(heading) @ enu, rate, times)
     z = aim + (gsd / period) * times[:, None] * along - position
     z /= np.linalg.norm(z, axis=1, keepdims=True)
     y = np.cross(z, along)
@@ -368,8 +368,11 @@ def _standpoint(target: Array, look: Look) -> Array:
     return np.asarray(origin + direction * (np.sqrt(along**2 + radius**2 - origin @ origin) - along))
 
 
-def _circle(place: Array, forward: Array, rate: float, times: Array) -> Array:
-    """Return ECEF positions (N, 3) on a circular inertial orbit, at `place` at time 0 and flying `forward`."""
+def circular_orbit(place: Array, forward: Array, rate: float, times: Array) -> Array:
+    """Return positions (N, 3) [m], ECEF, on an orbit that is a circle in inertial space, at times (N,) [s].
+
+    At time 0 it is at `place` (3,) [m] and flies towards `forward` (3,), at `rate` [rad/s].
+    """
     forward = forward - (forward @ place) / (place @ place) * place
     forward *= np.linalg.norm(place) / np.linalg.norm(forward)
     inertial = np.outer(np.cos(rate * times), place) + np.outer(np.sin(rate * times), forward)

@@ -324,7 +324,7 @@ def test_a_physical_model_is_for_the_altitudes_of_the_rpc_beside_it_or_for_all_g
 )
 def test_altitudes_are_an_interval_that_ground_may_lie_in(text, taken):
     if taken:
-        assert cameras._interval(text) == (-1e4, 1e5)
+        assert cameras.OPENERS["csm"].choices["altitudes"](text) == (-1e4, 1e5)
     else:
         with pytest.raises(ValueError):
-            cameras._interval(text)
+            cameras.OPENERS["csm"].choices["altitudes"](text)

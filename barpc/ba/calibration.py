@@ -214,7 +214,7 @@ class Told:
         return float(-(2.0 * self.gradient + self.matrix @ unknowns) @ unknowns)
 
 
-def _told(curve: LineCurve, ties: SensorTies, weight: Array) -> Told:
+def normal_equations(curve: LineCurve, ties: SensorTies, weight: Array) -> Told:
     """Return a block's normal equations of splines and detectors, its observations weighted by (K,) [1/px]."""
     block, (values, place) = _Eliminated(ties, ties.residual, weight), curve.local(ties.xy[:, 0])
     return block.told(block.both(values, place, curve.size + 1))
@@ -287,7 +287,9 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
     for turn in range(STEPS):
         candidates = LineCurve(int(width), np.unique(np.round(places)) - 0.5)
         weights = [_weights(block, spline) for block in blocks]
-        total = reduce(add, (_told(candidates, *one) for one in zip(blocks, weights, strict=True))).by_steps(candidates)
+        total = reduce(add, (normal_equations(candidates, *one) for one in zip(blocks, weights, strict=True))).by_steps(
+            candidates
+        )
         chosen, bend = _best(total, candidates)
         chosen.sort()
         curve = LineCurve(int(width), candidates.edges[chosen])
@@ -297,7 +299,7 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
             around = np.arange(-1.5 * _FINER, 1.5 * _FINER + 1) * max(spacing / _FINER, 1.0)
             places = (curve.edges[:, None] + 0.5 + around).clip(1.0, width - 1.0).ravel()
             spacing = max(spacing / _FINER, 1.0)
-    told = [_told(curve, *one).by_steps(curve) for one in zip(blocks, weights, strict=True)]
+    told = [normal_equations(curve, *one).by_steps(curve) for one in zip(blocks, weights, strict=True)]
     return _judged(curve, told, curve.prior(bend), float(np.median([1.0 / one.max() for one in weights])))
 
 

@@ -481,7 +481,10 @@ def _sights(ground: Array) -> tuple[float, float, float]:
     Of ground points (2, lines, points, 2, 3) at two altitudes: root mean square angles [rad], thickness over length,
     and the largest 1 / distance of the point [1/m], above positive; NaN where no line is all on the ground.
     """
-    known = [np.array([_bundle(ecef_from_ground(one)) for one in lines if np.isfinite(one).all()]) for lines in ground]
+    known = [
+        np.array([bundle_of_lines(ecef_from_ground(one)) for one in lines if np.isfinite(one).all()])
+        for lines in ground
+    ]
     known = [bundles for bundles in known if len(bundles)]
     if not known:
         return np.nan, np.nan, np.nan
@@ -489,8 +492,11 @@ def _sights(ground: Array) -> tuple[float, float, float]:
     return point, plane, max(float(bundles[:, 2].mean()) for bundles in known)
 
 
-def _bundle(ecef: Array) -> tuple[float, float, float]:
-    """Return how far lines through points (n, 2, 3) [m] are from a point and a plane, and 1 / distance of the point.
+def bundle_of_lines(ecef: Array) -> tuple[float, float, float]:
+    """Return how far lines through pairs of points (n, 2, 3) [m] are from a bundle, and 1 / distance of its centre.
+
+    From one point: the RMS angle [rad] between them and lines through the centre; from one plane: the thickness of all
+    points over their width; and [1/m]. LinAlgError for points that are not finite.
 
     A line through o with the slope t across the mean direction m passes the point at the distance h along m where
     o + h t is one for all: (o - (o m) (m + t)) / h - g = -t, linear in 1 / h and g.

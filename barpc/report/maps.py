@@ -168,7 +168,7 @@ def ground_map(files: RunFiles) -> str:
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
         gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
         pairs=_pair_lines(middles, files),
-        shown=_map_labels([(view, middles[view.name]) for view in named], taken, triangles),
+        shown=map_labels([(view, middles[view.name]) for view in named], taken, triangles),
         marks=[
             (kind, "doubted" * doubted(point), point.name, x, y, up)
             for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)
@@ -195,7 +195,7 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
 OccupiedAreas = list[tuple[float, float, float]]  # places that words have on the map: x, y, half their width
 
 
-def _map_labels(
+def map_labels(
     places: Sequence[tuple[ViewEntry, Array]], taken: OccupiedAreas, marks: OccupiedAreas | None = None
 ) -> list[tuple[ViewEntry, str, float, float]]:
     """Return labels of images at positions (2,), without those that would cover others or occupied areas.

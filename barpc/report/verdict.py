@@ -113,11 +113,14 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             *_of_solution(run, found),
         )
     yield from dem_reasons(found)
-    yield from datum_reasons(run.datums, found, _common_lean(views))
+    yield from datum_reasons(run.datums, found, common_lean(views))
 
 
-def _common_lean(views: Sequence[ViewEntry]) -> float:
-    """Return the tangent of the incidence that the lines of sight of all views have in common; 0: none."""
+def common_lean(views: Sequence[ViewEntry]) -> float:
+    """Return the tangent of the angle from the vertical that the lines of sight of all views have in common.
+
+    The length of the mean of their tangents as vectors by azimuth; views of unknown angles do not count, 0: none.
+    """
     angles = np.array([(view.incidence_deg, view.azimuth_deg) for view in views], dtype=np.float64)
     incidence, azimuth = np.radians(angles.reshape(-1, 2)).T
     leans = np.tan(incidence) * np.exp(1j * azimuth)

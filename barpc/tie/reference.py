@@ -349,7 +349,7 @@ class _ReferenceWork:
         aside = max(float(np.linalg.norm(sight)), 1e-9)
         sight = sight / aside
         turned = np.stack([[sight[1], -sight[0]], sight])  # across it; along it, where the terrain's errors move points
-        agreed = _affine(local, shift * [self.step, -self.step] @ turned.T, passed, self.step)
+        agreed = affine_of_shifts(local, shift * [self.step, -self.step] @ turned.T, passed, self.step)
         if agreed is None:
             return report, None
         fitted, keep, (scatter, along) = agreed
@@ -361,12 +361,13 @@ class _ReferenceWork:
         return report, (point[keep], xy[keep], np.full(int(keep.sum()), scatter / gsd))
 
 
-def _affine(
+def affine_of_shifts(
     local: Array, shift: Array, passed: BoolArray, step: float
 ) -> tuple[Array, BoolArray, tuple[float, float]] | None:
-    """Return an affine (n, 2) through most of the shifts (n, 2), its inliers, their sigmas along both axes.
+    """Return an affine through most shifts (n, 2) [m] at places `local` (n, 2) [m], its inliers and their sigmas.
 
-    The search starts where most shifts lie together, within `SURELY` px. None where too few agree.
+    Its values (n, 2), which of those that `passed` (n,) agree, and the standard deviations along both axes. The search
+    starts where most shifts lie together, within `SURELY` pixels of `step` [m]. None where too few agree.
     """
     if passed.sum() < _MIN_AGREEING_POINTS:
         return None

@@ -74,7 +74,7 @@ def described(
 def _altitude(image: ImageLike, camera: Camera, alt: float | None, terrain: Dem | None) -> float:
     """Return the altitude of the ground in the middle of an image [m]; the camera's where no size tells the middle."""
     if camera.size is None:
-        return camera.altitude if alt is None else alt
+        return camera.altitude
     if terrain is None:
         return altitude_of(camera, place_of(image), alt)
     found = ground_at(camera, (np.array([camera.size]) - 1) / 2, 0.0, terrain)[0, 2]

@@ -78,7 +78,9 @@ def test_an_error_that_neighbours_share_is_another_in_every_half_of_a_wave() -> 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_steps_leave_a_shift_and_a_scale_to_others(count: int) -> None:
-    steps = AdditionalParameters(0, np.zeros((1, count)))._of_steps
+    waves, col = AdditionalParameters(0, np.arange(count)[None] + 0.5), np.arange(count + 1.0)  # one of each detector
+    steps = waves.basis(0.0 * col, np.stack([col, col]), np.zeros(count + 1, dtype=int))[0].T
+    assert steps.shape == (count + 1, max(count - 1, 1))
     place = np.linspace(-1, 1, count + 1)
     np.testing.assert_allclose(steps.T @ np.ones(count + 1), 0.0, atol=1e-12)
     if count > 1:
@@ -90,9 +92,9 @@ def test_a_view_without_edges_has_no_steps_and_one_with_fewer_its_own() -> None:
     waves = AdditionalParameters(0, np.array([[5.0, 9.0], [7.0, np.inf], [np.inf, np.inf]]))
     col, index = np.tile([4.9, 5.0, 8.0, 9.5], 3), np.repeat([0, 1, 2], 4)
     (basis,) = waves.basis(np.zeros(12), np.stack([col, col * 0.0]), index)
-    levels = waves._of_steps.T
+    levels = np.array([1.0, -2.0, 1.0]) / np.sqrt(6.0)  # of three detectors all that is left
     place = [0, 1, 1, 2, 0, 0, 1, 1]
-    np.testing.assert_allclose(basis[:, :8], levels[:, place])
+    np.testing.assert_allclose(np.sign(basis[0, 0]) * basis[:, :8], levels[None, place])
     assert not basis[:, 8:].any()
     params = np.array([0.5, -0.25])
     for view, edges in ((0, [5.0, 9.0]), (1, [7.0]), (2, [])):

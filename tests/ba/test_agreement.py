@@ -177,7 +177,7 @@ def test_points_that_nothing_tells_of_take_no_part() -> None:
 def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
     offsets = drawn(5, 2, {0: (9.0, 0.0, 0.0)}, free=50.0)
     chosen = np.array([0, 1, 1, 0, 1], dtype=bool)
-    (score,), (squared,), (together,) = sets._log_evidence(offsets, chosen[None], scale)
+    (score,), (squared,), (together,) = sets.log_evidence(offsets, chosen[None], scale)
     motions = offsets.motions.reshape(15, -1)
     whole = motions @ motions.T + scale**2 * np.eye(15)
     rows = np.repeat(chosen, 3)
@@ -193,7 +193,7 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
         assert squared[g] == pytest.approx(far**2, rel=1e-4)
         # alike at all sizes from one sigma to 10,000: 1 / (4 pi r^3) over ln 10,000 and the ball within
         density = -np.log(4 * np.pi * (1 / 3 + np.log(1e4))) - 3 * np.log(max(far, 1.0))
-        expected += density - 0.5 * np.linalg.slogdet(spread)[1] - sets._ODDS
+        expected += density - 0.5 * np.linalg.slogdet(spread)[1] - sets.ODDS
     assert score == pytest.approx(expected, abs=0.05)
 
 

@@ -22,9 +22,9 @@ from barpc.ba.constraints.registration import (
     GivenHeights,
     Registration,
     TieSurface,
-    _search_shift,
     displacement,
     register,
+    search_shift,
 )
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
@@ -63,10 +63,10 @@ def registered(rng: np.random.Generator, heights: GivenHeights, **scene: Any) ->
 def test_the_search_gives_the_shift_on_which_most_heights_agree_and_none_where_there_is_no_surface():
     rng = np.random.default_rng(4)
     here = TieSurface.of(surface(rng))
-    found = _search_shift(here, given(rng, 400, [11.0, -7.0, 30.0], wrong=0.2), BEFORE)
+    found = search_shift(here, given(rng, 400, [11.0, -7.0, 30.0], wrong=0.2), BEFORE)
     np.testing.assert_allclose(found[:3], [11.0, -7.0, 30.0], atol=2.5)
     assert found[3:].tolist() == [0.0] * 4
-    assert _search_shift(here, given(rng, 50, [5000.0, 0.0, 30.0]), BEFORE).tolist() == [0.0] * 7
+    assert search_shift(here, given(rng, 50, [5000.0, 0.0, 30.0]), BEFORE).tolist() == [0.0] * 7
 
 
 def test_a_patch_has_its_own_height_and_slopes():
@@ -169,13 +169,11 @@ def test_slopes_that_are_noise_know_no_place():
     rng = np.random.default_rng(2)
     heights, free = given(rng, 400, 0.0, size=0.0), np.diag((10.0 * BEFORE) ** -2)
     plain = TieSurface.of(surface(rng, size=0.0, noise=0.3))
-    sigma = np.sqrt(
-        np.diag(registration._registration_result(plain, heights, np.zeros(7), 200.0, 1.0, free).covariance)
-    )
+    sigma = np.sqrt(np.diag(registration.registration_at(plain, heights, np.zeros(7), 200.0, 1.0, free).covariance))
     assert (sigma[:2] > 9.0).all()
     assert sigma[2] < 0.5
     hills = TieSurface.of(surface(rng))
-    found = registration._registration_result(hills, given(rng, 400, 0.0, wrong=0.2), np.zeros(7), 200.0, 1.0, free)
+    found = registration.registration_at(hills, given(rng, 400, 0.0, wrong=0.2), np.zeros(7), 200.0, 1.0, free)
     assert (np.sqrt(np.diag(found.covariance))[:3] < [0.5, 0.5, 0.1]).all()
     assert found.share == pytest.approx(0.8, abs=0.1)
 
@@ -362,7 +360,7 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     heights = GivenHeights(place, np.full(80, 0.5), np.full(80, 0.9))
     surface: Any = plane_of((0.3, -0.2), 0.4)
     free = np.diag(np.arange(1.0, 8.0) ** -2.0)
-    found = registration._registration_result(surface, heights, np.zeros(7), 200.0, noise, free)
+    found = registration.registration_at(surface, heights, np.zeros(7), 200.0, noise, free)
     scale, cut = max(noise, 1.0), registration.BIWEIGHT
     sigma = np.sqrt(0.4**2 + 0.5**2 + (0.3**2 + 0.2**2) * 0.9**2)
     near = place[:, :2].max(axis=1) <= 300.0

@@ -14,9 +14,9 @@ from barpc.ba.calibration import (
     SensorTies,
     Told,
     _judged,
-    _told,
     contradicts,
     learn,
+    normal_equations,
     share_shown,
 )
 from barpc.ba.interior import Calibration, CommonErrors, LineCurve
@@ -43,7 +43,7 @@ def test_points_and_nuisances_are_eliminated_as_a_dense_solution_does() -> None:
     made = ties(scene(any_looks(3, rng), Sensor.made("waves", 1, size=SIZE), rng, 60, size=SIZE))
     count, points, views = len(made.view), int(made.point.max()) + 1, int(made.view.max()) + 1
     weight, curve = rng.uniform(5, 10, count), LineCurve(SIZE[0], np.array([1500.5, 4200.5]))
-    told = _told(curve, made, weight).by_steps(curve)
+    told = normal_equations(curve, made, weight).by_steps(curve)
     col, row = made.place.T
     terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
     others, own = np.zeros((2 * count, 3 * points + 10 * views)), np.zeros((2 * count, 2 * curve.size))

@@ -12,7 +12,7 @@ from scipy.optimize import brentq, minimize
 
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import join, make_problem
-from barpc.ba.robust.consensus import TwoGroups, _mixture, agreeing, two_groups
+from barpc.ba.robust.consensus import TwoGroups, agreeing, two_groups, two_normals
 from barpc.ba.solving.problem import Problem
 from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
@@ -97,18 +97,18 @@ def test_a_mixture_is_the_likeliest_one(share: float, apart: float) -> None:
 
 @pytest.mark.parametrize(("apart", "found"), [(0.0, False), (1.8, False), (2.2, True)])
 def test_centres_are_apart_from_two_standard_deviations_on(apart: float, found: bool) -> None:
-    part, distance, _ = _mixture(groups(4000, 0.5, apart * 0.3))
+    part, distance, _ = two_normals(groups(4000, 0.5, apart * 0.3))
     assert (part > 0.4) == found
     assert (distance > 0) == found
 
 
 def test_nothing_is_gained_where_one_group_takes_all() -> None:
     lone = np.r_[np.zeros(50), 1e6]  # so far out that it is a group of no width
-    part, distance, gain = _mixture(lone - lone.mean())
+    part, distance, gain = two_normals(lone - lone.mean())
     assert 0 <= part < 0.05
     assert np.isfinite([part, distance, gain]).all()
     with np.errstate(invalid="ignore"):
-        assert _mixture(np.ones(50)) == (0.0, 0.0, 0.0)
+        assert two_normals(np.ones(50)) == (0.0, 0.0, 0.0)
     assert told(np.r_[np.zeros(150), 1e6]) is None
     assert told(np.ones(150)) is None
 
@@ -189,7 +189,7 @@ def test_what_looks_like_one_group_by_skewness_and_kurtosis_is_one(seen, monkeyp
         z = groups(400, share, distance)
         return (stats.skew(z) ** 2 + 1) / stats.kurtosis(z)
 
-    monkeypatch.setattr("barpc.ba.robust.consensus._mixture", lambda z: (0.5, 1.0, 100.0))
+    monkeypatch.setattr("barpc.ba.robust.consensus.two_normals", lambda z: (0.5, 1.0, 100.0))
     for bound, said in ((1.02, True), (0.98, False)):
         distance = brentq(lambda d, bound=bound: coefficient(d) - bound * 4.0 / 9.0, 0.5, 1.2)
         assert len(two_groups(seen[0].structure, *_given(seen, groups(400, share, distance)))) == said

@@ -133,7 +133,7 @@ def test_of_all_cuts_of_an_order_the_best_parts_most_for_the_views_that_touch_it
         before, behind = int(across.any(axis=1).sum()), int(across.any(axis=0).sum())
         near, far = (cut - before, n - cut) if before < behind else (cut, n - cut - behind)
         costs.append((min(before, behind) + 1) / (near * far) if near * far else np.inf)
-    _, cut, cost = structure._best_cut(graph, order)
+    _, cut, cost = structure.best_cut(graph, order)
     assert cost == pytest.approx(min(costs))
     assert costs[cut - 1] == pytest.approx(min(costs))
 

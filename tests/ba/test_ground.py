@@ -10,7 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from barpc.ba.constraints.gauge import MOTIONS, _motion_of_points
+from barpc.ba.constraints.gauge import MOTIONS, motions_of_moves
 from barpc.ba.constraints.ground import (
     DEM_BIAS,
     PointConstraints,
@@ -279,7 +279,7 @@ def test_motions_of_points_are_those_of_least_squares() -> None:
         ],
         axis=1,
     )
-    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([local, np.zeros(45)])), moves)
+    found = np.einsum("mnx,nx->m", motions_of_moves(np.column_stack([local, np.zeros(45)])), moves)
     np.testing.assert_allclose(found, amount, rtol=1e-6)
     assert MOTIONS[:7] == ("east", "north", "up", "tilt east", "tilt north", "turn", "scale")
     assert MOTIONS[7:] == ("twist", "bend east", "bend north")
@@ -290,9 +290,9 @@ def test_heights_of_a_narrow_scene_are_not_said_to_bend_where_it_is_not() -> Non
     east, north = np.random.default_rng(1).uniform(-1, 1, (2, 400)) * [[0.01], [1.0]]
     up = np.random.default_rng(2).normal(0, 1.0, 400)
     moves = np.column_stack([np.zeros((400, 2)), up])
-    found = np.einsum("mnx,nx->m", _motion_of_points(np.column_stack([east, north, up])), moves)
+    found = np.einsum("mnx,nx->m", motions_of_moves(np.column_stack([east, north, up])), moves)
     assert np.abs(found[7:]).max() < 1.0
-    line = _motion_of_points(np.column_stack([np.zeros(400), north, up]))
+    line = motions_of_moves(np.column_stack([np.zeros(400), north, up]))
     assert np.isfinite(line).all()
 
 

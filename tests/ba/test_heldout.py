@@ -14,13 +14,13 @@ from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import Block, join, make_problem
 from barpc.ba.robust.heldout import (
     HeldOut,
-    _scrambled,
     check_residuals,
     is_better,
     keep_out,
     measure,
     scatter,
     split_points,
+    splitmix64,
 )
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
@@ -50,7 +50,7 @@ def test_numbers_are_scrambled_as_splitmix_does_it() -> None:
     """The first outputs of SplitMix64 from the seed 0 (Vigna's reference code)."""
     odd = np.uint64(0x9E3779B97F4A7C15)
     with np.errstate(over="ignore"):
-        found = _scrambled(np.arange(1, 4, dtype=np.uint64) * odd)
+        found = splitmix64(np.arange(1, 4, dtype=np.uint64) * odd)
     assert [hex(int(x)) for x in found] == ["0xe220a8397b1dcdaf", "0x6e789e6aa1b965f4", "0x6c45d188009454f"]
 
 

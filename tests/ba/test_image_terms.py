@@ -16,7 +16,7 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.robust.heldout import keep_out
 from barpc.ba.select import image_terms
 from barpc.ba.select.beam import Selection
-from barpc.ba.select.image_terms import _spline_counts, with_splines, with_terms
+from barpc.ba.select.image_terms import spline_counts, with_splines, with_terms
 from barpc.ba.select.parts import Parts
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import Solution, solve_block
@@ -55,7 +55,7 @@ def views_of(*counts: int, rows: int = 20000, unused: int = 0) -> Any:
     ],
 )
 def test_splines_are_as_many_as_asked_for_or_ever_more(options, waves, counts) -> None:
-    assert _spline_counts(views_of(3000, 3000, 3000), AdjustOptions(**options), waves) == counts
+    assert spline_counts(views_of(3000, 3000, 3000), AdjustOptions(**options), waves) == counts
 
 
 @pytest.mark.few(3)
@@ -73,12 +73,12 @@ def test_splines_are_as_many_as_asked_for_or_ever_more(options, waves, counts) -
     ],
 )
 def test_a_view_needs_thirty_observations_a_spline(counts, expected) -> None:
-    assert _spline_counts(views_of(*map(int, counts)), AdjustOptions(), True) == expected
+    assert spline_counts(views_of(*map(int, counts)), AdjustOptions(), True) == expected
 
 
 def test_observations_that_are_not_used_hold_no_spline() -> None:
-    assert _spline_counts(views_of(700, 700, unused=310), AdjustOptions(), True) == [13, 18]
-    assert _spline_counts(views_of(60, 60), AdjustOptions(jitter="1000"), True) == [7]
+    assert spline_counts(views_of(700, 700, unused=310), AdjustOptions(), True) == [13, 18]
+    assert spline_counts(views_of(60, 60), AdjustOptions(jitter="1000"), True) == [7]
 
 
 # --- what is kept, of blocks with known displacements -----------------------------------------------------------------

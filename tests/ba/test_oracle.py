@@ -12,14 +12,14 @@ import scipy.linalg as la
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.constraints.block import join, make_problem
-from barpc.ba.constraints.gauge import MOTIONS, _modes, datum_shares, gauge_report
+from barpc.ba.constraints.gauge import MOTIONS, datum_shares, gauge_report, weakest_modes
 from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control
 from barpc.ba.control.snooping import image_test
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.problem import Problem
-from barpc.ba.solving.solve import Minimum, State, _WhitenedProblem, camera_step, gauss_newton
+from barpc.ba.solving.solve import Minimum, State, WhitenedProblem, camera_step, gauss_newton
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from tests.ba.conftest import Held, centers_of, held_by
@@ -179,7 +179,7 @@ def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
 
 
 def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced_problem(case):
-    compressed = _WhitenedProblem(case.problem, _state(case), case.weight, None)
+    compressed = WhitenedProblem(case.problem, _state(case), case.weight, None)
     size = case.params.size
     upper0 = la.cholesky(case.reduced.plain(np.ones(size, dtype=bool)))
     for x in (np.zeros(size), np.random.default_rng(3).normal(0, 0.5, size)):
@@ -282,7 +282,7 @@ def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, siz
 def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
     root = np.random.default_rng(4).normal(size=(7, 7))
     covariance = root @ root.T
-    modes = _modes(covariance)
+    modes = weakest_modes(covariance)
     assert sorted(mode.meaning for mode in modes) == sorted(MOTIONS[:7])  # every one once
     assert [mode.sigma for mode in modes] == sorted((mode.sigma for mode in modes), reverse=True)
     drawn = np.random.default_rng(5).multivariate_normal(np.zeros(7), covariance, 200_000)
@@ -292,10 +292,10 @@ def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
         assert mode.motion[m] == pytest.approx(mode.sigma)
         off = np.abs(drawn[:, m] - mode.sigma) < 0.1 * mode.sigma  # what is seen of the others where it is off so
         np.testing.assert_allclose(drawn[off].mean(axis=0), mode.motion, atol=0.1 * np.sqrt(np.diag(covariance)).max())
-    still = _modes(np.zeros((7, 7)))  # nothing may move
+    still = weakest_modes(np.zeros((7, 7)))  # nothing may move
     assert [mode.sigma for mode in still] == [0.0] * 7
     assert not any(mode.motion.any() for mode in still)
-    assert _modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
+    assert weakest_modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
 
 
 def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, sized):

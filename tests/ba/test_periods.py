@@ -81,10 +81,10 @@ def test_the_vertex_is_that_of_the_parabola() -> None:
     at = np.arange(7.0)
     for vertex in (2.7, 3.0, 3.4):
         gain = 5.0 - 2.0 * (at - vertex) ** 2
-        assert 3 + periods._vertex(gain, 3) == pytest.approx(vertex)
-    assert periods._vertex(5.0 - (at - 9.0) ** 2, 3) == 0.5  # no farther than half a step
-    assert periods._vertex(-gain, 3) == 0.0
-    assert periods._vertex(gain, 0) == periods._vertex(gain, 6) == 0.0
+        assert 3 + periods.parabola_vertex(gain, 3) == pytest.approx(vertex)
+    assert periods.parabola_vertex(5.0 - (at - 9.0) ** 2, 3) == 0.5  # no farther than half a step
+    assert periods.parabola_vertex(-gain, 3) == 0.0
+    assert periods.parabola_vertex(gain, 0) == periods.parabola_vertex(gain, 6) == 0.0
 
 
 def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:

@@ -149,7 +149,7 @@ def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
 )
 def test_as_many_alike_in_a_place_have_the_hypergeometric_chance(found, count, alike, whole) -> None:
     chance = hypergeom(whole, alike, count).sf(found - 1)
-    assert scan._at_least(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
+    assert scan.hypergeometric_tail(found, count, alike, whole) == pytest.approx(chance, rel=1e-9)
 
 
 def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
@@ -168,27 +168,14 @@ def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
     among = len(inside[::2])
     assert one.far == pytest.approx(among / len(inside))
     chance = hypergeom(399, among + 20 - 1, len(inside) - 1).sf(among - 2)
-    tests = 2 * scan._PLACES.shape[1]
+    tests = 2 * (62 + 62 + 4 + 16 + 64)  # lines each way of 32 parts, and squares of 2, 4 and 8 parts a side
     assert one.chance == pytest.approx(chance * (among + 3) * tests, rel=1e-9)
-
-
-def test_places_are_halves_of_rows_columns_both_and_cells() -> None:
-    """Of 32 parts: 62 lines each way, and squares of 2, 4 and 8 parts a side; each as large as it says."""
-    assert scan._PLACES.shape == (4, 62 + 62 + 4 + 16 + 64)
-    columns, k, rows, n = scan._PLACES
-    assert ((k < columns) & (n < rows) & (k >= 0) & (n >= 0)).all()
-    assert len(np.unique(scan._PLACES, axis=1).T) == scan._PLACES.shape[1]
-    np.testing.assert_array_equal(scan._CELLS_OF_REGIONS.sum(axis=1), 32 * 32 / (columns * rows))
-    first = int(np.flatnonzero((columns == 4) & (rows == 1) & (k == 2))[0])
-    assert np.flatnonzero(scan._CELLS_OF_REGIONS[first])[:9].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 48]
-    assert scan._ends(800.0, 4, 2) == (400.0, 600.0)
-    assert scan._ends(800.0, 1, 0) is None
 
 
 def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
     rng = np.random.default_rng(0)
     standard = np.array([[3.0, 1.0], [0.5, 0.2]]) @ rng.normal(size=(2, 300)) + 9.0
-    axes, spread = scan._axes(standard)
+    axes, spread = scan.principal_axes(standard)
     covariance = np.cov(standard, bias=True)
     np.testing.assert_allclose(axes.T @ covariance @ axes, np.diag(spread**2), atol=1e-9)
     assert spread[0] > spread[1] > 0

@@ -17,9 +17,9 @@ from barpc.ba.constraints.terrain import (
     RegularisedDem,
     Relief,
     _middling,
-    _summed,
     believe,
     quadratic_basis,
+    variance_inflation,
 )
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
@@ -176,10 +176,10 @@ def test_points_whose_errors_are_alike_are_worth_one_wherever_they_lie() -> None
         np.column_stack([along, along]),
         np.column_stack([0.2 * along, along]),
     ):
-        found = [_summed(1e4 * at + shift, pull) for shift in (0.0, [5e5, 0.0], [-3e4, 4e6])]
+        found = [variance_inflation(1e4 * at + shift, pull) for shift in (0.0, [5e5, 0.0], [-3e4, 4e6])]
         assert found == pytest.approx([found[0]] * 3)
         assert 80.0 < found[0] < 250.0
-    assert _summed(np.column_stack([along, along]), rng.normal(size=(1000, 2))) < 3.0
+    assert variance_inflation(np.column_stack([along, along]), rng.normal(size=(1000, 2))) < 3.0
 
 
 def test_holes_and_what_fills_them_hold_nothing() -> None:
@@ -373,12 +373,12 @@ def test_points_that_pull_alike_where_they_lie_together_count_as_one() -> None:
     corners = np.array([[0.0, 0.0], [900.0, 0.0], [0.0, 900.0], [900.0, 900.0]])
     at = np.repeat(corners, 9, axis=0) + rng.uniform(0.0, 5.0, (36, 2))
     alike = np.repeat([[1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [-1.0, -1.0]], 9, axis=0)
-    assert _summed(at, alike) == pytest.approx(9.0, rel=0.1)
+    assert variance_inflation(at, alike) == pytest.approx(9.0, rel=0.1)
     apart = np.tile([[1.0, 0.0], [-1.0, 0.0]], (18, 1))
-    assert 1.0 <= _summed(at, apart) < 2.0
-    assert _summed(rng.uniform(0.0, 900.0, (1, 2)), np.ones((1, 2))) == 1.0
+    assert 1.0 <= variance_inflation(at, apart) < 2.0
+    assert variance_inflation(rng.uniform(0.0, 900.0, (1, 2)), np.ones((1, 2))) == 1.0
     far = np.array([[0.0, 0.0], [900.0, 900.0]])
-    assert _summed(far, np.array([[1.0, 1.0], [-1.0, -1.0]])) == pytest.approx(1.0)
+    assert variance_inflation(far, np.array([[1.0, 1.0], [-1.0, -1.0]])) == pytest.approx(1.0)
 
 
 def test_values_within_five_standard_deviations_of_the_median_are_the_middle_ones() -> None:

@@ -13,7 +13,7 @@ from barpc.ba import AdjustOptions, adjust_tracks, solution
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.parameters.priors import CameraPrior
 from barpc.ba.robust import rounds
-from barpc.ba.robust.rounds import _weighted_median
+from barpc.ba.robust.rounds import weighted_median
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State
@@ -127,12 +127,12 @@ def test_control_is_let_in_after_the_ties_where_there_are_any(monkeypatch, gcps:
 
 def test_a_median_counts_each_value_by_its_weight() -> None:
     values = np.array([5.0, 2.0, 9.0, 3.0])
-    assert _weighted_median(values, np.ones(4)) == 3.0
-    assert _weighted_median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
-    assert _weighted_median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
-    assert _weighted_median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 2.0
-    assert _weighted_median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
-    assert _weighted_median(values[:0], values[:0]) == 1.0
+    assert weighted_median(values, np.ones(4)) == 3.0
+    assert weighted_median(values, np.array([1.0, 1.0, 1.0, 0.5])) == 5.0
+    assert weighted_median(values, np.array([0.0, 0.0, 1.0, 0.0])) == 9.0
+    assert weighted_median(values, np.array([0.0, 3.0, 1.0, 1.0])) == 2.0
+    assert weighted_median(values, np.zeros(4)) == 1.0  # as stated where nothing counts
+    assert weighted_median(values[:0], values[:0]) == 1.0
 
 
 def test_points_that_were_cut_are_seen_where_the_cameras_see_them_now(clean) -> None:

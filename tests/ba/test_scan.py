@@ -132,7 +132,7 @@ def test_where_so_few_are_wrong_their_place_tells_nothing(total: float, bad: flo
     """All of them in one observation's interval: the rest would be certain, whatever is wrong."""
     bins = np.zeros((2, 1, scanning.BINS))
     bins[:, 0, 0], bins[0, 0, 1] = bad, total - bad
-    gain = scanning._share_log_ratios(bins)
+    gain = scanning.share_log_ratios(bins)
     whole = bad * np.log(bad / total) + (total - bad) * np.log(1.0 - bad / total)
     assert gain[0, 0] == pytest.approx(-whole if told else 0.0)
     assert (whole < -SURE) == told

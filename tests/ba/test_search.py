@@ -15,7 +15,7 @@ from barpc.ba.constraints.block import Block, join
 from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
-from barpc.ba.select import anomalies, beam, search
+from barpc.ba.select import anomalies, search
 from barpc.ba.select.beam import Selection, TermSearch, _same, _SearchState, _Taken, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
@@ -175,7 +175,7 @@ WORLDS: dict[str, tuple[tuple[Displacement, ...], int, dict[tuple[str, int], flo
 
 
 @pytest.mark.parametrize("world", rest_slow(WORLDS))
-def test_terms_are_named_that_together_explain_most_though_another_does_by_itself(monkeypatch, world: str) -> None:
+def test_terms_are_named_that_together_explain_most_though_another_does_by_itself(sized, world: str) -> None:
     """They are found among rivals of the best: without rivals other images are named."""
     moved, seed, truth = WORLDS[world]
     seen = residuals_of(*moved, seed=seed)
@@ -187,7 +187,7 @@ def test_terms_are_named_that_together_explain_most_though_another_does_by_itsel
         assert 0.0 < one.gap <= sum(row.gain for row in found.findings) + 1e-9
     # a sample of tracks for the first choice ends at the same terms
     assert sorted(kinds(searched(replace(seen, few=seen.linear.thinned(110))))) == sorted(truth)
-    monkeypatch.setattr(beam, "RIVALS", 1)
+    sized(rivals=1)
     alone = searched(seen)
     assert sorted(kinds(alone)) != sorted(truth)
     assert sum(one.gain for one in alone.findings) < sum(one.gain for one in found.findings)
@@ -399,7 +399,7 @@ def test_what_was_cut_is_seen_where_two_others_tell_its_point() -> None:
     np.testing.assert_array_equal(anomalies._confirmed_observations(outcome, block), [1, 1, 1, 0, 0, 0])
 
 
-def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_size(monkeypatch) -> None:
+def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_size(sized) -> None:
     for moved, named in ((STEP, [("step", 1)]), (SWING, [("sinusoid", 1)])):
         one = solved(moved)
         found = search_terms(one.outcome, one.block, FLOOR)
@@ -408,23 +408,22 @@ def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_s
         assert found.step.shape[0] == 3
     sound = solved()
     assert kinds(search_terms(sound.outcome, sound.block, FLOOR)) == []
-    for limit, value in (("LARGEST", one.outcome.problem.free.size), ("MAX_OBSERVATIONS", len(one.block.view))):
-        with monkeypatch.context() as patch:
-            patch.setattr(search, limit, value)
-            assert kinds(search_terms(one.outcome, one.block, FLOOR)) == named
-            patch.setattr(search, limit, value - 1)
-            assert search_terms(one.outcome, one.block, FLOOR).findings == ()
+    most = {"unknowns_searched": one.outcome.problem.free.size, "observations_searched": len(one.block.view)}
+    for limit in most:
+        sized(**most)
+        assert kinds(search_terms(one.outcome, one.block, FLOOR)) == named
+        sized(**{limit: most[limit] - 1})
+        assert search_terms(one.outcome, one.block, FLOOR).findings == ()
 
 
 @pytest.mark.slow
-def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(monkeypatch) -> None:
+def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(sized) -> None:
     """The same terms as of the whole block, under its numbers, and nothing of views far away."""
     one = solved(step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 4, 20.0), views=6, tracks=300)
     whole = search_terms(one.outcome, one.block, FLOOR)
     assert sorted(kinds(whole)) == [("sinusoid", 4), ("step", 1)]
     a_view = one.outcome.problem.free.size // 6
-    monkeypatch.setattr(search, "SMALL", 4 * a_view)
-    monkeypatch.setattr(search, "_NEAREST", 3)
+    sized(unknowns_together=4 * a_view, views_together=3)
     found = search_terms(one.outcome, one.block, FLOOR)
     assert sorted(kinds(found)) == [("sinusoid", 4), ("step", 1)]
     for kind in ("step", "sinusoid"):
@@ -474,7 +473,7 @@ def test_terms_among_some_views_are_those_of_the_block() -> None:
     assert (all_of.step[[1, 4]] == 0).all()
 
 
-def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(monkeypatch) -> None:
+def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(sized) -> None:
     one = solved(views=6, tracks=300)
     views = np.array([1, 2, 4])
     found = linearised_among(one.outcome, one.block, views)
@@ -485,10 +484,10 @@ def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(
     expected = np.isin(one.block.view, views) & (count[one.block.point] >= 2)
     np.testing.assert_array_equal(rows, np.flatnonzero(expected))
     a_view = one.outcome.problem.free.size // 6
-    monkeypatch.setattr(search, "SMALL", 3 * a_view)
+    sized(unknowns_together=3 * a_view)
     assert linearised_among(one.outcome, one.block, views) is not None
     assert linearised_among(one.outcome, one.block, np.arange(4)) is None
-    monkeypatch.setattr(search, "KEPT", 1)
+    sized(elements_linearised=1)
     assert linearised_among(one.outcome, one.block, views) is None
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
-from barpc.ba.control.snooping import CRITICAL, ControlTest, _together
+from barpc.ba.control.snooping import CRITICAL, ControlTest, global_test
 from barpc.base.geodesy import ecef_from_ground, enu_basis, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
@@ -326,14 +326,14 @@ def test_all_together_they_may_scatter_as_chance_lets_them_once_in_a_thousand(sh
     freedom = 3 * 0.75
     whitened = np.full((4, 3), 9.0)  # of what is not used, and of what nothing tells, nothing counts
     whitened[:2] = np.sqrt(share * stats.chi2.isf(1e-3, freedom) / 6)
-    scatter, may_be = _together(whitened, redundancy, used)
+    scatter, may_be = global_test(whitened, redundancy, used)
     assert scatter == pytest.approx(np.sqrt(share * stats.chi2.isf(1e-3, freedom) / freedom))
     assert may_be == fits
 
 
 @pytest.mark.parametrize(("redundancy", "told"), [(0.32, False), (0.35, True)])
 def test_of_less_than_one_degree_of_freedom_nothing_is_told(redundancy, told) -> None:
-    scatter, fits = _together(np.full((1, 3), 99.0), np.array([redundancy]), np.ones(1, dtype=bool))
+    scatter, fits = global_test(np.full((1, 3), 99.0), np.array([redundancy]), np.ones(1, dtype=bool))
     assert np.isfinite(scatter) == told
     assert fits != told
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.solving import solve
-from barpc.ba.solving.solve import Minimum, State, _has_converged
+from barpc.ba.solving.solve import Minimum, State, has_converged
 from barpc.base.errors import AdjustError
 from barpc.simulate import simulate_block
 from tests.constants import Sized
@@ -101,7 +102,7 @@ def test_a_step_that_gains_what_it_should_is_the_last(monkeypatch, off: float, l
     ],
 )
 def test_a_step_is_the_last_where_what_it_leaves_does_not_matter(gain, before, last) -> None:
-    assert _has_converged(gain, before, 1000.0, 1e-6) == last
+    assert has_converged(gain, before, 1000.0, 1e-6) == last
 
 
 def test_a_step_that_fails_is_damped_and_the_damping_let_go(monkeypatch) -> None:
@@ -224,7 +225,7 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
     block = join(made.views, made.tracks, None, options)
     problem = make_problem(block, options, None, None)
     state, _ = first_state(problem, block, options, None)
-    whole, fails = solve.la.cholesky, []
+    whole, fails = scipy.linalg.cholesky, []
 
     def cholesky(matrix: Any, **given: Any) -> Any:
         if fails:
@@ -247,7 +248,7 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
         return reduce(self, *given)
 
     monkeypatch.setattr(type(problem), "reduce", followed)
-    monkeypatch.setattr(solve.la, "cholesky", cholesky)
+    monkeypatch.setattr(scipy.linalg, "cholesky", cholesky)
     monkeypatch.setattr(scipy.optimize, "least_squares", tries)
     found = solve.minimise(problem, state, block.use / block.sigma, "scipy")
     assert found.settled

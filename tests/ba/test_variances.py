@@ -14,7 +14,7 @@ from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, prior_sigmas
 from barpc.ba.parameters.unknowns import Unknowns
-from barpc.ba.robust.variances import PriorTest, Variances, _Around, same_prior
+from barpc.ba.robust.variances import PriorTest, QuadraticProblem, Variances, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground
@@ -86,19 +86,9 @@ def test_what_is_learnt_is_what_the_options_leave_open() -> None:
     assert variances(1, "affine").constants == 0
 
 
-def test_priors_are_widened_view_by_view_and_drifts_degree_by_degree() -> None:
-    v = variances(2, "rotation+translation", 2)
-    found = v._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 12.0]))
-    np.testing.assert_array_equal(found.mean, v.given.mean)
-    np.testing.assert_allclose(found.sigma[:, :6], [[2.0] * 6, [6.0] * 6])
-    # a turn about a centre that flies on is a drift of a hundredth of it
-    np.testing.assert_allclose(found.sigma[:, 6:9], np.hypot(2.0, [[0.02] * 3, [0.06] * 3]))
-    np.testing.assert_allclose(found.sigma[:, 9:], 5.0)
-    # a turn about the line of sight is as wide as it shows, and as the place at least
-    np.testing.assert_allclose(np.ravel(found.wider), [12.0, 4.0])
-    told = replace(v, learns=False)._prior(np.array([1.0, 3.0]), np.array([2.0, 5.0, 1.0]))
-    np.testing.assert_allclose(told.sigma[:, 6:9], 2.0)
-    search = v.for_search()
+def test_a_search_has_priors_as_given_but_for_wide_drifts() -> None:
+    """A turn about a centre that flies on is a drift of a hundredth of it."""
+    search = variances(2, "rotation+translation", 2).for_search()
     np.testing.assert_allclose(search.sigma[:, :6], 2.0)
     np.testing.assert_allclose(search.sigma[:, 6:9], np.hypot(30.0, 0.02))
     np.testing.assert_allclose(search.sigma[:, 9:], 30.0)
@@ -391,7 +381,7 @@ def test_the_problem_under_other_priors_is_the_one_solved_with_them(made, fixed:
         matrix = minimum.reduced.plain(free)
         volume = np.linalg.slogdet(matrix)[1] + 2 * np.log(prior.sigma.ravel()[free]).sum()
         found.append((minimum, -0.5 * (minimum.state.cost + volume), np.linalg.inv(matrix)))
-    around = _Around(problem, found[0][0])
+    around = QuadraticProblem(problem, found[0][0])
     (same, unmoved, _), (evidence, params, covariance) = (
         around.under(problem.camera_prior),
         around.under(other),
@@ -411,7 +401,7 @@ def test_other_priors_of_single_views_are_an_update_of_what_is_known(n: int) -> 
     problem = make_problem(join(block.views, block.tracks, None, options), options, centers_of(block), None)
     weight = np.full(len(problem.structure.view), 5.0)
     state = State(problem.camera_prior.mean, ecef_from_ground(block.truth.ground))
-    around = _Around(problem, minimise(problem, state, weight, "sparse", 1e-10))
+    around = QuadraticProblem(problem, minimise(problem, state, weight, "sparse", 1e-10))
     wider = problem.camera_prior.sigma * np.random.default_rng(0).uniform(1.0, 50.0, (n, 1))
     known, prior = around.posterior(problem.camera_prior), problem.camera_prior
     evidence, offset, blocks = known.alone(replace(prior, sigma=wider))
@@ -660,7 +650,7 @@ def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minim
 @pytest.mark.parametrize(("unknowns", "small"), [(400, True), (401, False)])
 def test_every_view_is_tried_up_to_four_hundred_unknowns(unknowns: int, small: bool) -> None:
     problem: Any = SimpleNamespace(free=np.zeros(unknowns, dtype=bool))  # fixed ones, too
-    around: Any = _Around(problem, None)  # type: ignore[arg-type]
+    around: Any = QuadraticProblem(problem, None)  # type: ignore[arg-type]
     assert around.small == small
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -21,7 +22,8 @@ from jsonschema import Draft202012Validator
 import barpc
 from barpc.base.declarations import Declared, Options, Rule, checked, declared, schema, with_values
 from barpc.base.errors import InputError, UsageError
-from barpc.base.options import _DEEP, _QUOTED, PAPER, AdjustOptions, FitOptions, RunOptions, TieOptions, read_options
+from barpc.base.options import PAPER, AdjustOptions, FitOptions, RunOptions, TieOptions, read_options
+from barpc.base.safe_io import MB
 from barpc.base.verb_options import ConvertOptions, DsmOptions, OrthoOptions, RefitOptions
 from barpc.cli import cli
 from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
@@ -347,9 +349,11 @@ def test_dots_that_part_no_key_are_no_parts(tmp_path, text) -> None:
     "a" * (1 << 20), "a-" * (1 << 19), '"' * (1 << 20), "'\"" * (1 << 19), "a." * (1 << 19),
     '"""' + "\\" * (1 << 19), "a.b.c.d.e.f.g.h.i " * 50000, "#\n" * (1 << 19),
 ])  # fmt: skip
-def test_parts_are_counted_in_a_time_that_grows_with_the_text(text) -> None:
+def test_parts_are_counted_in_a_time_that_grows_with_the_text(tmp_path, text) -> None:
+    (tmp_path / "o.toml").write_text(text[: MB - 1])
     start = time.process_time()
-    _DEEP.search(_QUOTED.sub("q", text[: 1 << 20]))
+    with contextlib.suppress(InputError):
+        read_options(tmp_path / "o.toml")
     assert time.process_time() - start < 3.0
 
 

@@ -14,7 +14,6 @@ import rasterio
 from rasterio.windows import Window
 
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
-from barpc.base.verb_options import ConvertOptions
 from barpc.cameras import open_camera
 from barpc.cli import terminal as printing
 from barpc.cli.convert import _tell_readings
@@ -23,15 +22,7 @@ from barpc.pipeline.verify_outputs import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
 from barpc.verbs import converting as module
-from barpc.verbs.converting import (
-    Converted,
-    _refuse_source_folder,
-    _shadow_reasons,
-    _window_chooser,
-    box_of,
-    check_target,
-    window_of,
-)
+from barpc.verbs.converting import Converted, box_of, check_target, convert, window_of
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -117,12 +108,15 @@ def test_what_reads_back_elsewhere_ends_with_3(
 
 
 def test_notes_of_a_camera_are_told_but_not_beside_json(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(module, "camera_of", lambda spec: replace(open_camera(spec), notes=("a note",)))
-    assert run("convert", str(file), str(file.parent / "b.geom")) == 0
-    assert capsys.readouterr().err == "barpc: a note\n"
-    assert run("convert", str(file), str(file.parent / "c.geom"), "--json") == 0
+    for suffix in (".RPB", "_RPC.TXT"):
+        write_rpc(read_rpc(image), image.with_name(f"scene{suffix}"))
+    assert run("convert", str(image), str(tmp_path / "b.geom")) == 0
+    told = capsys.readouterr().err
+    assert told.startswith("barpc: not used: ")
+    assert told.count("\n") == 1
+    assert run("convert", str(image), str(tmp_path / "c.geom"), "--json") == 0
     assert capsys.readouterr().err == ""
 
 
@@ -218,16 +212,15 @@ def test_a_box_may_lie_across_the_antimeridian() -> None:
     assert window((179.8, 49.6, -179.8, 49.8), camera=camera) == (30, 20, 41, 21)
 
 
-def test_a_window_stands_as_given_and_one_of_both_is_taken() -> None:
-    assert _window_chooser(ConvertOptions(window=(1, 2, 3, 4)))(CAMERA, Path("a")) == (1, 2, 3, 4)
-    none: dict[str, Any] = {}
+def test_a_window_stands_alone(image: Path, tmp_path: Path) -> None:
     for both in (
-        none,
         {"window": (1, 2, 3, 4), "bbox": (0.0, 0.0, 1.0, 1.0)},
         {"bbox": (0.0,) * 4, "aoi": "a"},
+        {"window": (1, 2, 3, 4), "aoi": "a"},
     ):
         with pytest.raises(UsageError, match="give one of --window, --bbox and --aoi"):
-            _window_chooser(ConvertOptions(**both))
+            convert(image, tmp_path / "part.tif", **both)
+    assert convert(image, tmp_path / "part.tif", window=(1, 2, 3, 4)).window == (1, 2, 3, 4)
 
 
 # --- a part of the ground out of many images --------------------------------------------------------------
@@ -413,32 +406,35 @@ def test_a_hand_off_ends_with_the_largest_difference_of_all_readers(errors: Sequ
     assert str(Converted((), tuple(seen), 2)) == said
 
 
-def test_names_of_a_hand_off_are_checked_first(tmp_path: Path) -> None:
+def test_names_of_a_hand_off_are_checked_first(image: Path, tmp_path: Path) -> None:
     a, b = tmp_path / "a" / "x.tif", tmp_path / "b" / "x.tif"
+
+    def handed(images: list[Path], out: Path, formats: str = "txt") -> None:
+        convert(images, out_dir=out, rpc=tmp_path / "none", rpc_format=formats)
+
     out = tmp_path / "out"
-    _refuse_source_folder([a, b.with_name("y.tif")], out, ["txt", "geom"])
     with pytest.raises(UsageError, match="--rpc-format doc: not a format that is written"):
-        _refuse_source_folder([a], out, ["txt", "doc"])
+        handed([a], out, "txt,doc")
     with pytest.raises(InputError, match="several images named x: apply them one folder at a time"):
-        _refuse_source_folder([a, b], out, ["txt"])
+        handed([a, b], out)
     with pytest.raises(InputError, match="the folder of the images; choose a new one"):
-        _refuse_source_folder([b, a.with_name("y.tif")], a.parent, ["txt"])
+        handed([b, a.with_name("y.tif")], a.parent)
     with pytest.raises(InputError):
-        _refuse_source_folder([a], Path(str(tmp_path / "a\0b")), ["txt"])
+        handed([a], Path(str(tmp_path / "a\0b")))
+    assert not out.exists()
 
 
 def test_what_hides_an_rpc_is_told_of_the_input_and_counts_in_the_output(image: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out" / "scene.tif"
-    write_rpc_copy(read_rpc(image), image, out)
-    assert _shadow_reasons(image, [out]) == []
-    write_rpc(make_rpc(), image.with_suffix(".RPB"))
-    write_rpc(make_rpc(), out.with_suffix(".RPB"))
-    hiding = out.with_suffix(".RPB")
+    out = tmp_path / "out"
+    assert convert(image, out_dir=out, images="copy").reasons == ()
+    write_rpc(make_rpc().crop(900, 900), image.with_suffix(".RPB"))
+    write_rpc(make_rpc(), hiding := out / "scene.RPB")
     told = f"^beside {image}: scene.RPB hides an RPC put into the image$"
     with pytest.warns(Remark, match=told):
-        assert _shadow_reasons(image, [out]) == [f"{hiding} hides the RPC of {out}: move it away."]
-    with pytest.warns(Remark, match=told):
-        assert _shadow_reasons(image, [out, hiding]) == []  # it is one of those just written
+        reasons = convert(image, out_dir=out, images="copy", overwrite=True).reasons
+    assert f"{hiding} hides the RPC of {out / 'scene.tif'}: move it away." in reasons
+    with pytest.warns(Remark, match=told):  # it is one of those just written
+        assert convert(image, out_dir=tmp_path / "new", images="copy", rpc_format="rpb").reasons == ()
 
 
 def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.base.errors import InputError, RpcError
+from barpc.base.errors import RpcError
 from barpc.cameras import open_camera
 from barpc.cli.info import _labelled_sentences
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
-from barpc.verbs import describe as module
-from barpc.verbs.describe import _altitude, _describe, _viewed_together, outlines_geojson
+from barpc.verbs.describe import described, outlines_geojson
 from tests.cli.test_main import run
+from tests.cli.test_points import a_slope
 from tests.rpcio.conftest import make_rpc
 
 SIZE = (2000, 1900)
@@ -71,7 +71,7 @@ def ray(rpc: RPC, ground: Any) -> np.ndarray:
 
 
 def describe(spec: str, alt: float = 150.0, at: Any = None) -> dict[str, Any]:
-    return _describe(open_camera(spec), alt, at)
+    return described([spec], at, alt, None)[0]
 
 
 @pytest.mark.parametrize("at", [None, (5.402, 43.199, 80.0)])
@@ -115,20 +115,20 @@ def test_a_box_is_the_rpc_s_offset_and_scale_on_either_side(tmp_path: Path) -> N
     assert report["first_pixel"] == "its centre is (0, 0)"
 
 
-def test_the_angle_of_a_pair_is_that_between_the_rays(pair: list[str], tmp_path: Path) -> None:
+def test_the_angle_of_a_pair_is_that_between_the_rays(pair: list[str]) -> None:
     cameras = [open_camera(spec) for spec in pair]
     for at in (None, (5.402, 43.199, 80.0)):
-        (found,) = _viewed_together(pair, cameras, 0, 150.0, at)
-        first = cameras[0].rpc
-        place = first.localize((np.array(SIZE) - 1) / 2, 150.0) if at is None else at
+        first, second = described(pair, at, 150.0, None)
+        (found,) = first["pairs"]
+        assert second["pairs"] == []
+        place = cameras[0].rpc.localize((np.array(SIZE) - 1) / 2, 150.0) if at is None else at
         one, two = (ray(camera.rpc, place) for camera in cameras)
         angle = math.degrees(math.acos(one @ two))
         assert found["convergence_deg"] == pytest.approx(angle, abs=0.02)
         base = np.linalg.norm(one[:2] / one[2] - two[:2] / two[2])
         assert found["b_over_h"] == pytest.approx(base, rel=0.01)
         assert found["with"] == "right"
-    assert _viewed_together(pair, cameras, 1, 150.0, None) == []
-    three = _viewed_together([*pair, pair[0]], [*cameras, cameras[0]], 0, 150.0, None)
+    three = described([*pair, pair[0]], None, 150.0, None)[0]["pairs"]
     assert [row["with"] for row in three] == ["right", "left"]
     assert three[1]["convergence_deg"] == pytest.approx(0.0, abs=1e-4)
 
@@ -209,7 +209,7 @@ class Blind:
 
 def test_a_camera_that_sees_no_ground_has_a_problem(pair: list[str]) -> None:
     camera = replace(open_camera(pair[0]), model=Blind())
-    assert _describe(camera, 1.0, None)["problem"] == "no ground point at the image's centre"
+    assert described([camera], None, 1.0, None)[0]["problem"] == "no ground point at the image's centre"
     with pytest.raises(RpcError, match=r"left.*: no ground point at its image's border at 7 m"):
         outlines_geojson([camera], 7.0, None)
 
@@ -217,28 +217,26 @@ def test_a_camera_that_sees_no_ground_has_a_problem(pair: list[str]) -> None:
 # --- altitudes and outlines -------------------------------------------------------------------------------
 
 
-def test_without_a_size_the_ground_is_the_camera_s_own_middle(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_size_no_height_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_rpc(make_rpc(), tmp_path / "a.RPB")
-    camera = open_camera(str(tmp_path / "a.RPB"))
-    assert _altitude("a.RPB", camera, 5.0, None) == 5.0
-    assert _altitude("a.RPB", camera, None, None) == pytest.approx(166.6667)
-    assert capsys.readouterr().err == ""
+    assert run("info", str(tmp_path / "a.RPB")) == 0
+    said = capsys.readouterr()
+    assert "size unknown" in said.out
+    assert said.err == ""
 
 
-def test_a_dem_is_asked_in_the_middle_of_the_image(pair: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    camera, asked = open_camera(pair[0]), []
-
-    def ground_at(_camera: Any, image: Any, alt: Any, dem: Any) -> np.ndarray:
-        asked.append((image.tolist(), dem))
-        return np.array([[5.4, 43.2, 77.0 if dem == "dem" else np.nan]])
-
-    monkeypatch.setattr(module, "ground_at", ground_at)
-    assert _altitude("a", camera, None, "dem") == 77.0  # type: ignore[arg-type]
-    assert asked == [([[999.5, 949.5]], "dem")]
-    with pytest.raises(InputError, match=r"^a: the DEM has no height in the middle of it$"):
-        _altitude("a", camera, None, "hole")  # type: ignore[arg-type]
+def test_a_dem_is_asked_in_the_middle_of_the_image(
+    pair: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("info", pair[1], "--dem", str(a_slope(tmp_path / "d.tif", rise=100.0)), "--json") == 0
+    (found,) = json.loads(capsys.readouterr().out)
+    lon, lat = found["center_deg"]
+    assert found["center_alt_m"] == pytest.approx(100.0 + 1e4 * (lon - 5.4) + 50 * (44 - lat), abs=2e-3)
+    seen = open_camera(pair[1]).model.project(np.array([lon, lat, found["center_alt_m"]]))
+    assert seen == pytest.approx([999.5, 949.5], abs=1e-2)
+    hole = a_slope(tmp_path / "hole.tif", np.s_[70:90, 30:50])
+    assert run("info", pair[1], "--dem", str(hole)) == 1
+    assert f"barpc: {pair[1]}: the DEM has no height in the middle of it" in capsys.readouterr().err
 
 
 def test_outlines_name_their_images(pair: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,12 +8,13 @@ import os
 import sys
 import warnings
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import click
 import pytest
 
 from barpc.base.errors import BarpcWarning, InputError
-from barpc.cli import COMMANDS, Verbs, _exit_message, _log_warning, cli, main
+from barpc.cli import COMMANDS, Verbs, cli, main
 from barpc.cli.process import interruptible
 from barpc.verbs.workers import THREADS
 
@@ -57,12 +58,13 @@ def test_a_word_that_is_not_known_is_met_with_the_one_that_is(words: list[str], 
         ["info", "--", "--size"],  # the name of a file
         ["fit", "size"],
         ["--nothing"],
+        ["-v", "info"],  # before a verb they are the group's own
     ],
 )
 def test_other_words_are_left_to_click(words: list[str]) -> None:
     context = click.Context(cli, **cli.context_settings)
     context.params = {"verbose": 0, "quiet": False, "debug": False}
-    if words[0].startswith("--"):
+    if words[0].startswith("-"):
         with pytest.raises(click.UsageError, match="No such"):
             cli.resolve_command(context, words)
         return
@@ -80,7 +82,6 @@ def test_other_words_are_left_to_click(words: list[str]) -> None:
         ("info --quiet --debug", "info", (0, True, True)),
         ("info a -- -v -q", "info a -- -v -q", (0, False, False)),
         ("info -v -- --debug", "info -- --debug", (1, False, False)),
-        ("-v info", "-v info", (0, False, False)),
         ("info -vvv", "info -vvv", (0, False, False)),
     ],
 )
@@ -88,7 +89,8 @@ def test_flags_of_every_verb_are_taken_out_of_its_words(words: str, rest: str, p
     context = click.Context(cli, **cli.context_settings)
     context.params = {"verbose": 0, "quiet": False, "debug": False}
     assert isinstance(cli, Verbs)
-    assert cli._general(context, words.split()) == rest.split()
+    name, _, others = cli.resolve_command(context, words.split())
+    assert [name, *others] == rest.split()
     assert (context.params["verbose"], context.params["quiet"], context.params["debug"]) == params
 
 
@@ -134,6 +136,21 @@ def _from(cause: BaseException, error: BaseException) -> BaseException:
     return error
 
 
+@pytest.fixture
+def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
+    """Sets what every call of the group does: it returns a value or raises an error."""
+
+    def does(what: object) -> None:
+        def called(**_: object) -> object:
+            if isinstance(what, BaseException):
+                raise what
+            return what() if callable(what) else what
+
+        monkeypatch.setattr(cli, "main", called)
+
+    return does
+
+
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
@@ -154,23 +171,12 @@ def _from(cause: BaseException, error: BaseException) -> BaseException:
         (KeyError("k"), 1, "unexpected KeyError: 'k'; this is a bug: please report what --debug shows"),
     ],
 )  # fmt: skip
-def test_an_error_is_an_exit_code_and_a_sentence(error: BaseException, code: int, text: str) -> None:
-    assert _exit_message(error) == (code, text)
-
-
-@pytest.fixture
-def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
-    """Sets what every call of the group does: it returns a value or raises an error."""
-
-    def does(what: object) -> None:
-        def called(**_: object) -> object:
-            if isinstance(what, BaseException):
-                raise what
-            return what() if callable(what) else what
-
-        monkeypatch.setattr(cli, "main", called)
-
-    return does
+def test_an_error_is_an_exit_code_and_a_sentence(
+    error: BaseException, code: int, text: str, verb: Callable[[object], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb(error)
+    assert run("info") == code
+    assert capsys.readouterr() == ("", f"barpc: {text}\n")
 
 
 @pytest.mark.parametrize(("value", "code"), [(0, 0), (3, 3), (None, 0), ("text", 0)])
@@ -228,42 +234,46 @@ def test_only_a_process_of_its_own_has_its_garbage_left_alone(
 # --- the log ----------------------------------------------------------------------------------------------
 
 
-def test_a_warning_of_barpc_is_told_always_and_of_a_library_with_v(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    _log_warning("one\n two", BarpcWarning, "f.py", 3)
-    _log_warning("old\n thing", DeprecationWarning, "f.py", 3)
-    assert caplog.record_tuples == [
-        ("barpc", logging.WARNING, "one two"),
-        ("py.warnings", logging.INFO, "f.py:3: DeprecationWarning: old thing"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("words", "level", "all_of_it"),
     [((), logging.WARNING, False), (("-q",), logging.ERROR, False), (("-v",), logging.INFO, True),
      (("-vv",), logging.DEBUG, True), (("-v", "-v", "-v"), logging.DEBUG, True), (("-q", "-v"), logging.ERROR, True)],
 )  # fmt: skip
 def test_how_much_is_logged(
-    words: tuple[str, ...], level: int, all_of_it: bool, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...],
+    level: int,
+    all_of_it: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """A warning of barpc is told always, one of a library with -v."""
     given = list[dict[str, object]]()
     seen = list[object]()
+    caplog.set_level(logging.INFO)
+    before = warnings.showwarning
 
     @click.command()
     @click.pass_context
     def probe(context: click.Context) -> int:
         asked = context.find_root().params
-        seen.append(({name: asked[name] for name in ("quiet", "verbose")}, warnings.showwarning))
+        seen.append({name: asked[name] for name in ("quiet", "verbose")})
+        warnings.simplefilter("always")
+        warnings.warn_explicit("one\n two", BarpcWarning, "f.py", 3)
+        warnings.warn_explicit("old\n thing", DeprecationWarning, "f.py", 3)
         return 0
 
     monkeypatch.setattr(logging, "basicConfig", lambda **how: given.append(how))
-    monkeypatch.setattr(Verbs, "get_command", lambda *_: probe)
+    monkeypatch.setitem(sys.modules, "barpc.cli.info", SimpleNamespace(info=probe))
     assert run(*words, "info") == 0
     verbose = sum(word.count("v") for word in words)
-    assert seen == [({"quiet": "-q" in words, "verbose": verbose}, _log_warning)]
+    assert seen == [{"quiet": "-q" in words, "verbose": verbose}]
+    assert caplog.record_tuples == [
+        ("barpc", logging.WARNING, "one two"),
+        ("py.warnings", logging.INFO, "f.py:3: DeprecationWarning: old thing"),
+    ]
     (how,) = given
     assert how["level"] == level
     (handler,) = how["handlers"]  # type: ignore[misc]
     assert handler.stream is sys.stderr
     assert bool(handler.filter(logging.LogRecord("gcsfs", 40, "", 0, "x", (), None))) == all_of_it
-    assert warnings.showwarning is not _log_warning
+    assert warnings.showwarning is before

@@ -14,7 +14,7 @@ from barpc.base.errors import InputError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import cli
 from barpc.cli.adjust import adjust
-from barpc.cli.flags import _jobs, field_of, flag, flag_name, given_flags, image_paths, run_options
+from barpc.cli.flags import field_of, flag, flag_name, given_flags, image_paths, jobs_option, run_options
 
 
 def given(target: str, *words: str) -> Any:
@@ -121,12 +121,10 @@ def test_a_flag_has_the_field_s_name(target: str, name: str) -> None:
      ("-1", None), ("", None), ("2.0", None), ("host", None)],
 )  # fmt: skip
 def test_jobs_are_a_number_or_an_address(text: str, jobs: Any) -> None:
-    context, parameter = click.Context(click.Command("x")), click.Option(["--jobs"])
-    if jobs is None:
-        with pytest.raises(click.BadParameter, match="no number of processes"):
-            _jobs(context, parameter, text)
-    else:
-        assert _jobs(context, parameter, text) == jobs
+    found = list[Any]()
+    said = CliRunner().invoke(jobs_option(click.Command("x", callback=lambda jobs: found.append(jobs))), ["-j", text])
+    assert found == ([] if jobs is None else [jobs])
+    assert ("is no number of processes, and no address" in said.output) == (jobs is None)
 
 
 def test_a_list_of_images_is_read_behind_those_of_the_command_line(tmp_path: Path) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.cli.project import _print_points, _tell_failures, given_points
-from barpc.rasters.dem import Dem
+from barpc.cli.project import given_points
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from tests.cli.test_main import run
+from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
 
 XYZ = ("lon", "lat", "alt")
@@ -102,25 +102,6 @@ def test_a_table_that_lacks_something_says_what(text: str, fill: float | None, t
 # --- what goes out ----------------------------------------------------------------------------------------
 
 
-def test_points_are_printed_with_their_digits(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values = np.array([[1 / 3, 2.0], [np.nan, -2 / 3]])
-    _print_points(("a", "b"), values, (6, 3))
-    assert capsys.readouterr().out == "a,b\n0.333333,2.000\nnan,-0.667\n"
-    monkeypatch.setattr("barpc.cli.project.wants_json", lambda: True)
-    _print_points(("a", "b"), values, (6, 3))
-    assert json.loads(capsys.readouterr().out) == [{"a": 0.333333, "b": 2.0}, {"a": None, "b": -0.667}]
-
-
-def test_a_point_fails_with_any_of_its_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert _tell_failures(np.array([[1.0, 2.0]]), "went") == 0
-    assert _tell_failures(np.empty((0, 2)), "went") == 0
-    assert capsys.readouterr().err == ""
-    assert _tell_failures(np.array([[1.0, np.nan], [np.inf, 1.0], [1.0, 1.0]]), "went") == 3
-    assert capsys.readouterr().err == "barpc: exit code 3: 2 of 3 points went\n"
-
-
 # --- the verbs --------------------------------------------------------------------------------------------
 
 
@@ -171,13 +152,42 @@ def test_altitudes_of_a_table_count_and_the_others_are_the_one_given(
     assert "terrain height unknown" in told.err
 
 
-def test_a_dem_tells_the_altitudes_of_projected_points(
-    rpc_file: tuple[Path, RPC], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_point_without_a_value_is_nan_or_null_and_the_exit_code_3(
+    rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, rpc = rpc_file
-    monkeypatch.setattr(Dem, "open", lambda dem, geoid: lambda lon, lat: 100.0 + 10 * (lon - 5) - (lat - 43))
-    assert run("project", str(file), "5.4", "43.2", "--dem", "d.tif") == 0
-    np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.4, 43.2, 103.8]), atol=6e-7)
+    words = ("project", str(file), "5.4", "43.2", "120", "nan", "43.2", "120", "5.4", "43.2", "inf")
+    col, row = rpc.project([5.4, 43.2, 120.0])
+    assert run(*words) == 3
+    assert capsys.readouterr() == (
+        f"col,row\n{col:.6f},{row:.6f}\nnan,nan\nnan,nan\n",
+        "barpc: exit code 3: 2 of 3 points could not be projected\n",
+    )
+    assert run(*words, "--json") == 3
+    nothing = {"col": None, "row": None}
+    assert json.loads(capsys.readouterr().out) == [{"col": round(col, 6), "row": round(row, 6)}, nothing, nothing]
+    assert run("localize", str(file), "100", "200", "--alt", "3.00004", "--json") == 0
+    assert json.loads(capsys.readouterr().out)[0]["alt"] == 3.0
+    (tmp_path / "none.csv").write_text("lon,lat,alt\n")
+    assert run("project", str(file), "--points", str(tmp_path / "none.csv")) == 0
+    assert capsys.readouterr() == ("col,row\n", "")
+
+
+def a_slope(path: Path, *holes: tuple[slice, slice], rise: float = 1.0) -> Path:
+    """A DEM of 100 m at 5.4 E, 44 N: up by `rise` a hundredth of a degree to the east, by half a metre to the south."""
+    row, col = np.mgrid[:101, :61]
+    heights = (100.0 + rise * (col - 40) + 0.5 * row).astype(np.float32)
+    for hole in holes:
+        heights[hole] = -9999.0
+    return write_dem(path, 4979, heights)
+
+
+def test_a_dem_tells_the_altitudes_of_projected_points(
+    rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, rpc = rpc_file
+    assert run("project", str(file), "5.404", "43.203", "--dem", str(a_slope(tmp_path / "d.tif"))) == 0
+    np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.404, 43.203, 140.25]), atol=6e-6)
 
 
 @pytest.fixture

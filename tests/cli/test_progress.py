@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import gc
 import io
+import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 import warnings
+from concurrent.futures import CancelledError
 from types import SimpleNamespace
 
+import click
 import pytest
 
 from barpc.base.errors import InputError
-from barpc.cli import terminal as module
 from barpc.cli.terminal import MINUTE, Lines, progress_told
-from barpc.verbs import workers
 from barpc.verbs.workers import THREADS, executor_for
+from tests.lanes import rest_slow
 
 
 class Told:
@@ -171,7 +175,7 @@ def test_a_bar_follows_the_numbers_it_is_given(monkeypatch: pytest.MonkeyPatch) 
         made.append(bar)
         return bar
 
-    monkeypatch.setattr(module.click, "progressbar", progressbar)
+    monkeypatch.setattr(click, "progressbar", progressbar)
     with progress_told(False, 0) as told:
         told("match", 1, 4)
         told("match", 3, 8)
@@ -187,72 +191,57 @@ def test_a_bar_follows_the_numbers_it_is_given(monkeypatch: pytest.MonkeyPatch) 
 # --- workers ----------------------------------------------------------------------------------------------
 
 
-def test_one_process_is_this_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", None)
+def test_one_process_is_this_one() -> None:
     with executor_for(1) as executor:
         assert executor is None
 
 
-class Pool:
-    def __init__(self, jobs: int, mp_context: object, initializer: object) -> None:
-        self.jobs, self.context, self.initializer = jobs, mp_context, initializer
-        self.ended = list[dict[str, bool]]()
-
-    def shutdown(self, **how: bool) -> None:
-        self.ended.append(how)
+def seen_by_a_worker() -> tuple[object, ...]:
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.warn("nobody hears this", stacklevel=1)
+    ear = signal.getsignal(signal.SIGINT)
+    return os.getpid(), [os.environ[name] for name in THREADS], ear, len(heard), gc.get_threshold()[0]
 
 
 def test_several_processes_are_spawned_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_Workers", Pool)
-    with executor_for(2) as pool:
-        assert isinstance(pool, Pool)
-        assert pool.jobs == 2
-        assert pool.context.get_start_method() == "spawn"  # type: ignore[attr-defined]
-        assert pool.initializer is workers._enter_worker
-        assert pool.ended == []
-    assert pool.ended == [{}]
-
-
-class Process:
-    def __init__(self, killed: list[int], number: int) -> None:
-        self.kill = lambda: killed.append(number)
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_after_an_error_nobody_waits_for_workers(error: type[BaseException], monkeypatch: pytest.MonkeyPatch) -> None:
-    killed = list[int]()
-    others, own = ([Process(killed, n) for n in some] for some in ((7,), (0, 1)))  # those of a host stay
-    alive = iter([others, [*others, *own]])
-    monkeypatch.setattr(workers, "_Workers", Pool)
-    monkeypatch.setattr(workers.multiprocessing, "active_children", lambda: next(alive))
-    with pytest.raises(error), executor_for(3) as pool:
-        raise error
-    assert pool.ended == [{"wait": False, "cancel_futures": True}]  # type: ignore[union-attr]
-    assert sorted(killed) == [0, 1]
-
-
-def test_a_worker_has_one_thread_of_blas_and_leaves_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with one thread of BLAS, deaf to Ctrl-C and to warnings."""
     for name in THREADS:
         monkeypatch.setenv(name, "8")
-    signals, ended, joined = list[tuple[int, object]](), list[int](), list[bool]()
-    parent = SimpleNamespace(join=lambda: joined.append(True))
-    monkeypatch.setattr(workers.signal, "signal", lambda *given: signals.append(given))
-    monkeypatch.setattr(workers.multiprocessing, "parent_process", lambda: parent)
-    monkeypatch.setattr(workers.os, "_exit", ended.append)
-    with warnings.catch_warnings(record=True) as heard:
-        workers._enter_worker()
-        warnings.warn("nobody hears this", stacklevel=1)
-    assert heard == []
-    assert [os.environ[name] for name in THREADS] == ["1"] * 3
-    assert signals == [(signal.SIGINT, signal.SIG_IGN)]
-    for _ in range(500):
-        if ended:
-            break
-        time.sleep(0.01)
-    assert (joined, ended) == ([True], [1])
-    monkeypatch.setattr(workers.multiprocessing, "parent_process", lambda: None)
-    workers._leave_with_parent()
-    assert ended == [1]
+    with executor_for(2) as pool:
+        assert pool is not None
+        number, *rest = pool.submit(seen_by_a_worker).result()
+        own = [child for child in multiprocessing.active_children() if child.pid == number]
+        last = pool.submit(time.sleep, 0.2)
+    assert rest == [["1"] * 3, signal.SIG_IGN, 0, 50_000]
+    assert last.done()
+    assert [(type(child).__name__, child.exitcode) for child in own] == [("SpawnProcess", 0)]
+
+
+@pytest.mark.parametrize("error", rest_slow([KeyboardInterrupt, ValueError]))
+def test_after_an_error_nobody_waits_for_workers(error: type[BaseException]) -> None:
+    host = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600,))
+    host.start()
+    with pytest.raises(error), executor_for(2) as pool:
+        assert pool is not None
+        *_, last = [pool.submit(time.sleep, 30) for _ in range(9)]
+        own = {child for child in multiprocessing.active_children() if child.pid != host.pid}
+        raise error
+    for child in own:
+        child.join(60)
+    assert {child.exitcode for child in own} == {-signal.SIGKILL}
+    with pytest.raises(CancelledError):
+        last.result(60)
+    assert host.is_alive()
+    host.kill()
+    host.join()
+
+
+def test_a_worker_leaves_with_its_parent() -> None:
+    """Which says nothing any more; what they print to has an end when both have gone."""
+    work = "import os; from barpc.verbs.workers import executor_for\nwith executor_for(2) as pool:\n "
+    work += "print(pool.submit(os.getpid).result(), flush=True); os.kill(os.getpid(), 9)"
+    found = subprocess.run([sys.executable, "-c", work], stdout=subprocess.PIPE, timeout=60)
+    assert (found.returncode, found.stdout.strip().isdigit()) == (-signal.SIGKILL, True)
 
 
 def test_a_cluster_needs_its_package_and_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:

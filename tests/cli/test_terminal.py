@@ -8,6 +8,7 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 
 from barpc.cli import terminal
@@ -27,19 +28,6 @@ def test_a_table_that_has_room_has_its_heads_in_one_line(width: int | None) -> N
         "a             0.5          12",
         "bb          10.25           3",
     ]
-
-
-@pytest.mark.parametrize(
-    ("text", "width", "lines"),
-    [
-        ("a word-of-two parts", None, ["a word-of-two parts"]),
-        ("a word-of-two parts", 12, ["a", "word-of-two", "parts"]),
-        ("", 12, [""]),
-        ("", None, [""]),
-    ],
-)
-def test_lines_end_between_words(text: str, width: int | None, lines: list[str]) -> None:
-    assert terminal._wrapped(text, width) == lines
 
 
 @pytest.mark.parametrize("width", [28, 20])
@@ -141,16 +129,13 @@ def test_a_record_of_the_log_is_a_line_and_a_traceback_keeps_its_own() -> None:
 def spoken(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
     """Every text that is printed, with how it looks."""
     found: list[tuple[str, dict[str, Any]]] = []
-    monkeypatch.setattr(
-        terminal.click, "secho", lambda text, err, nl, **style: found.append((text, {"err": err, **style}))
-    )
+    monkeypatch.setattr(click, "secho", lambda text, err, nl, **style: found.append((text, {"err": err, **style})))
     return found
 
 
 def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
-    spoken: list[tuple[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
+    spoken: list[tuple[str, dict[str, Any]]],
 ) -> None:
-    monkeypatch.setattr(terminal, "output_width", lambda: None)
     summary = a_summary(
         [a_view("A"), a_view("B", rmse_before=3.0)],
         [a_pair("A", "B", 77)],
@@ -179,10 +164,7 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
     ]
 
 
-def test_what_holds_the_scene_is_a_table_where_several_sources_do(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(terminal, "output_width", lambda: None)
+def test_what_holds_the_scene_is_a_table_where_several_sources_do(capsys: pytest.CaptureFixture[str]) -> None:
     entry = DatumEntry("east", 0.5, 0.7, 0.0, 0.0, 0.3, 0.0)
     print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
     title, head, row, *_ = capsys.readouterr().out.splitlines()
@@ -202,12 +184,15 @@ def test_what_holds_the_scene_is_a_table_where_several_sources_do(
 def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
     status: str, colour: str, spoken: list[tuple[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terminal, "output_width", lambda: 12)
+    monkeypatch.setenv("COLUMNS", "12")
+    monkeypatch.setattr(sys, "stdout", Window())
     print_summary(a_summary([], status=status, headline="All of it well.", verdict=("five tie-points of a view",)))
     assert spoken == [
         ("All of it well.", {"err": False, "bold": True, "fg": colour}),
         ("five\ntie-points\nof a view", {"err": False}),
     ]
+    print_summary(a_summary([a_view("A")], status=status))
+    assert spoken[2][0] == "Reprojection\nerror of the\ntie points"
 
 
 COMPARISON: dict[str, Any] = {
@@ -222,8 +207,7 @@ COMPARISON: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_two_runs_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(terminal, "output_width", lambda: None)
+def test_two_runs_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
     print_comparison(COMPARISON)
     assert capsys.readouterr().out.split("\n") == [
         "A: one",

@@ -18,7 +18,7 @@ from barpc.base.errors import FitError
 from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.cameras import open_camera
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
-from barpc.fit.refit import _bundle, wrong_axes, wrong_axes_of_grid
+from barpc.fit.refit import bundle_of_lines, wrong_axes, wrong_axes_of_grid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.simulate import Look, fly
 from tests.fit.cameras import adjusted, synthetic_rpc
@@ -264,15 +264,15 @@ def test_lines_of_sight_meet_where_the_camera_is() -> None:
     camera = np.array([4.2e6, 1.0e5, 5.1e6])
     ground = 0.9 * camera + np.column_stack([np.zeros(9), np.linspace(-1e4, 1e4, 9), np.linspace(-3e3, 3e3, 9)])
     ecef = np.stack([ground, ground + 1e-3 * (camera - ground)], axis=1)
-    point, plane, nearness = _bundle(ecef)
+    point, plane, nearness = bundle_of_lines(ecef)
     assert point < 1e-10
     assert plane < 1e-10
     assert 1 / nearness == pytest.approx(np.linalg.norm(0.1 * camera), rel=1e-3)  # from the middle of the lines' ends
     assert min(point * 700.0, plane * 3e4) > 1e-8  # no farther than to the rounding of places
-    assert _bundle(ecef[:, ::-1])[2] == pytest.approx(-nearness, rel=2e-3)
+    assert bundle_of_lines(ecef[:, ::-1])[2] == pytest.approx(-nearness, rel=2e-3)
     bent = ecef + [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]] * np.cos(np.arange(9.0))[:, None, None]
-    assert 1e-4 < _bundle(bent)[0] < 3e-3  # a metre at the end of 660 m
-    assert 1e-5 < _bundle(bent)[1] < 1e-3
+    assert 1e-4 < bundle_of_lines(bent)[0] < 3e-3  # a metre at the end of 660 m
+    assert 1e-5 < bundle_of_lines(bent)[1] < 1e-3
 
 
 @pytest.mark.parametrize("projection", ["+proj=utm +zone={zone}", "+proj=eqc +lat_ts={lat}", "+proj=webmerc"])

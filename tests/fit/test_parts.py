@@ -72,14 +72,14 @@ def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted
     ground, image, norm = wavy(camera)
     weight = np.random.default_rng(1).uniform(0.2, 1.0, len(ground)) if weighted else None
     problem = FitProblem(ground, image, norm, weight=weight)
-    coeffs, solved, h, passes = solve_module._gauss_newton_fit(problem, None)
+    coeffs, solved, h, passes = solve_module.METHODS["gauss-newton"](problem, None)
     squares = (left(problem, coeffs) ** 2).sum(axis=0)
     for axis in range(2):
         assert squares[axis] <= 1.01 * best(problem, axis, coeffs)
     assert (h == 0).all()
     assert len(solved) == 2
     assert 2 <= passes <= 20
-    ridge = solve_module._ridge(problem, None)[0]
+    ridge = solve_module.METHODS["ridge"](problem, None)[0]
     assert squares.sum() < (left(problem, ridge) ** 2).sum()
 
 

@@ -25,7 +25,7 @@ from barpc.pipeline import grid_outputs as grids
 from barpc.pipeline.grid_outputs import CORRECTION, GRID_SUFFIX, RESAMPLED, grid_names, write_grids
 from barpc.pipeline.verify_outputs import difference
 from barpc.rpcio import read_rpc
-from barpc.rpcio.grids import read_correction
+from barpc.rpcio.grids import read_correction, write_correction
 from barpc.scene import View
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import LINEAR
@@ -139,17 +139,15 @@ def test_a_resampled_image_has_one_rpc_that_holds(tmp_path, view, camera, fit):
     assert read_rpc(tmp_path / f"a{RESAMPLED}").off(rpc).max() < 1e-9
 
 
-def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view, camera, fit, monkeypatch):
-    real = grids.write_correction
-    monkeypatch.setattr(
-        grids,
-        "write_correction",
-        lambda grid, *given, **how: real(replace(grid, shift=-grid.shift), *given, **how),
-    )
+def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view, camera, fit):
+    errors = grids.make_grids(view, fit.rpc, camera, grids.GridFiles(grids=True, resampled=False), str(tmp_path))
+    assert set(grids.verify_grids(view, camera, errors, str(tmp_path / "a"))) == {"a" + GRID_SUFFIX, "a" + CORRECTION}
+    rpc, lacking = read_correction(path := tmp_path / "a" / f"a{CORRECTION}")
+    write_correction(replace(lacking, shift=-lacking.shift), rpc, path, overwrite=True)
     with pytest.raises(
         OutputError, match=r"a_correction\.tif: (gdal|barpc) reads it with errors of [01]\.\d+ px RMS, not 0\.00\d+; is"
     ):
-        run_of(tmp_path / "out", (view, fit, camera))
+        grids.verify_grids(view, camera, errors, str(tmp_path / "a"))
 
 
 @pytest.mark.slow
@@ -467,11 +465,10 @@ def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monke
     assert written == {f"a/{name}": row for name, (there, _, row) in known.items() if there}
 
 
-def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, monkeypatch) -> None:
+def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, fit) -> None:
     """There is no room to clear then."""
-    monkeypatch.setattr(grids, "make_grids", lambda *given: 1 / 0)
-    with Workspace(tmp_path / "out") as run, pytest.raises(ZeroDivisionError):
-        grids._write_grids(run, [(view, None, None, None)], None, None)  # type: ignore[arg-type, list-item]
+    with pytest.raises(AttributeError, match=r"localize|project"):
+        run_of(tmp_path / "out", (view, fit, object()), grids=True)
 
 
 # --- whole runs -------------------------------------------------------------------------------------------

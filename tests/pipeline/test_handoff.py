@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
@@ -128,7 +129,7 @@ def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monk
     def lend(*_: object, **__: object) -> None:
         raise OSError(code, "so it is")
 
-    monkeypatch.setattr("barpc.pipeline.verify_outputs.rasterio.MemoryFile", lend)
+    monkeypatch.setattr(rasterio, "MemoryFile", lend)
     if refused:
         with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
             verify([path], make_rpc(), SIZE, ALTITUDES)

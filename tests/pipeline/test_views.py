@@ -120,8 +120,12 @@ def test_a_view_brings_its_own_camera_altitudes_and_date_and_its_size_is_that_of
         ((-30000.0, -20000.0), (-1050.0, -950.0)),
     ],
 )
-def test_altitudes_are_those_of_the_earth_and_a_hundred_metres_at_least(stated, used) -> None:
-    assert views._altitudes_used(SimpleNamespace(alt_range=stated)) == pytest.approx(used)  # type: ignore[arg-type]
+def test_altitudes_are_those_of_the_earth_and_a_hundred_metres_at_least(pair, stated, used) -> None:
+    rpc = make_rpc()
+    rpc = replace(rpc, ground_scale=rpc.ground_scale * [1.0, 1.0, 1000.0])  # it sees all of these
+    given = View("a", str(pair[0]), (WIDE, HIGH), rpc, stated)
+    (found,) = load_views([given], min_views=1).views
+    assert found.alt_range == pytest.approx(used)
 
 
 def test_an_rpc_that_does_not_reach_the_ground_is_named(pair) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from rasterio.warp import transform
 
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import HeightDatum, ecef_from_ground
-from barpc.pointio import gcp_formats
 from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.pointio.gcp_formats import GCP_NAMES as NAMES_OF
 from barpc.pointio.gcps import ControlReference, read_gcps
@@ -383,9 +381,7 @@ def test_a_layer_of_points_is_read_by_either_library(tmp_path, monkeypatch, read
     with fiona.open(tmp_path / file, "w", driver=driver, crs="EPSG:32631", schema=schema) as layer:
         point = {"type": "Point", "coordinates": (EAST, NORTH, ALT)}
         layer.write({"type": "Feature", "geometry": point, "properties": {"name": "p", "pixel": COL, "line": ROW}})
-    monkeypatch.setattr(
-        gcp_formats, "find_spec", lambda name: importlib.util.find_spec(name) if name == reader else None
-    )
+    monkeypatch.setitem(sys.modules, {"pyogrio": "fiona", "fiona": "pyogrio"}[reader], None)
     found = read_gcps(tmp_path / file, NAMES)
     assert found.names == ("p",)
     assert found.view.tolist() == [0]
@@ -395,7 +391,8 @@ def test_a_layer_of_points_is_read_by_either_library(tmp_path, monkeypatch, read
 
 @pytest.mark.parametrize("head", [b"SQLite format 3\0", b"\0\0\x27\x0a"])
 def test_without_a_library_a_layer_says_what_to_install(tmp_path, monkeypatch, head) -> None:
-    monkeypatch.setattr(gcp_formats, "find_spec", lambda name: None)
+    for name in ("pyogrio", "fiona"):
+        monkeypatch.setitem(sys.modules, name, None)
     (tmp_path / "a.gpkg").write_bytes(head + bytes(100))
     with pytest.raises(InputError, match="a GeoPackage or Shapefile, which pyogrio reads: pip install pyogrio"):
         read_gcps(tmp_path / "a.gpkg", NAMES)

@@ -54,13 +54,16 @@ def test_egm2008_is_found_where_proj_keeps_it(nowhere, tmp_path, variable, file)
     assert geoid_file("egm2008") == str(path)
 
 
-def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere):
-    nowhere.setattr(geoids, "proj_folders", lambda: [Path("/a"), Path("/b")])
+def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere, tmp_path):
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for folder in folders:
+        folder.mkdir()
+    nowhere.setenv("PROJ_DATA", ":".join(map(str, folders)))
     with pytest.raises(InputError, match=r"geoid egm2008: no us_nga_egm08_25\.tif or egm08_25\.gtx in PROJ's") as told:
         geoid_file("egm2008")
     text = str(told.value)
     assert "\n" not in text
-    for word in ("(/a, /b)", "projsync --file", "https://cdn.proj.org/us_nga_egm08_25.tif", "egm96"):
+    for word in (", ".join(map(str, folders)), "projsync --file", "https://cdn.proj.org/us_nga_egm08_25.tif", "egm96"):
         assert word in text
 
 

@@ -7,6 +7,8 @@ import itertools
 import os
 import ssl
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -43,23 +45,17 @@ def test_a_name_that_lies_here_is_no_url(tmp_path, monkeypatch):
     assert location(AT) is AT
 
 
-def test_a_file_has_the_version_that_it_is_found_to_have(monkeypatch):
-    asked = []
-
-    def fetch(at, start, stop):
-        asked.append((start, stop))
-        return Part(b"x" * REQUEST_BYTES, 7 * REQUEST_BYTES, tag)
-
-    monkeypatch.setattr(hosts, "fetch", fetch)
-    tag = "v"
-    found = remote.pinned(Remote("https://a.org/new.tif"))
-    assert (found.size, found.tag, asked) == (7 * REQUEST_BYTES, "v", [(0, REQUEST_BYTES)])
+def test_a_file_has_the_version_that_it_is_found_to_have(server):
+    (server.folder / "new.tif").write_bytes(b"x" * 7 * REQUEST_BYTES)
+    server.tag = "v"
+    found = remote.pinned(Remote(server.url("new.tif")))
+    assert (found.size, found.tag, server.counts["bytes"]) == (7 * REQUEST_BYTES, "v", REQUEST_BYTES)
     assert RemoteFile(found).read(10) == b"x" * 10  # the first block is kept
     assert remote.pinned(found) is found
-    assert len(asked) == 1
-    tag = ""
+    assert server.counts["requests"] == 1
+    server.tag = ""
     with pytest.raises(OSError, match="names no version"):
-        remote.pinned(Remote("https://a.org/new.tif"))
+        remote.pinned(Remote(server.url("new.tif")))
 
 
 # --- blocks -----------------------------------------------------------------------------------------------
@@ -138,9 +134,11 @@ def test_a_place_is_counted_from_the_start_from_here_or_from_the_end(asked):
     assert io.BufferedReader(RemoteFile(at)).read(3) == b"\0\0\0"
 
 
-def test_a_file_that_changed_is_noticed(monkeypatch):
-    monkeypatch.setattr(hosts, "fetch", lambda *_: Part(block(0), AT.size or 0, "one"))
-    for other in (Remote(str(AT), AT.size, "two"), Remote(str(AT), (AT.size or 0) + REQUEST_BYTES, "one")):
+def test_a_file_that_changed_is_noticed(server):
+    (server.folder / "x").write_bytes(block(0))
+    url, size, tag = server.url("x"), REQUEST_BYTES, server.tag
+    assert RemoteFile(Remote(url, size, tag)).read(1) == b"\0"
+    for other in (Remote(url, size, "two"), Remote(url, size + REQUEST_BYTES, tag)):
         with pytest.raises(OSError, match="changed on its host"):
             RemoteFile(other).read(1)
 
@@ -250,7 +248,7 @@ def fails(error: BaseException) -> Iterator[bytes]:
 def test_it_is_asked_four_times_with_longer_waits(monkeypatch, fetched):
     waited: list[float] = []
     monkeypatch.undo()
-    monkeypatch.setattr(hosts.time, "sleep", waited.append)
+    monkeypatch.setattr(time, "sleep", waited.append)
     monkeypatch.setattr("http.client.HTTPSConnection.connect", lambda _: next(fails(ConnectionRefusedError("no"))))
     with pytest.raises(OSError, match=r"no answer from its host \(no\); asked 4 times"):
         hosts.fetch(AT, 0, 1)
@@ -362,7 +360,7 @@ def test_a_request_has_a_time_that_grows_with_its_bytes_however_its_end_shows(fe
         def cancel(self):
             given.append("cancel")
 
-    monkeypatch.setattr(hosts.threading, "Timer", Timer)
+    monkeypatch.setattr(threading, "Timer", Timer)
     late = False
     fetched(GOOD, start=10, stop=14)
     late = True
@@ -371,24 +369,17 @@ def test_a_request_has_a_time_that_grows_with_its_bytes_however_its_end_shows(fe
     assert given == [30.0 + 4 / 10_000, "start", "cancel"] * 2
 
 
-def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(monkeypatch):
-    tried: list[str] = []
-    present = {"img_rpc.txt", "img.RPB", "img_RPC.geom"}
-
-    def fetch(at, start, stop):
-        tried.append(at.name)
-        assert (start, stop) == (0, 1)
-        if at.name not in present:
-            raise FileNotFoundError
-        return Part(b"", 0, "")
-
-    monkeypatch.setattr(hosts, "fetch", fetch)
-    found = remote.beside(AT, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
+def test_side_files_are_asked_for_as_named_and_with_their_ending_in_lower_case(server):
+    for name in ("img_rpc.txt", "img.RPB", "img_RPC.geom"):
+        (server.folder / name).write_bytes(b"abcd")
+    image = Remote(server.url("img.tif"))
+    found = remote.beside(image, ["img_RPC.TXT", "img.RPB", "img.xml", "img_RPC.geom"])
     every = ["img.RPB", "img.rpb", "img.xml", "img_RPC.TXT", "img_RPC.geom", "img_rpc.geom", "img_rpc.txt"]
-    assert sorted(tried) == every
+    assert sorted(server.seen) == [f"/{name}" for name in every]
+    assert server.counts["bytes"] == 3  # one of each
     assert found == {"img_rpc.txt": "img_rpc.txt", "img.rpb": "img.RPB", "img_rpc.geom": "img_RPC.geom"}
-    present.add("img.rpb")
-    assert remote.beside(AT, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
+    (server.folder / "img.rpb").write_bytes(b"x")
+    assert remote.beside(image, ["img.RPB"]) == {"img.rpb": "img.RPB"}  # the name as it is goes first
 
 
 # --- object stores ----------------------------------------------------------------------------------------
@@ -480,7 +471,7 @@ def test_a_version_has_many_names(shelf, found, version):
 
 def test_the_files_beside_an_object_are_listed_once_a_minute(shelf, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(hosts.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
     assert remote.beside(STORED, ["y_rpc", "X", "other"]) == {"y_rpc": "Y_RPC", "x": "x"}
     now[0] = 59.0
     remote.beside(STORED, ["z"])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from barpc.base.geodesy import Array
-from barpc.report.runfiles import ObservationTable, RunFiles
+from barpc.report.page import SECTIONS, Section
+from barpc.report.runfiles import OBSERVATION_COLUMNS, RESIDUALS, ObservationTable, RunFiles
 from barpc.report.summary import SCHEMA, Summary, TablesEntry, TracksEntry
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
@@ -77,6 +80,23 @@ def files_of(
     table = np.array(points, dtype=float).reshape(-1, 4)
     rings = outlines or [()] * len(summary.views)
     return RunFiles(summary, observed or seen([]), table, np.arange(len(table)), rings)
+
+
+def without_points(folder: Path, count: int, **texts: str) -> Path:
+    """The tables of a run of so many images without a tie point, but for the texts of some."""
+    usual = {
+        "footprints.geojson": json.dumps({"features": [{"geometry": None}] * count}),
+        "observations.csv": ",".join(OBSERVATION_COLUMNS),
+        "residuals.csv": ",".join(RESIDUALS),
+    }
+    for name, text in usual.items():
+        (folder / name).write_text(texts.get(Path(name).stem, text))
+    return folder
+
+
+def section(files: RunFiles, key: str) -> Section | None:
+    """The part of the page of a run that has a key, if there is one."""
+    return next((found for make in SECTIONS if (found := make(files)) is not None and found.key == key), None)
 
 
 def a_square(lon: float, lat: float, half: float = 0.01) -> list[Array]:

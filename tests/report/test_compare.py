@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cli import cli
-from barpc.report.compare import _compared_pairs, _comparison_lines, _view, compare_runs, flat_options
+from barpc.report.compare import compare_runs, flat_options
 from barpc.report.records import json_form
 from barpc.rpcio import read_rpc, write_rpc
 from tests.rpcio.conftest import make_rpc
@@ -107,50 +107,68 @@ def test_the_verb_prints_tables_or_json(block_run, check_run):
     assert json.loads(found.output) == compare_runs(check_run.folder, block_run.folder)
 
 
-def rows(*found):
-    """Rows of views: name, errors, whole difference, without the shift."""
-    keys = ("name", "rmse", "rpc_difference_px", "rpc_difference_without_shift_px")
-    return [dict(zip(keys, row, strict=True)) for row in found]
+@pytest.fixture
+def compared(tmp_path):
+    """Compares two runs by their summaries and the RPCs that they wrote, image by image."""
+
+    def made(*runs, rpcs=({}, {})):
+        folders = [tmp_path / f"{len([*tmp_path.iterdir()])}_{name}" for name in "ab"]
+        for folder, summary, written in zip(folders, runs, rpcs, strict=True):
+            folder.mkdir()
+            (folder / "summary.json").write_text(json.dumps(json_form(summary)))
+            for name, rpc in written.items():
+                write_rpc(rpc, folder / f"{name}_RPC.TXT")
+        return compare_runs(*folders)
+
+    return made
 
 
-def test_what_is_said_of_two_runs():
-    views = rows(("A", (1.0, 0.1), 3.0, 0.5), ("B", (3.0, 0.3), 4.0, 0.25), ("C", (2.0, 0.2), None, None))
-    options = [{"option": "tie.band", "values": [1, None]}]
-    found = _comparison_lines({"views": views, "only_a": ["X", "Y"], "only_b": [], "options": options})
-    assert found == [
+def test_what_is_said_of_two_runs(compared):
+    errors = {"A": (1.0, 0.1), "B": (3.0, 0.3), "C": (2.0, 0.2)}
+    a, b = (
+        [a_view(name, rmse_after=of[k], outputs={f"{name}_RPC.TXT": {}}) for name, of in errors.items()] for k in (0, 1)
+    )
+    rpc = make_rpc()
+    bent = replace(rpc, image_scale=rpc.image_scale * 1.0001)
+    first = a_summary([*a, a_view("X"), a_view("Y")], options={"tie": {"band": 1}})
+    second = a_summary(b, options={})
+    rpcs = {"A": rpc, "B": rpc}, {"A": bent, "B": rpc.crop(3.0, -4.0)}
+    found = compared(first, second, rpcs=rpcs)
+    (whole, bend), (shift, rest), nothing = (
+        (view["rpc_difference_px"], view["rpc_difference_without_shift_px"]) for view in found["views"]
+    )
+    assert nothing == (None, None)
+    assert (shift, rest) == pytest.approx((5.0, 0.0), abs=1e-6)
+    assert 0.01 < bend <= whole < 2.0
+    assert found["lines"] == [
         "3 images in both: their tie points agree to 2.000 px in A, 0.200 px in B.",
-        "Their RPCs differ by up to 4 px (B), by 0.5 px once the mean shift of each image is taken away.",
+        f"Their RPCs differ by up to 5 px (B), by {bend:.3g} px once the mean shift of each image is taken away.",
         "In A alone: X, Y.",
         "Option tie.band: 1 in A, None in B.",
     ]
-    assert len(_comparison_lines({"views": views[2:], "only_a": [], "only_b": ["Z"], "options": []})) == 2
+    assert len(compared(a_summary(a[2:]), a_summary([b[2], a_view("Z")]))["lines"]) == 2
 
 
-def test_each_run_s_error_is_that_of_its_last_cameras(tmp_path):
-    views = (
-        a_view(rmse_before=2.0, rmse_after=None, num_observations=5),
-        a_view(rmse_before=3.0, rmse_after=0.2),
-    )
-    found = _view((tmp_path, tmp_path), views)
+def test_each_run_s_error_is_that_of_its_last_cameras(compared):
+    check, adjusted = a_view(rmse_before=2.0, rmse_after=None, num_observations=5), a_view(rmse_after=0.2)
+    (found,) = compared(a_summary([check]), a_summary([adjusted]))["views"]
     assert (found["rmse"], found["num_observations"]) == ([2.0, 0.2], [5, 100])
     assert found["rpc_difference_px"] is found["rpc_difference_without_shift_px"] is None
 
 
-def test_where_the_first_of_two_cameras_sees_no_ground_no_difference_is_told(tmp_path):
-    view = a_view(outputs={"A_RPC.TXT": {}})
-    folders = tmp_path / "one", tmp_path / "two"
-    for folder, beside in zip(folders, (1e12, 0.0), strict=True):
-        folder.mkdir()
-        write_rpc(make_rpc().crop(beside, 0.0), folder / "A_RPC.TXT")
-    found = _view(folders, (view, view))
+def test_where_the_first_of_two_cameras_sees_no_ground_no_difference_is_told(compared):
+    run = a_summary([a_view(outputs={"A_RPC.TXT": {}})])
+    far, near = ({"A": make_rpc().crop(beside, 0.0)} for beside in (1e12, 0.0))
+    (found,) = compared(run, run, rpcs=(far, near))["views"]
     assert found["rpc_difference_px"] is found["rpc_difference_without_shift_px"] is None
-    assert _view((folders[1], folders[1]), (view, view))["rpc_difference_px"] == 0.0
+    assert compared(run, run, rpcs=(near, near))["views"][0]["rpc_difference_px"] == 0.0
 
 
-def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets():
-    a = a_summary([], [a_pair("A", "B", 5, epipolar_after=None), a_pair("A", "C"), a_pair("B", "C", 8)])
-    b = a_summary([], [a_pair("B", "C", 9), a_pair("A", "B", 7)])
-    assert _compared_pairs(a, b) == [
+def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets(compared):
+    views = [a_view(name) for name in "ABC"]
+    a = a_summary(views, [a_pair("A", "B", 5, epipolar_after=None), a_pair("A", "C"), a_pair("B", "C", 8)])
+    b = a_summary(views, [a_pair("B", "C", 9), a_pair("A", "B", 7)])
+    assert compared(a, b)["pairs"] == [
         {"a": "A", "b": "B", "num_matches": [5, 7], "epipolar_rms": [0.4, 0.1]},
         {"a": "B", "b": "C", "num_matches": [8, 9], "epipolar_rms": [0.1, 0.1]},
     ]

@@ -13,7 +13,7 @@ from barpc.ba.constraints.gauge import SOURCES
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.base.geodesy import DEFAULT, INFERRED, STATED, HeightDatum
 from barpc.report.datum import datum_reasons
-from barpc.report.verdict import _common_lean
+from barpc.report.verdict import common_lean
 from tests.report.made import a_view
 
 GEOID = 48.0
@@ -134,4 +134,4 @@ def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_
 )
 def test_the_common_lean_of_lines_of_sight_cancels_from_opposite_sides(angles, lean):
     views = [a_view(incidence_deg=incidence, azimuth_deg=azimuth) for incidence, azimuth in angles]
-    assert _common_lean(views) == pytest.approx(lean, abs=1e-3)
+    assert common_lean(views) == pytest.approx(lean, abs=1e-3)

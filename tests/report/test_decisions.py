@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 
-from barpc.report import page
 from barpc.report.page import decisions
 from barpc.report.summary import Summary
 from barpc.report.summary.block import ExplanationEntry, HeldOutEntry, JustificationEntry, LeftEntry
 from barpc.report.summary.ground_points import ControlTestEntry
 
-from .made import files_of
+from .made import files_of, section
 
 
 def said(summary: Summary, **scene: Any) -> str:
@@ -246,8 +245,8 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
     pair = replace(record.pairs[0], tied_by="structure", num_matches=240, beaten=("guided 12 of 100", "x 20 of 100"))
     scene = replace(record.scene, explanations=(strip,), left=(left,), held_out_places=(one,))
-    section = page._decisions_section(files_of(replace(record, scene=scene, pairs=(pair, *record.pairs[1:]))))
-    found = {table.key: [[cell.text for cell in row] for row in table.rows] for table in section.tables}
+    told = section(files_of(replace(record, scene=scene, pairs=(pair, *record.pairs[1:]))), "decisions")
+    found = {table.key: [[cell.text for cell in row] for row in table.rows] for table in told.tables}
     assert found["explained"] == [["Rows lie off", "120", "33", "low_frequency"]]
     assert found["left"] == [["B", "columns", "10", "99", "42%", "0.03", "2.00", "17"]]
     assert found["worse"] == [["Rows 0-99 of B: they lie off", "20", "3e-07"]]

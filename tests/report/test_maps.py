@@ -14,7 +14,6 @@ import pytest
 
 from barpc.report import maps
 from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
-from barpc.report.page import _map_section
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.ground_points import CheckPointEntry
 
@@ -27,6 +26,7 @@ from .made import (
     a_view,
     corners,
     files_of,
+    section,
     seen,
 )
 
@@ -45,7 +45,25 @@ def drawn_graticule(plane: Plane) -> Drawing:
 
 
 def drawn_names(places, taken=()) -> Drawing:
-    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps._map_labels(places, taken))}</svg>")
+    return Drawing(f"<svg>{maps.template('drawings.svg.j2').module.names(maps.map_labels(places, taken))}</svg>")
+
+
+def sheet(lonlat):
+    """Where places (n, 2) stand on the sheet that they fill, near the equator, and how tall it is."""
+    low, high = lonlat.min(axis=0), lonlat.max(axis=0)
+    extent = (high - low) * [LON, LAT]
+    scale = min(352 / extent[0], 420 / extent[1])
+    tall = extent[1] * scale + 92
+    return (lambda at: [210, tall / 2] + (at - (low + high) / 2) * np.multiply([LON, -LAT], scale)), tall
+
+
+def caption(files) -> str:
+    return section(files, "map").charts[0][1]
+
+
+def alone(*places) -> Drawing:
+    """The map of some places that two images show."""
+    return Drawing(ground_map(files_of(a_summary([]), points=[(*place, 0.0, 0.0) for place in places])))
 
 
 def plane(height: float = 300.0, unit: float = 100.0) -> Plane:
@@ -84,27 +102,30 @@ def test_a_place_stands_east_to_the_right_and_north_up():
 
 
 def test_the_map_of_a_wide_scene_fills_the_sheet_from_side_to_side():
-    found = maps._plane_of(np.array([[10.0, -0.1], [10.4, 0.1], [370.2, 0.0]]))
-    assert (found.lon, found.lat) == pytest.approx((10.2, 0.0))
-    assert found.unit[0] * 0.4 == pytest.approx(420 - 2 * 34)
-    assert found.scale == pytest.approx(352 / (0.4 * LON), rel=1e-6)
-    assert found.unit[1] / found.unit[0] == pytest.approx(LAT / LON, rel=1e-6)
-    assert found.height == pytest.approx(0.2 * found.unit[1] + 92)
+    drawn = alone((10.0, -0.1), (10.4, 0.1), (370.2, 0.0))
+    tall = 0.2 * 352 / 0.4 * LAT / LON
+    assert drawn.box == (420, pytest.approx(tall + 92, abs=0.006))
+    expected = [(34, 46 + tall), (386, 46), (210, 46 + tall / 2)]
+    assert np.array(drawn.points("point")[0]) == pytest.approx(np.array(expected), abs=0.06)
+    ((x, _, length, _),) = drawn.rects("scalebar")
+    assert (x + length, length) == pytest.approx((416, 352 / (0.4 * LON) * 10_000), abs=0.011)
 
 
 def test_the_map_of_a_tall_scene_is_420_units_tall_and_of_one_place_a_metre_wide():
-    tall = maps._plane_of(np.array([[10.0, -1.0], [10.4, 1.0]]))
-    assert tall.height == pytest.approx(420 + 92)
-    assert tall.unit[1] * 2.0 == pytest.approx(420)
-    one = maps._plane_of(np.array([[10.0, 1.0]]))
-    assert one.scale == pytest.approx(352)
-    assert one.height == pytest.approx(352 + 92)
+    tall = alone((10.0, -1.0), (10.4, 1.0))
+    assert tall.box == (420, pytest.approx(420 + 92, abs=0.006))
+    (low, high) = tall.points("point")[0]
+    assert (low[1] - high[1], high[0] - low[0]) == pytest.approx((420, 0.4 * 210 * LON / LAT), abs=0.11)
+    one = alone((10.0, 1.0))
+    assert one.box == (420, 352 + 92)
+    assert one.rects("scalebar")[0][2] == pytest.approx(352 / 5, abs=0.011)  # of 20 cm
 
 
 def test_a_scene_across_the_antimeridian_is_not_round_the_earth():
-    found = maps._plane_of(np.array([[179.9, 0.0], [-179.9, 0.1]]))
-    assert found.lon % 360 == pytest.approx(180.0)
-    assert found.unit[0] * 0.2 == pytest.approx(352)
+    drawn = alone((179.9, 0.0), (-179.9, 0.1))
+    (west, east) = drawn.points("point")[0]
+    assert (west[0], east[0]) == pytest.approx((34, 386), abs=0.06)
+    assert "180° W" in [text for text, *_ in drawn.texts("degrees")]
 
 
 def test_the_graticule_says_round_degrees_and_the_scale_bar_a_round_length():
@@ -172,8 +193,8 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     summary = a_summary(views, pairs, gcps=(a_gcp("P", 10.05, 0.005),), check_points=(known,))
     points = [(10.0, 0.0, 5.0, 0.1), (10.1, 0.005, 5.0, 0.1)]
     drawn = Drawing(ground_map(files_of(summary, outlines, points)))
-    at = maps._plane_of(np.concatenate([*[*chain(*outlines)], np.array(points)[:, :2]]))
-    assert drawn.box == (420, pytest.approx(at.height, abs=0.006))
+    at, tall = sheet(np.concatenate([*[*chain(*outlines)], np.array(points)[:, :2]]))
+    assert drawn.box == (420, pytest.approx(tall, abs=0.006))
     for status, outline in zip(("adjusted", "weak", "failed"), outlines, strict=True):
         (found,) = drawn.points(f"outline {status}")
         assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
@@ -214,19 +235,17 @@ def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
         files = files_of(a_summary(views), outlines)
         drawn = Drawing(ground_map(files))
         (shaded,) = drawn.points("gap")
-        assert np.array(shaded) == pytest.approx(
-            maps._plane_of(np.concatenate([*chain(*outlines)]))(np.array(ground)), abs=0.006
-        )
+        at, _ = sheet(np.concatenate([*chain(*outlines)]))
+        assert np.array(shaded) == pytest.approx(at(np.array(ground)), abs=0.006)
         assert drawn.titles("gap") == ["B: few tie points here"]
         (first, _), (second, _) = residual_panels(views, files.observations, "after")[0]
         assert Drawing(first).points("gap") == []
         assert "few tie points" not in Drawing(first).described
         assert Drawing(second).points("gap") == [[(0, 60), (300, 60), (300, 90), (0, 90)]]  # 800 rows on 240 units
         assert Drawing(second).described.endswith("; shaded: few tie points.")
-        caption = _map_section(files).charts[0][1]
-        assert caption.endswith("; shaded: rows or columns with few tie points.")
-        plain = _map_section(files_of(a_summary(views[:1]), outlines[:1])).charts[0][1]
-        assert plain == "Footprints at the altitude of the scene."
+        assert caption(files).endswith("; shaded: rows or columns with few tie points.")
+        plain = files_of(a_summary(views[:1]), outlines[:1])
+        assert caption(plain) == "Footprints at the altitude of the scene."
 
 
 def test_the_caption_names_what_is_on_the_map_and_nothing_else():
@@ -243,15 +262,16 @@ def test_the_caption_names_what_is_on_the_map_and_nothing_else():
         "dashed": "tie points that move",
     }
     for known in (set(), {"dots"}, {"triangles"}, {"inverted triangles"}, {"thicker lines"}, {"dashed"}, set(words)):
+        found = (moving, rows) if "dashed" in known else (rows,)
         summary = a_summary(
             views,
             pairs if "thicker lines" in known else pairs[:1],
             gcps=(point,) * ("triangles" in known),
             check_points=(check,) * ("inverted triangles" in known),
-            scene=SimpleNamespace(explanations=(moving, rows) if "dashed" in known else (rows,)),
+            scene=SimpleNamespace(explanations=found, left=(), held_out_places=()),
         )
         files = files_of(summary, outlines, [(10.0, 0.0, 0.0, 0.0)] * ("dots" in known))
-        _, *told = _map_section(files).charts[0][1].rstrip(".").split("; ")
+        _, *told = caption(files).rstrip(".").split("; ")
         told = [one for one in told if one != "those that need review on top"]
         assert told == [f"{key}: {word}" for key, word in words.items() if key in known]
         drawn = Drawing(ground_map(files))
@@ -266,7 +286,7 @@ def test_a_gcp_that_contradicts_others_is_red_and_the_caption_says_so(status):
     drawn, wrong = Drawing(ground_map(files_of(summary, outlines))), status not in ("used", "not seen")
     classes = [mark.get("class") for mark in drawn.all("path") if "gcps" in (mark.get("class") or "").split()]
     assert classes == ["gcps doubted" if wrong else "gcps", "gcps"]
-    told = _map_section(files_of(summary, outlines)).charts[0][1]
+    told = caption(files_of(summary, outlines))
     assert ("triangles: GCPs, red where they contradict others." in told) == wrong
     assert told.endswith("triangles: GCPs.") != wrong
 
@@ -279,7 +299,7 @@ def test_where_tie_points_move_is_outlined_and_says_so():
         ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0),
     )
     drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=SimpleNamespace(explanations=groups)), outlines)))
-    at = maps._plane_of(np.concatenate([*chain(*outlines)]))
+    at, _ = sheet(np.concatenate([*chain(*outlines)]))
     assert drawn.titles("group") == ["a <group> & more"]
     (outline,) = drawn.rects("group")
     assert outline[:2] == pytest.approx(at(np.array([box[0], box[3]])), abs=0.006)
@@ -295,17 +315,17 @@ def test_names_stand_in_the_sheet_and_on_nothing_and_long_ones_are_cut_to_their_
     places = [(a_view("view_0137"), np.array([2.0, 100.0])), (a_view("B"), np.array([419.0, 50.0]))]
     drawn = drawn_names(places)
     assert drawn.texts("name") == [("view_0137", 36.9, 104.0, "middle"), ("B", 415.9, 54.0, "middle")]
-    assert [row[3] for row in maps._map_labels(places, [(30.0, 90.0, 20.0)])] == [pytest.approx(115.4), 50.0]
+    assert [row[3] for row in maps.map_labels(places, [(30.0, 90.0, 20.0)])] == [pytest.approx(115.4), 50.0]
     (long,) = drawn_names([(a_view(f"{'x' * 60}_0137"), np.array([210.0, 50.0]))]).texts("name")
     assert (long[0][0], long[0][-5:], len(long[0])) == ("…", "_0137", 16)
     for dx, dy, clear in ((8.3, 0.0, True), (8.1, 0.0, False), (0.0, 14.1, True), (0.0, 13.9, False)):
         two = [(a_view("V"), np.array([50.0, 50.0])), (a_view("V"), np.array([50.0 + dx, 50.0 + dy]))]
         aside = 15.4 * (not clear)  # of few images each has its name, a line lower where it would cover another
-        assert maps._map_labels(two, [])[1][3] == pytest.approx(50.0 + dy + aside)
+        assert maps.map_labels(two, [])[1][3] == pytest.approx(50.0 + dy + aside)
     crowd = [(a_view("V"), np.array([50.0 + 8.1 * k, 50.0])) for k in range(12)]  # of many those that find room
-    assert [row[2] for row in maps._map_labels(crowd, [])] == pytest.approx([50.0 + 16.2 * k for k in range(6)])
+    assert [row[2] for row in maps.map_labels(crowd, [])] == pytest.approx([50.0 + 16.2 * k for k in range(6)])
     crowd[1] = (a_view("W", status="weak", advice="look"), crowd[1][1])  # and any that needs review
-    assert ("W", pytest.approx(65.4)) in [(name, y) for _, name, _, y in maps._map_labels(crowd, [])]
+    assert ("W", pytest.approx(65.4)) in [(name, y) for _, name, _, y in maps.map_labels(crowd, [])]
 
 
 def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_them():
@@ -317,11 +337,11 @@ def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_the
         "two below": [mark, (50.0, 66.0, 5.0), (50.0, 34.0, 5.0)],
         "nowhere": [(50.0, 50.0 + 16.0 * k, 5.0) for k in range(-2, 3)],
     }
-    found = {key: [y for *_, y in maps._map_labels(place, [], marks)] for key, marks in rows.items()}
+    found = {key: [y for *_, y in maps.map_labels(place, [], marks)] for key, marks in rows.items()}
     rows = {"free": 50.0, "below": 65.4, "above": 34.6, "two below": 80.8, "nowhere": 50.0}
     assert found == {key: [pytest.approx(y)] for key, y in rows.items()}
     words = [(50.0, 50.0 + 16.0 * k, 5.0) for k in (-2, -1, 1, 2)]  # where these stand is no room
-    assert maps._map_labels(place, words, [mark])[0][3] == 50.0
+    assert maps.map_labels(place, words, [mark])[0][3] == 50.0
 
 
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
@@ -471,11 +491,13 @@ def test_a_very_large_error_is_no_darker_than_dark_and_its_arrow_no_longer_than_
 
 
 def test_a_short_arrow_has_a_short_head():
-    shaft, barbs = maps._arrow(np.array([50.0, 50.0]), np.array([0.0, 4.0]))
-    assert np.array(shaft).tolist() == [[50, 48], [50, 52]]
-    assert np.array(barbs) == pytest.approx(np.array([[48.8, 50], [50, 52], [51.2, 50]]))
-    nothing, _ = maps._arrow(np.array([50.0, 50.0]), np.zeros(2))
-    assert np.array(nothing).tolist() == [[50, 50], [50, 50]]
+    """Four units of a tenth of a long residual, down the image from its first cell."""
+    rows = [(0, k, (50.0, 50.0), (0, 0), (0.0, 0.1), True) for k in range(20)]
+    rows += [(0, 20 + k, (950.0, 950.0), (0, 0), (1.0, 0.0), True) for k in range(5)]
+    shaft, barbs = Drawing(panels(rows, [a_view(size=(1000, 1000))])[0][0][0]).points("mean")
+    x = y = 18.75
+    assert np.array(shaft) == pytest.approx(np.array([(x, y - 2), (x, y + 2)]), abs=0.006)
+    assert np.array(barbs) == pytest.approx(np.array([(x - 1.2, y), (x, y + 2), (x + 1.2, y)]), abs=0.006)
 
 
 def test_of_many_residuals_every_few_th_is_drawn_and_of_many_images_the_most_systematic(monkeypatch):

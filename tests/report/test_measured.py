@@ -15,7 +15,7 @@ from barpc.report import Run, summarize
 from barpc.report import outcome as runs
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.page import decisions
-from barpc.report.summary.block import _justification
+from barpc.report.summary.block import measure_scene
 from barpc.report.summary.ground_points import (
     GcpEntry,
     measure_check_points,
@@ -23,6 +23,7 @@ from barpc.report.summary.ground_points import (
     measure_gcps,
     measure_reference,
 )
+from barpc.report.summary.pairs import MAX_PER_PAIR
 from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, measure_views, rmse_by_view
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
@@ -189,14 +190,12 @@ def test_a_summary_counts_tie_points_by_the_views_that_see_them(check_run):
 # --- pairs ------------------------------------------------------------------------------------------------
 
 
-def test_the_offset_of_a_pair_is_measured_on_a_thousand_matches_evenly(block_run, monkeypatch):
-    from barpc.report.summary import pairs
-
-    assert pairs.MAX_PER_PAIR == 1000
+def test_the_offset_of_a_pair_is_measured_on_a_thousand_matches_evenly(block_run, sized):
+    assert MAX_PER_PAIR == 1000
     run = block_run.run
     ties = max(run.pairs, key=lambda one: len(one.a))
-    monkeypatch.setattr(pairs, "MAX_PER_PAIR", 40)
-    found = pairs._pair_offsets(run, run.after, run.ground[:, 2])[run.pairs.index(ties)]
+    sized(matches_measured=40)
+    found = summarize(run).pairs[run.pairs.index(ties)].epipolar_after
     picks = np.linspace(0, len(ties.a) - 1, 40).astype(int)
     i, j = ties.views
     a, b = run.tracks.xy[ties.a[picks]], run.tracks.xy[ties.b[picks]]
@@ -350,22 +349,24 @@ def test_check_points_are_measured_with_the_new_cameras_or_the_old_ones(block_ru
 # --- what was left, and decided by ------------------------------------------------------------------------
 
 
-def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chance():
-    test = SmoothTest(np.array([0.9, 0.4, 0.3]), np.array([1e-3, 1e-9, 1e-5]), np.zeros(3), np.array([0.1, 0.0, 0.35]))
-    adjustment = SimpleNamespace(asked={"drift": test}, names=("A", "B", "C"))
-    found = _justification(adjustment, "drift")
-    assert (found.image, found.systematic_px, found.systematic_p, found.neighbour_correlated_px, found.num_images) == (
-        "B",
-        0.4,
-        1e-9,
-        0.0,
-        2,
-    )
-    more = replace(test, shared=np.array([0.5, 0.0, 0.35]))
-    assert _justification(SimpleNamespace(asked={"drift": more}, names=("A", "B", "C")), "drift").image == "A"
-    at = replace(test, significance=np.array([1e-4, 0.99e-4, 1.0]))
-    assert _justification(SimpleNamespace(asked={"drift": at}, names=("A", "B", "C")), "drift").num_images == 1
-    assert _justification(adjustment, "jitter") is None
+def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chance(block_run):
+    run = block_run.run
+
+    def asking(rms, significance, shared, what="drift"):
+        """What is said of three of the images; of the others there is nothing."""
+        given = (rms, 0.0), (significance, 1.0), ([0.0] * 3, 0.0), (shared, 0.0)
+        test = SmoothTest(*(np.append(values, np.full(6, rest)) for values, rest in given))
+        return measure_scene(replace(run, adjustment=replace(run.adjustment, asked={what: test})))
+
+    names, chance = [view.name for view in run.views], [1e-3, 1e-9, 1e-5]
+    scene = asking([0.9, 0.4, 0.3], chance, [0.1, 0.0, 0.35])
+    found = scene.drift_justification
+    assert (found.image, found.systematic_px, found.systematic_p) == (names[1], 0.4, 1e-9)
+    assert (found.neighbour_correlated_px, found.num_images) == (0.0, 2)
+    assert asking([0.9, 0.4, 0.3], chance, [0.5, 0.0, 0.35]).drift_justification.image == names[0]
+    at = asking([0.9, 0.4, 0.3], [1e-4, 0.99e-4, 1.0], [0.1, 0.0, 0.35], "jitter")
+    assert at.jitter_justification.num_images == 1
+    assert scene.jitter_justification is at.drift_justification is None
 
 
 def test_decisions_end_with_the_test_of_control(block_run):

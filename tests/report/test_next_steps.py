@@ -25,7 +25,7 @@ from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import Look, SimulatedBlock, simulate_block
 
-from .made import a_gcp, a_pair, a_summary, a_view
+from .made import a_correction, a_gcp, a_pair, a_summary, a_view, files_of, section, seen
 
 OFF = 1.5  # a prediction is right to this factor, both ways
 OPTIONS = AdjustOptions(dem_sigma=2.0)
@@ -243,7 +243,9 @@ def test_a_flagged_image_is_not_handed_over_and_the_part_that_shows_it_is_linked
     assert "B." not in use.text
     assert "A - C, 2.0 m per pixel" in use.text
     assert review.text.startswith("Look at B (")
-    assert review.part in _QUESTIONS
+    views = [replace(view, correction=a_correction()) for view in views]
+    files = files_of(a_summary(views, pairs), observed=seen([(0, 0, (0.0, 0.0), (1.0, 1.0), (0.1, 0.1), True)]))
+    assert section(files, review.part) is not None
 
 
 def test_one_line_names_some_of_three_hundred_images_and_counts_the_others():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 import time
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -213,7 +214,7 @@ def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, 
 
 
 def test_without_jinja2_the_run_is_whole_and_the_verb_says_what_to_install(block_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "can_render", lambda: False)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     written(block_run.run, tmp_path / "run")
     assert (tmp_path / "run/summary.json").is_file()
     assert not (tmp_path / "run/report.html").exists()

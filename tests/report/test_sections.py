@@ -18,17 +18,17 @@ from barpc.report.summary.pairs import OffsetEntry
 from barpc.report.summary.views import CenterEntry, EllipseEntry, FitEntry
 from barpc.report.summary.words import STATUS_WORDS
 
-from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, seen
+from .made import a_correction, a_gcp, a_pair, a_square, a_summary, a_view, files_of, section, seen, without_points
 
 pytest.importorskip("jinja2")
 
 VIEWS = [a_view("A"), a_view("B"), a_view("C")]
 
 
-def asked(name: str, views=VIEWS, pairs=(), outlines=(), observed=None, **fields):
-    """The section that one of the page's functions makes."""
+def asked(key: str, views=VIEWS, pairs=(), outlines=(), observed=None, **fields):
+    """The part of the page that has a key."""
     files = files_of(a_summary(views, pairs, **fields), outlines, observed=observed)
-    return getattr(page, f"_{name}_section")(files)
+    return section(files, key)
 
 
 def texts(table) -> list[list[str]]:
@@ -115,20 +115,20 @@ def pushed(view: int, cells: int, of: int):
 
 
 def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
-    calm = asked("randomness", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
+    calm = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
     assert calm.answer.startswith(
         "Mostly: in no image do residuals point the same way in more than half of the cells. A cell"
     )
     assert len(calm.panels) == 3
     assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
     assert len(calm.folds[0][1]) == 3
-    told = asked("randomness", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
+    told = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
     assert told.answer.startswith("Not in B: in most of their cells the residuals point the same way. A cell")
-    check = asked("randomness", observed=seen(pushed(1, 2, 3)), kind="check")
+    check = asked("random", observed=seen(pushed(1, 2, 3)), kind="check")
     assert check.folds == []
     assert 'id="panel-before0-t"' in check.panels[0][0]
     assert 'id="panel-after0-t"' in calm.panels[0][0]
-    assert asked("randomness", observed=seen([])) is None
+    assert asked("random", observed=seen([])) is None
 
 
 def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
@@ -177,12 +177,12 @@ def test_corrections_are_told_by_the_farthest_move():
             camera_center=CenterEntry((0, 0, 0), 694e3, "line"),
         ),
     ]
-    section = asked("corrections", views, scene=a_scene(shift_enu_m=(-2.0, 2.0, 1.0)))
+    section = asked("moves", views, scene=a_scene(shift_enu_m=(-2.0, 2.0, 1.0)))
     common = (
         "Part of that is common to all images: the scene as a whole moved by 3.0 m, which tie points cannot determine."
     )
     assert section.answer == f"Up to 5.00 px at the centre of an image. {common}"
-    assert asked("corrections", views).answer == "Up to 5.00 px at the centre of an image."
+    assert asked("moves", views).answer == "Up to 5.00 px at the centre of an image."
     assert [table.key for table in section.tables] == ["corrections", "places"]
     assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-", "-", "-"]
     assert texts(section.tables[0])[1][-2:] == ["694,000", "line"]
@@ -192,11 +192,11 @@ def test_corrections_are_told_by_the_farthest_move():
     gcps = (a_gcp("P", 0.0, 0.0),)
     for cameras, told in ((0.9, True), (0.1, False)):  # whether control is given or not: what counts is used
         datum = (DatumEntry("up", 2.0, cameras, 0.0, 0.0, 1.0 - cameras, 0.0, None),)
-        moved = asked("corrections", views, scene=a_scene(shift_enu_m=(9.0, 0.0, 0.0), datum=datum), gcps=gcps)
+        moved = asked("moves", views, scene=a_scene(shift_enu_m=(9.0, 0.0, 0.0), datum=datum), gcps=gcps)
         assert ("which tie points cannot determine" in moved.answer) == told
-    assert [table.key for table in asked("corrections", views[:1]).tables] == ["corrections"]
-    assert asked("corrections", [views[0], a_view("B")]) is None
-    clocks = asked("corrections", [a_view("A", correction=a_correction(range_m=1.0, azimuth_ms=0.5))])
+    assert [table.key for table in asked("moves", views[:1]).tables] == ["corrections"]
+    assert asked("moves", [views[0], a_view("B")]) is None
+    clocks = asked("moves", [a_view("A", correction=a_correction(range_m=1.0, azimuth_ms=0.5))])
     assert clocks.tables[0].columns[-2:] == ["range [m]", "azimuth [ms]"]
     assert texts(clocks.tables[0])[0][-2:] == ["+1.000", "+0.5000"]
 
@@ -278,7 +278,7 @@ def test_check_points_are_shown():
         a_check("Q", (None, 1.0, 1.0), (0.0, 0.0)),
         a_check("R", (4.0, 0.0, 0.3)),
     )
-    section = asked("check_points", check_points=points)
+    section = asked("accuracy", check_points=points)
     assert section.answer == (
         "3 check points that the adjustment did not use; the verdict states the RMS of their residuals."
     )
@@ -286,7 +286,7 @@ def test_check_points_are_shown():
         ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
         ["R", "0", "-", "+4.000", "0", "+0.300"],
     ]  # fmt: skip
-    assert asked("check_points") is None
+    assert asked("accuracy") is None
 
 
 def test_files_are_held_to_what_their_readers_found():
@@ -327,11 +327,9 @@ def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():
 
 
 @pytest.mark.parametrize(("num", "more"), [(400, False), (401, True)])
-def test_a_verdict_of_four_hundred_sentences_is_shown_whole(monkeypatch, num, more):
-    files = files_of(a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num))))
-    monkeypatch.setattr(page, "read_tables", lambda *_: files)
-    monkeypatch.setattr(page, "SECTIONS", ())
-    html = page.report_html(files.summary, "")
+def test_a_verdict_of_four_hundred_sentences_is_shown_whole(tmp_path, num, more):
+    summary = a_summary(VIEWS, verdict=tuple(f"s{k}." for k in range(num)))
+    html = page.report_html(summary, without_points(tmp_path, len(VIEWS)))
     assert "<li>s399.</li>" in html
     assert ("And 1 more; all are in summary.json." in html) == more
 
@@ -390,18 +388,18 @@ def test_pairs_that_are_torn_are_first():
 @pytest.mark.parametrize(("nmad", "told"), [(0.25, True), (None, False)])
 def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images(nmad, told):
     files = files_of(a_summary(VIEWS))
-    assert page._surface_section(files) is None
+    assert section(files, "surface") is None
     before = ReliefWindow("delivered", (2, 2), 0.412, nmad, "QUJD")
     after = replace(before, cameras="corrected", share=0.933, nmad_m=0.5)
-    section = page._surface_section(replace(files, reliefs=(before, after)))
+    shown = section(replace(files, reliefs=(before, after)), "surface")
     said = "41 % of its cells have a height with the delivered cameras, 93 % with the corrected ones."
-    assert said in section.answer
-    assert ("differ by 25.0 cm and by 50.0 cm" in section.answer) == told
-    assert [words.partition(",")[0] for _, words in section.charts] == [
+    assert said in shown.answer
+    assert ("differ by 25.0 cm and by 50.0 cm" in shown.answer) == told
+    assert [words.partition(",")[0] for _, words in shown.charts] == [
         "Surface from the delivered cameras", "Surface from the corrected cameras",
     ]  # fmt: skip
     draped = tuple(Draped(name, (2, 2), "QUJD") for name in "AC")
-    (*_, (chart, words)) = page._surface_section(replace(files, reliefs=(before, after), draped=draped)).charts
+    (*_, (chart, words)) = section(replace(files, reliefs=(before, after), draped=draped), "surface").charts
     assert words.startswith("A (left) and C (right) draped over the surface from the corrected cameras: ")
     assert str(chart).count("QUJD") == 2
 

@@ -19,19 +19,13 @@ from barpc.report.runfiles import (
     OBSERVATION_COLUMNS,
     RESIDUALS,
     TABLES,
-    _floats,
-    _formatted_cell,
-    _parse_observations,
-    _parse_outlines,
-    _parse_points,
-    _rounded,
-    _table_columns,
-    _track_numbers,
     gcps_geojson,
     map_layers,
     read_tables,
     run_key,
 )
+
+from .made import a_pair, a_summary, a_view, without_points
 
 
 def rows_of(path):
@@ -102,7 +96,7 @@ def test_the_same_run_gives_the_same_bytes(block_run):
     assert geopackage(map_layers(run, again)) == (block_run.folder / "map.gpkg").read_bytes()
 
 
-def test_tables_are_written_and_read_in_parts_of_any_size(block_run, sized):
+def test_tables_are_written_and_read_in_parts_of_any_size(block_run, tmp_path, sized):
     rows = 7
     tables, whole = block_run.folder / "tables", read_tables(block_run.record, block_run.folder)
     assert len(whole.tracks) % rows
@@ -116,8 +110,10 @@ def test_tables_are_written_and_read_in_parts_of_any_size(block_run, sized):
         assert (getattr(again.observations, name) == getattr(whole.observations, name)).all(), name
     text = (tables / "residuals.csv").read_text().splitlines()
     for lost in (1 + rows, 2 * rows):  # blank lines as many as a part has, or one
-        with pytest.raises(ValueError, match=r"cells|shorter|longer"):
-            _parse_points([*text[: 1 + rows], *[""] * lost, *text[1 + rows :]])
+        shutil.copytree(tables, torn := tmp_path / str(lost))
+        (torn / "residuals.csv").write_text("\n".join([*text[: 1 + rows], *[""] * lost, *text[1 + rows :]]))
+        with pytest.raises(InputError, match=r"cells|too many or too few values"):
+            read_tables(block_run.record, torn)
 
 
 def test_a_huge_run_is_thinned_evenly_and_says_so(block_run, sized):
@@ -154,21 +150,33 @@ HEAD, ROW = ",".join(OBSERVATION_COLUMNS), "A,3,1.5,2.5,0.1,0.2,,,1"
 PLACES, PLACE = ",".join(RESIDUALS), "10,20,30,0.5,3,0.7,8"
 
 
-def test_observations_are_read_with_what_is_missing():
-    found = _parse_observations([HEAD, "B,4,1,2,3,4,5,6,0", ROW], ["A", "B"])
+@pytest.fixture
+def read(tmp_path):
+    """Reads the tables of a run of the images A and B, of which some texts are given."""
+
+    def made(**texts: str):
+        return read_tables(a_summary([a_view("A"), a_view("B")]), without_points(tmp_path, 2, **texts))
+
+    return made
+
+
+def test_observations_are_read_with_what_is_missing(read):
+    found = read(observations=f"{HEAD}\nB,4,1,2,3,4,5,6,0\n{ROW}\n").observations
     assert (found.view.tolist(), found.track.tolist(), found.used.tolist()) == ([1, 0], [4, 3], [False, True])
     assert found.xy.tolist() == [[1, 2], [1.5, 2.5]]
     assert found.before.tolist() == [[3, 4], [0.1, 0.2]]
     assert found.after[0].tolist() == [5, 6]
     assert np.isnan(found.after[1]).all()
-    assert len(_parse_observations([HEAD], ["A"]).view) == 0
+    nothing = read()
+    assert (len(nothing.observations.view), len(nothing.points), len(nothing.tracks)) == (0, 0, 0)
 
 
-def test_places_are_read_with_their_numbers():
-    points, tracks = _parse_points([PLACES, PLACE, "10,20,30,,3,,999999999999999999"])
-    assert points[0].tolist() == [10, 20, 30, 0.5]
-    assert np.isnan(points[1, 3])
-    assert tracks.tolist() == [8, 999999999999999999]
+def test_places_are_read_with_their_numbers(read):
+    found = read(residuals=f"{PLACES}\n{PLACE}\n10,20,30,,3,,999999999999999999\n10,20,-1e12,1e12,3,,0")
+    assert found.points[0].tolist() == [10, 20, 30, 0.5]
+    assert np.isnan(found.points[1, 3])
+    assert found.points[2].tolist() == [10, 20, -1e12, 1e12]
+    assert found.tracks.tolist() == [8, 999999999999999999, 0]
 
 
 @pytest.mark.parametrize(
@@ -185,65 +193,70 @@ def test_places_are_read_with_their_numbers():
         "A,x,1.5,2.5,0.1,0.2,,,1",
     ],
 )
-def test_an_observation_that_cannot_be_is_refused(row):
-    _parse_observations([HEAD, ROW], ["A"])
-    with pytest.raises((ValueError, LookupError)):
-        _parse_observations([HEAD, row], ["A"])
+def test_an_observation_that_cannot_be_is_refused(read, row):
+    read(observations=f"{HEAD}\n{ROW}")
+    with pytest.raises(InputError, match=r"observations\.csv: damaged"):
+        read(observations=f"{HEAD}\n{row}")
 
 
 @pytest.mark.parametrize(
     "place", [(540.0, 90.0), (-540.0, -90.0), (540.1, 0.0), (-540.1, 0.0), (0.0, 90.1), (0.0, -90.1)]
 )
-def test_a_place_is_on_the_earth_up_to_a_turn_and_a_half(place):
-    lines = [PLACES, f"{place[0]},{place[1]},30,0.5,3,0.7,8"]
-    ring = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], list(place), [0, 0]]]}
-    outline = json.dumps({"features": [{"geometry": ring}]})
+def test_a_place_is_on_the_earth_up_to_a_turn_and_a_half(read, place):
+    points = f"{PLACES}\n{place[0]},{place[1]},30,0.5,3,0.7,8"
+    outline = outlines(polygon([[0, 0], [1, 0], list(place), [0, 0]]), None)
     if abs(place[0]) <= 540 and abs(place[1]) <= 90:
-        assert len(_parse_points(lines)[0]) == 1
-        assert len(_parse_outlines(outline)[0][0]) == 4
+        found = read(residuals=points, footprints=outline)
+        assert len(found.points) == 1
+        assert len(found.outlines[0][0]) == 4
         return
-    with pytest.raises(ValueError, match="no longitude and latitude"):
-        _parse_points(lines)
-    with pytest.raises(ValueError, match="no longitude and latitude"):
-        _parse_outlines(outline)
+    for texts in ({"residuals": points}, {"footprints": outline}):
+        with pytest.raises(InputError, match="no longitude and latitude"):
+            read(**texts)
 
 
-def test_outlines_are_the_outer_rings():
+def polygon(*rings):
+    return {"type": "Polygon", "coordinates": rings}
+
+
+def outlines(*geometries) -> str:
+    return json.dumps({"features": [{"geometry": one} for one in geometries]})
+
+
+def test_outlines_are_the_outer_rings(read):
     square = [[0, 0], [1, 0], [1, 1], [0, 0]]
-    parts = [
-        {"type": "MultiPolygon", "coordinates": [[square, "hole"], [square]]},
-        {"type": "Polygon", "coordinates": [square]},
-        None,
-    ]
-    found = _parse_outlines(json.dumps({"features": [{"geometry": part} for part in parts]}))
-    assert [len(rings) for rings in found] == [2, 1, 0]
-    assert found[1][0].tolist() == square
+    parts = {"type": "MultiPolygon", "coordinates": [[square, "hole"], [square]]}
+    one, two = read(footprints=outlines(parts, polygon(square, "hole"))).outlines
+    assert (len(one), len(two), two[0].tolist()) == (2, 1, square)
+    assert [len(rings) for rings in read(footprints=outlines(None, parts)).outlines] == [0, 2]
     for ring in (square[:3], [[0, 0, 0]] * 4, [0, 0, 0, 0]):
-        with pytest.raises(ValueError, match="outline of shape"):
-            _parse_outlines(json.dumps({"features": [{"geometry": {"type": "Polygon", "coordinates": [ring]}}]}))
+        with pytest.raises(InputError, match="outline of shape"):
+            read(footprints=outlines(polygon(ring), None))
 
 
-def test_a_table_with_other_columns_is_refused():
-    assert [*_table_columns(["a,b", "1,2", "3,4"], ("a", "b"))] == [[("1", "3"), ("2", "4")], [(), ()]]
-    assert [*_table_columns(["a,b"], ("a", "b"))] == [[(), ()]]
-    wrong = {
-        "a,c\n1,2\n": "columns are not a, b",
-        "a,b\n1,2,3\n": "rows of 3 cells",
-        "a,b\n1,2\n3\n": "shorter",
-    }
-    for text, said in wrong.items():
-        with pytest.raises(ValueError, match=said):
-            [*_table_columns(text.splitlines(), ("a", "b"))]
-    assert _floats([["1", ""], ["", "1e12"]], 0)[1, 1] == 1e12
-    assert _track_numbers(["0", "12"]).tolist() == [0, 12]
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{PLACES}x\n{PLACE}\n", f"columns are not {RESIDUALS[0]}, {RESIDUALS[1]}"),
+        (f"{PLACES}\n{PLACE},3\n", "rows of 8 cells"),
+        (f"{PLACES}\n{PLACE}\n3\n", "too many or too few values"),
+        ("", "columns are not"),
+    ],
+)
+def test_a_table_with_other_columns_is_refused(read, text, said):
+    with pytest.raises(InputError, match=said):
+        read(residuals=text)
 
 
 TIE = {"kind": "worst", "a": "A", "b": "B", "offset_px": [1.5, 0.5], "patches": ["QUJD", "QUJD", "QUJDQQ=="]}
 
 
 def test_numbers_of_a_table():
-    assert (_rounded(None, 4), _rounded(float("nan"), 4), _rounded(1.23456, 4)) == ("", "", "1.2346")
-    assert [_formatted_cell(value) for value in ("a,b", 7, 0.123456, None)] == ['"a,b"', "7", "0.12346", ""]
+    pair = a_pair("a,b", "c", 7, convergence_deg=0.123456, base_to_height=float("nan"), epipolar_after=None)
+    head, row = b"".join(TABLES["pairs.csv"](None, a_summary([], [pair]))).decode().splitlines()
+    assert row.startswith('"a,b",c,7,')
+    found = dict(zip(head.split(","), *csv.reader([row]), strict=True))
+    assert (found["convergence_deg"], found["base_to_height"], found["epipolar_after_rms_px"]) == ("0.12346", "", "")
 
 
 def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):

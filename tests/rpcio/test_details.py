@@ -20,7 +20,6 @@ from barpc.base.errors import ImageError, InputError, OutputError, RpcError, Rpc
 from barpc.base.safe_io import Kind
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
-from barpc.rpcio import formats as formats_module
 from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import (
@@ -424,7 +423,7 @@ def test_a_folder_is_listed_again_when_it_changed_and_once_while_it_rests(tmp_pa
     """A change within two seconds may not show in the folder's time: it is listed anew until then."""
     listed: list[object] = []
     scan = os.scandir
-    monkeypatch.setattr(formats_module.os, "scandir", lambda folder: listed.append(folder) or scan(folder))
+    monkeypatch.setattr(os, "scandir", lambda folder: listed.append(folder) or scan(folder))
     now = time.time_ns()
     for name in ("B.tif", "a.TIF"):
         (tmp_path / name).touch()
@@ -432,7 +431,7 @@ def test_a_folder_is_listed_again_when_it_changed_and_once_while_it_rests(tmp_pa
         os.utime(tmp_path, ns=(now, now - round(age * 1e9)))
         listed.clear()
         for _ in range(2):
-            monkeypatch.setattr(formats_module.time, "time_ns", lambda: now)
+            monkeypatch.setattr(time, "time_ns", lambda: now)
             assert files_of(tmp_path) == {"b.tif": "B.tif", "a.tif": "a.TIF"}
         assert len(listed) == times, age
     assert files_of(tmp_path / "nothing") == {}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.base.geodesy import EARTH_RATE, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.simulate import GM, Look, _circle, fly, looks
+from barpc.simulate import GM, Look, circular_orbit, fly, looks
 
 TARGET = np.array([5.4, 43.3, 230.0])
 SIZE, GSD = (401, 301), 0.5
@@ -62,7 +62,7 @@ def test_the_line_of_sight_passes_over_the_ground_at_a_line_a_period() -> None:
 def test_an_orbit_is_a_circle_in_space_and_the_earth_turns_below() -> None:
     place, rate, times = np.array([7.0e6, 1e5, 2e5]), 1e-3, np.array([-100.0, 0.0, 1e-3, 100.0, 1000.0])
     forward = np.array([0.3, 0.1, 1.0])
-    found = _circle(place, forward, rate, times)
+    found = circular_orbit(place, forward, rate, times)
     np.testing.assert_allclose(found[1], place)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), np.linalg.norm(place))
     level = forward - (forward @ place) / (place @ place) * place

@@ -8,13 +8,13 @@ import pytest
 
 from barpc.tie.patches import dense
 from barpc.tie.patches.dense import (
-    _NOISE_VARIANCE,
-    _SLOPE_VARIANCE,
     COLUMNS_PER_PIXEL,
+    NOISE_VARIANCE,
+    SLOPE_VARIANCE,
     _both_ways,
-    _refined_disparity,
     dense_matches,
     epipolar_frame,
+    refined_disparity,
 )
 
 from .conftest import write_image
@@ -96,10 +96,10 @@ def test_a_step_of_least_squares_moves_no_match_by_more_than_a_column(off):
     left = cv2.normalize(left, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
     given = np.full(left.shape, 5.0 + off, np.float32)
-    found = _refined_disparity(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
+    found = refined_disparity(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
     assert np.abs(found - off).max() <= 1.0
     assert np.median(found) == pytest.approx(0.5 * off)  # towards the right place, as far as it may
-    exact = _refined_disparity(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
+    exact = refined_disparity(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
     assert np.abs(exact - 5.0).max() < 0.1
 
 
@@ -112,7 +112,7 @@ def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
         moved = cv2.warpAffine(noise, to_frame, (1000, 700), flags=cv2.INTER_CUBIC)
         inside = cv2.erode(cv2.warpAffine(np.ones_like(noise), to_frame, (1000, 700)), np.ones((9, 9))) > 0.999
         found.append([moved[inside].var(), np.gradient(moved, axis=1)[inside].var()])
-    np.testing.assert_allclose(np.mean(found, axis=0), [_NOISE_VARIANCE, _SLOPE_VARIANCE], rtol=0.03)
+    np.testing.assert_allclose(np.mean(found, axis=0), [NOISE_VARIANCE, SLOPE_VARIANCE], rtol=0.03)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.7, 40.0), (1.3, -40.0)])
@@ -125,7 +125,7 @@ def test_a_step_finds_the_place_between_columns_and_says_how_well_whatever_gain_
     moved = cv2.remap(texture, cols + 5.3, rows, cv2.INTER_LANCZOS4)
     pictures = [100.0 + texture, offset + gain * (100.0 + moved)]
     noisy = [np.clip(np.rint(one + 2.0 * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8) for one in pictures]
-    found, sigma = _refined_disparity(
+    found, sigma = refined_disparity(
         *noisy, np.full(texture.shape, 5.0, np.float32), np.ones(texture.shape, dtype=bool)
     )
     off, said = found[15:-15, 40:-40] - 5.3, COLUMNS_PER_PIXEL * np.median(sigma[15:-15, 40:-40])

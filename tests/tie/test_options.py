@@ -299,5 +299,5 @@ def test_common_altitudes_are_those_that_both_ranges_hold() -> None:
 def test_the_penalties_of_dense_matching_are_opencv_s_for_disparities_twice_as_fine() -> None:
     """8 and 32 times the pixels of a window, by the manual of StereoSGBM; of one channel."""
     assert dense.COLUMNS_PER_PIXEL == 2
-    assert dense._SGBM["P1"] == dense.COLUMNS_PER_PIXEL * 8 * dense._SGBM["blockSize"] ** 2 == 400
-    assert dense._SGBM["P2"] == dense.COLUMNS_PER_PIXEL * 32 * dense._SGBM["blockSize"] ** 2 == 1600
+    assert dense.SGBM["P1"] == dense.COLUMNS_PER_PIXEL * 8 * dense.SGBM["blockSize"] ** 2 == 400
+    assert dense.SGBM["P2"] == dense.COLUMNS_PER_PIXEL * 32 * dense.SGBM["blockSize"] ** 2 == 1600

@@ -23,8 +23,8 @@ from barpc.tie.reference import (
     Accuracy,
     ReferenceControl,
     ViewMatch,
-    _affine,
     _ReferenceWork,
+    affine_of_shifts,
     peak,
     register_views,
 )
@@ -344,7 +344,7 @@ def shifts(agree: int, others: int):
 @pytest.mark.parametrize(("agree", "others"), [(200, 0), (60, 100), (12, 3)])
 def test_most_shifts_lie_about_one_affine(agree, others):
     local, shift, true = shifts(agree, others)
-    fitted, keep, both = _affine(local, shift, np.ones(len(local), dtype=bool), 2.0)
+    fitted, keep, both = affine_of_shifts(local, shift, np.ones(len(local), dtype=bool), 2.0)
     assert not keep[agree:].any()
     assert keep.sum() >= min(agree, max(12, 0.9 * agree))
     np.testing.assert_allclose(fitted[keep], true[keep], atol=0.15)
@@ -383,14 +383,14 @@ def test_fewer_than_twelve_that_agree_are_none():
     local, shift, _ = shifts(40, 0)
     for count in (11, 12):
         passed = np.arange(40) < count
-        assert (_affine(local, shift, passed, 2.0) is None) == (count < 12)
+        assert (affine_of_shifts(local, shift, passed, 2.0) is None) == (count < 12)
     local, shift, _ = shifts(11, 60)
-    assert _affine(local, shift, np.ones(len(local), dtype=bool), 2.0) is None
+    assert affine_of_shifts(local, shift, np.ones(len(local), dtype=bool), 2.0) is None
 
 
 def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
     local, _, true = shifts(50, 0)
-    fitted, keep, scatter = _affine(local, true, np.ones(50, dtype=bool), 2.0)
+    fitted, keep, scatter = affine_of_shifts(local, true, np.ones(50, dtype=bool), 2.0)
     assert keep.all()
     assert scatter == pytest.approx([1.4826 * 0.02 * 2.0] * 2)
     np.testing.assert_allclose(fitted, true, atol=1e-9)

@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from barpc.tie.patches import register
-from barpc.tie.patches.register import _Template, _upsampled, _with_derivatives, register_patches, register_places
+from barpc.tie.patches.register import _Template, _with_derivatives, register_patches, register_places, upsampled
 from barpc.tie.pixels import PixelReader
 from tests.constants import Sized
 from tests.lanes import diagonal
@@ -153,7 +153,7 @@ def test_images_that_hold_nothing_are_read_as_little_as_it_takes_to_know(tmp_pat
         write_image(path, np.zeros((SIZE, SIZE), np.uint16))
     kept = PixelReader.read
     monkeypatch.setattr(PixelReader, "read", lambda self, box: read.append(box) or kept(self, box))
-    monkeypatch.setattr(register, "_upsampled", None)  # would fail
+    monkeypatch.setattr(register, "upsampled", None)  # would fail
     xy = np.array([[50.0, 50.0], [SIZE - 50.0, SIZE - 60.0]])
     found = register_places(files, 1, xy, xy + 0.25, np.tile(np.eye(2), (2, 1, 1)), 21)
     assert not found.ok.any()
@@ -210,11 +210,11 @@ def test_no_patches_at_all_is_no_error(texture) -> None:
 @pytest.mark.parametrize(("period", "error"), [(3, 0.01), (4, 0.003), (5, 0.004), (8, 0.002)])
 def test_upsampling_keeps_the_pixels_and_a_wave_between_them(period: int, error: float) -> None:
     wave = np.tile(np.cos(2 * np.pi * np.arange(240.0) / period), (50, 1)).astype(np.float32)
-    fine = _upsampled(wave)
+    fine = upsampled(wave)
     np.testing.assert_allclose(fine[::4, ::4], wave, atol=1e-6)
     expected = np.cos(2 * np.pi * np.arange(960) / (4 * period))
     np.testing.assert_allclose(fine[80, 80:-80], expected[80:-80], atol=error)
-    np.testing.assert_allclose(_upsampled(wave.T.copy()), fine.T, atol=1e-6)
+    np.testing.assert_allclose(upsampled(wave.T.copy()), fine.T, atol=1e-6)
 
 
 def test_the_result_does_not_depend_on_opencv_threads(texture, reference) -> None:

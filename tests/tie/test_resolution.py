@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import barpc.tie.pixels as reading
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
@@ -129,8 +128,8 @@ def test_the_camera_of_a_look_is_that_of_the_coarser_image() -> None:
 # --- what is read -------------------------------------------------------------------------------------------
 
 
-def test_pixels_are_means_and_valid_where_all_that_they_hold_is(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(reading, "SPAN", 12)  # several parts
+def test_pixels_are_means_and_valid_where_all_that_they_hold_is(tmp_path, sized) -> None:
+    sized(pixels_together=12)  # several parts
     data = RNG.integers(1, 4000, (83, 62)).astype(np.uint16)  # a rest on both sides
     data[30:40, 20:30] = 9
     path = write_image(tmp_path / "a.tif", data, nodata=9)

@@ -27,10 +27,10 @@ from barpc.tie.matchers.matching import (
     match_pair,
 )
 from barpc.tie.matchers.structural import (
-    _adjacency,
-    _grid_points,
     _GridSearch,
-    _supported,
+    adjacency,
+    lattice_points,
+    supported,
 )
 from barpc.tie.pairing.epipolar import EpipolarSegments, epipolar_segments, robust_affine
 from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register_oriented, resolution
@@ -241,10 +241,10 @@ def test_pictures_are_as_coarse_as_the_coarser_image_by_a_power_of_two(side, pix
 
 
 def test_a_lattice_holds_the_multiples_of_its_pitch_in_a_box() -> None:
-    at = _grid_points((10, 20, 31, 11), 10)
+    at = lattice_points((10, 20, 31, 11), 10)
     assert at.tolist() == [[10, 20], [20, 20], [30, 20], [40, 20], [10, 30], [20, 30], [30, 30], [40, 30]]
-    assert _grid_points((11, 21, 9, 9), 10).tolist() == []
-    assert _grid_points((11, 21, 10, 10), 10).tolist() == [[20, 30]]
+    assert lattice_points((11, 21, 9, 9), 10).tolist() == []
+    assert lattice_points((11, 21, 10, 10), 10).tolist() == [[20, 30]]
 
 
 def level(half: float, width: float, height: float, probes: int | None = None, band: float = 3.0, least: int = 1):
@@ -325,12 +325,12 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
 def test_neighbours_speak_for_a_place_and_bend_a_little() -> None:
     """Three points in a row see one place, some pixels apart; the middle one another one better. One is far away."""
     at = np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [500.0, 0.0]])
-    near = _adjacency(at, 10.0)
+    near = adjacency(at, 10.0)
     assert near.tolist() == [[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 0], [0, 0, 0, 1]]
     seen = np.zeros((4, 9, 9), np.float32)
     seen[0, 4, 3] = seen[1, 4, 5] = seen[2, 4, 7] = seen[3, 1, 1] = 0.3
     seen[1, 8, 0] = 0.4
-    found = _supported(seen, near, 4.0)
+    found = supported(seen, near, 4.0)
     assert np.unravel_index(found[1].argmax(), (9, 9)) == (4, 5)
     assert found[1, 4, 5] == pytest.approx(0.3)
     assert found[1, 8, 0] == pytest.approx(0.4 / 5)

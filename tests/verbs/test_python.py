@@ -18,12 +18,13 @@ from click.testing import CliRunner
 from rasterio.io import MemoryFile
 
 import barpc
-from barpc.base.declarations import Options
+from barpc.base.declarations import Options, declared
 from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
+from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
 from barpc.verbs.images import camera_of, every
-from barpc.verbs.options import _tables, run_options
+from barpc.verbs.options import FLAG_NAMES, run_options
 from tests.rpcio.conftest import make_rpc
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
@@ -45,10 +46,12 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
     assert set(COMMANDS) - {"report"} <= set(PUBLIC)  # of a report AdjustResult.report, and files
     positional = {"images", "points", "numbers", "files", "run_dir", "places", "target"}
     printed = {"image_list", "options_file", "paper", "out", "output", "outlines", "help_all", "at"}
+    of_options = {name for table in (RunOptions, TieOptions, AdjustOptions, FitOptions) for name in declared(table)}
+    of_options |= set(FLAG_NAMES.values())
     for verb in set(COMMANDS) - {"report"}:
         command = cli.get_command(click.Context(cli), verb)
         assert command is not None
-        known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *_tables()}
+        known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *of_options}
         for flag in command.params:
             name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
             assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)

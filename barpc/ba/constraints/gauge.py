@@ -83,7 +83,7 @@ def gauge_report(
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
     radius = max(float(np.sqrt((local[:, :2] ** 2).sum(axis=1).mean())), 1e-6)
-    pick = _motion_of_points(local / radius) @ enu  # (10, n, 3) by ECEF moves
+    pick = motions_of_moves(local / radius) @ enu  # (10, n, 3) by ECEF moves
     by_unknown, own = _motion_by_unknowns(covariance.of_noise, pick, use, use.sum() / count)
     motions = by_unknown, own, _motion_by_shared(covariance, pick, np.flatnonzero(use))
     found = _assembled_report(covariance, enu @ shift, motions, radius)
@@ -114,7 +114,7 @@ def _assembled_report(
         moves = by_unknown @ covariance.shared.by_unknown + direct
         motion_covariance += moves @ moves.T
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
-    return GaugeReport(shift, sigma[:3], sigma, _modes(motion_covariance), radius, by_unknown, own)
+    return GaugeReport(shift, sigma[:3], sigma, weakest_modes(motion_covariance), radius, by_unknown, own)
 
 
 def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> Array | float:
@@ -144,8 +144,12 @@ def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, sha
     return by_camera, own
 
 
-def _motion_of_points(local: Array) -> Array:
-    """Return (10, n, 3): least-squares motions by the moves (east, north, up) of points at `local` (n, 3) radii."""
+def motions_of_moves(local: Array) -> Array:
+    """Return the matrix (10, n, 3) from moves of points, east, north and up, to the motions of the scene they make.
+
+    In least squares, `MOTIONS` in the unit of the moves; `local` (n, 3): where the points are, in radii of the scene
+    from its middle. What so few or so narrow points do not tell is 0.
+    """
     n = len(local)
     e, o, one, zero = local[:, 0], local[:, 1], np.ones(n), np.zeros(n)
     shifts = [[one, zero, zero], [zero, one, zero], [zero, zero, one]]
@@ -168,8 +172,11 @@ def _bending_modes(east: Array, north: Array) -> Array:
     return np.asarray(curved / np.maximum(np.ptp(curved, axis=1, keepdims=True), 1e-6))
 
 
-def _modes(motion_covariance: Array) -> tuple[Mode, ...]:
-    """Return the scene's motions by their covariance, the weakest first."""
+def weakest_modes(motion_covariance: Array) -> tuple[Mode, ...]:
+    """Return the motions of the scene, the weakest first, by their covariance (10, 10) [m^2].
+
+    With each the motions (10,) [m] that go along with one standard deviation of it; zeros with one that is held.
+    """
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     along = np.where(sigma > 0, motion_covariance, 0.0) / np.where(sigma > 0, sigma, 1.0)
     weakest = np.argsort(-sigma, kind="stable").tolist()

@@ -171,8 +171,8 @@ def register(surface: TieSurface, given: GivenHeights, radius: float, before: Ar
     the heights tell nothing, that stays open.
     """
     free = np.diag((TIMES * before) ** -2)
-    motion, noise = _converged_motion(surface, given, _search_shift(surface, given, before), radius, free)
-    found = _registration_result(surface, given, motion, radius, noise, free)
+    motion, noise = _converged_motion(surface, given, search_shift(surface, given, before), radius, free)
+    found = registration_at(surface, given, motion, radius, noise, free)
     wider = _jackknife(surface, given, found, radius, noise, free)
     return replace(found, covariance=wider[:, None] * found.covariance * wider)
 
@@ -266,8 +266,11 @@ class _SurfaceMisfit:
         return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
 
 
-def _search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Array:
-    """Return the shift (7,; tilts, turn and scale 0) on which the most heights agree, east and north within 4 sigma."""
+def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Array:
+    """Return the shift (7,) [m] on which the most heights agree, east and north within four of `before` (7,) [m].
+
+    Its tilts, turn and scale are 0; all is 0 where no height lies on the surface.
+    """
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
     first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
@@ -292,10 +295,14 @@ def _search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Ar
     return found
 
 
-def _registration_result(
+def registration_at(
     surface: TieSurface, given: GivenHeights, motion: Array, radius: float, noise: float, free: Array
 ) -> Registration:
-    """Return the covariance at the end, and which heights agree."""
+    """Return the registration at a motion (7,) [m]: its covariance, that of an M-estimate, and which heights agree.
+
+    `radius` [m] of the scene; `noise`: by how much the misfit exceeds what is stated; `free` (7, 7) [1/m^2]: the prior
+    information on the motion. LinAlgError where that is not positive definite.
+    """
     seen = _SurfaceMisfit.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), SURELY)
     agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)

@@ -245,7 +245,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
         smooth,
         found.gains,
         float(np.sqrt((STATED_FREEDOM * stated**2 + (left[fits] ** 2).sum()) / (STATED_FREEDOM + freedom))),
-        max(_summed(at[fits], pull * left[fits, None]), fits.sum() / relief.independent(index[fits])),
+        max(variance_inflation(at[fits], pull * left[fits, None]), fits.sum() / relief.independent(index[fits])),
         times,
         shows,
     )
@@ -277,7 +277,7 @@ def _compared(
     gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(BACKFITTING):
         rising = np.einsum("k,knx->nx", gains, slopes)
-        hills = fits.sum() / _summed(at[fits], rising[fits] - rising[fits].mean(axis=0))
+        hills = fits.sum() / variance_inflation(at[fits], rising[fits] - rising[fits].mean(axis=0))
         believes = believes and min(hills, independent) > _HILLS
         moved = smooth
         if believes:  # a shift, a turn, a growth
@@ -304,7 +304,7 @@ def _least_squares_fit(design: Array, values: Array) -> Array:
     return np.asarray(np.linalg.lstsq(design, values, rcond=1e-9)[0], dtype=np.float64)
 
 
-def _summed(at: Array, pull: Array) -> float:
+def variance_inflation(at: Array, pull: Array) -> float:
     """Return the number of points at places (n, 2) that count as one, by their pulls (n, 2) to the east and north.
 
     Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.

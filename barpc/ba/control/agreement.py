@@ -30,7 +30,7 @@ UNCONSTRAINED_SIGMA = (
 )
 _MAX_SET_POINTS = 50_000  # points of sets at a time: some 25 MB
 _SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
-_ODDS = float(-np.log(LEVEL))
+ODDS = float(-np.log(LEVEL))
 """Nats that it costs to call a point wrong, and each factor of e in accuracies or motions; and by which a set must
 beat any other that contradicts it: one in twenty."""
 
@@ -152,7 +152,7 @@ def _fits_as_stated(offsets: Offsets) -> bool:
     """Return whether all points are as near as nineteen times of twenty, and no better without one."""
     count = len(offsets.own)
     one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
-    score, _, squares = _log_evidence(offsets, one_less, 1.0)
+    score, _, squares = log_evidence(offsets, one_less, 1.0)
     freedom = 3.0 * (count - 1)  # a shift is free
     return bool(squares[0] < chdtri(freedom, LEVEL) and score[0] >= score.max())
 
@@ -186,7 +186,7 @@ class _SubsetSearch:
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
         if len(other):
             # how well as many points happen to fit is no vote
-            least = np.where(size[other] >= best.sum(), 2.0 * SURE, _ODDS)
+            least = np.where(size[other] >= best.sum(), 2.0 * SURE, ODDS)
             rival = np.where(self.score[other] > score - least, self.score[other], -np.inf)
             if np.isfinite(rival).any():
                 return np.asarray(self.masks[other[rival.argmax()]])
@@ -201,7 +201,7 @@ class _SubsetSearch:
             mask[rng.choice(places, 3, replace=False)] = True
             scale = (1.0, 3.0)[trial % 2]
             for _ in range(2):
-                squared = _log_evidence(self.offsets, mask[None], scale)[1][0]
+                squared = log_evidence(self.offsets, mask[None], scale)[1][0]
                 mask = among & (squared < CRITICAL**2)
             if mask.any():
                 yield mask
@@ -209,7 +209,7 @@ class _SubsetSearch:
     def _refine(self, n: int) -> None:
         """Move single points into or out of a set as long as that raises its evidence."""
         for _ in range(self.count):
-            squared = _log_evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
+            squared = log_evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
             doubtful = np.flatnonzero((squared > 0.5 * CRITICAL**2) & (squared < 2.0 * CRITICAL**2))
             before = self.score[n]
             self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
@@ -227,17 +227,21 @@ class _SubsetSearch:
         """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
         score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
         for motions, times in product(_SIGMA_FACTORS, _SIGMA_FACTORS):
-            found = _log_evidence(self.offsets.moving(motions), masks, times)[0] - _ODDS * np.log(times * motions)
+            found = log_evidence(self.offsets.moving(motions), masks, times)[0] - ODDS * np.log(times * motions)
             better = found > score
             score[better], scale[better] = found[better], times
         return score, scale
 
 
-def _log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Return the log evidence (B,) of sets (B, G), squared deviations of points (B, G), and of all in a set (B,)."""
+def log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
+    """Return the log evidence (B,) of sets of points (B, G), and their squared deviations (B, G) and (B,).
+
+    The deviations of every point from what each set tells of it, in variances of that, and the sum of squares of the
+    points in a set. Points agree to `scale` times their standard deviations; wrong ones lie anywhere.
+    """
     own, motions, variance = offsets.own, offsets.motions, scale**2
     if len(masks) > (room := max(_MAX_SET_POINTS // len(own), 1)):
-        parts = [_log_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
+        parts = [log_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
         score, squared, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
         return score, squared, squares
     chosen = masks.astype(np.float64)
@@ -257,4 +261,4 @@ def _log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Arr
     # an error of a wrong point is alike in its logarithm from one standard deviation on, to 10,000
     volume = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
     anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + volume + 0.5 * np.linalg.slogdet(spread)[1]
-    return inside - ((1.0 - chosen) * (anywhere + _ODDS)).sum(axis=1), squared, squares
+    return inside - ((1.0 - chosen) * (anywhere + ODDS)).sum(axis=1), squared, squares

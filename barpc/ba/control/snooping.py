@@ -132,15 +132,17 @@ def control_test(
         residual[g] = sigmas[g] * shown
         spread = np.sqrt(np.maximum(np.diag(left) / sigmas[g] ** 2, RIDGE))
         w[g] = (np.abs(offset[g] / sigmas[g]) / spread).max()
-    scatter, fits = _together(offset / sigmas, redundancy, used)
+    scatter, fits = global_test(offset / sigmas, redundancy, used)
     fits &= agreed.scale == 1.0
     return ControlTest(used, residual, w, redundancy, scatter * agreed.scale, fits, agreed)
 
 
-def _together(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
-    """Return the scatter of the points used (G, 3), and whether it may be chance.
+def global_test(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
+    """Return the scatter of the points used (G,), in standard deviations, and whether it may be chance.
 
-    The sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a chi-square.
+    `whitened` (G, 3): residuals over their standard deviations; `redundancy` (G,): the mean part of these that others
+    hold. Their sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a
+    chi-square. Of less than one degree of freedom NaN and True.
     """
     freedom = 3.0 * float(redundancy[used].sum())
     if freedom < 1.0:

@@ -86,7 +86,7 @@ class _Rows:
         for start, stop in pairwise([*starts.tolist(), len(gain)]):
             k = start + int(gain[start:stop].argmax())
             if _worth(gain[k]) > max(costs, 0.0 if best is None else best[1]):
-                period = self.bins * _BIN / (self.waves[k] + _vertex(gain, k) / _FREQUENCY_OVERSAMPLING)
+                period = self.bins * _BIN / (self.waves[k] + parabola_vertex(gain, k) / _FREQUENCY_OVERSAMPLING)
                 worth = _worth(gain[k] / self._level(k, period))
                 if worth > max(costs, 0.0 if best is None else best[1]):
                     best = float(period), worth
@@ -128,8 +128,11 @@ def _worth(gain: float) -> float:
     return float(gain - np.log1p(gain))
 
 
-def _vertex(gain: Array, k: int) -> float:
-    """Return the offset of the vertex of a parabola through a peak and its neighbours."""
+def parabola_vertex(gain: Array, k: int) -> float:
+    """Return the offset from k of the vertex of the parabola through values k - 1 to k + 1 of `gain` (n,), in steps.
+
+    Half a step at most; 0 at the ends, and where the values have no peak there.
+    """
     if not 0 < k < len(gain) - 1:
         return 0.0
     bend = gain[k - 1] - 2.0 * gain[k] + gain[k + 1]

@@ -75,7 +75,7 @@ def scan(
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
-        shares = _share_log_ratios(whole)
+        shares = share_log_ratios(whole)
         gains, displaced = _displacements(view, bin_, off, told, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # all of an image is no interval
@@ -161,7 +161,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
     return out - float(np.log(4 * views))
 
 
-def _share_log_ratios(bins: Array) -> Array:
+def share_log_ratios(bins: Array) -> Array:
     """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
 
     `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.
@@ -273,7 +273,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     near = np.hypot(*standard) <= limit
     if near.sum() < 2:
         return None
-    axes, spread = _axes(standard[:, near])
+    axes, spread = principal_axes(standard[:, near])
     along = axes.T @ standard
     chances, together = np.ones((2, len(count))), np.zeros((len(count), len(near)), dtype=bool)
     for place in np.flatnonzero((inside[:, ~near]).sum(axis=1) > np.maximum(share * count, 1)):
@@ -284,7 +284,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
         together[place] = alike & inside[place]
         found = int(together[place].sum())
         if found > share * count[place]:  # one of them is where the others are looked for
-            sure = _at_least(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
+            sure = hypergeometric_tail(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
             chances[0, place] = min(1.0, sure * int(of_place.sum()))
     of_near = (inside & near).astype(np.float64)
     here = of_near.sum(axis=1)
@@ -309,8 +309,11 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
 
 
-def _at_least(found: int, count: int, alike: int, whole: int) -> float:
-    """Return the hypergeometric probability of at least so many found among a count, of all that are alike."""
+def hypergeometric_tail(found: int, count: int, alike: int, whole: int) -> float:
+    """Return the probability of `found` or more alike among `count` that are drawn, where `alike` of `whole` are.
+
+    The tail of the hypergeometric distribution, by logarithms of factorials; 0 where so many cannot be drawn.
+    """
     k = np.arange(found, min(count, alike) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
@@ -319,8 +322,11 @@ def _at_least(found: int, count: int, alike: int, whole: int) -> float:
     return float(np.exp(ways(alike, k) + ways(whole - alike, count - k) - ways(whole, count)).sum())
 
 
-def _axes(standard: Array) -> tuple[Array, Array]:
-    """Return the axes along which residuals (2, K) scatter most and least, as columns, and their scatter."""
+def principal_axes(standard: Array) -> tuple[Array, Array]:
+    """Return the axes (2, 2) along which residuals (2, K) about their mean scatter most and least, as columns.
+
+    And their standard deviations (2,), in the unit of the residuals.
+    """
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
     return axes[:, ::-1], np.sqrt(np.maximum(variance[::-1], 0.0))

@@ -46,15 +46,19 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
         # Sarle's coefficient is 1/3 for a normal distribution, 5/9 for a uniform one: beyond the middle
         maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= MANY)):
-        share, apart, gain = _mixture(z[bounds[pair] : bounds[pair + 1]])
+        share, apart, gain = two_normals(z[bounds[pair] : bounds[pair + 1]])
         if share > LEVEL and gain > 3.0 * SURE:  # nats over one group: two are likelier by a factor of three million
             first, second = structure.pair_view[pair].tolist()
             found.append(TwoGroups((first, second), share, apart))
     return tuple(found)
 
 
-def _mixture(z: Array) -> tuple[float, float, float]:
-    """Return the smaller share, distance (0: not apart) and gain [nats] of two normals of one width over one."""
+def two_normals(z: Array) -> tuple[float, float, float]:
+    """Return the smaller share, distance and gain [nats] of two normal distributions of one width over one.
+
+    The likeliest ones of values z (n,), found by expectation and maximisation; the distance, in the unit of the values,
+    is 0 where the centres are less than two standard deviations apart, and all is 0 where one takes everything.
+    """
     z = z - z.mean()
     whole = float((z**2).mean())
     (low, high), square, part = np.quantile(z, [0.1, 0.9]), 0.25 * whole, 0.5

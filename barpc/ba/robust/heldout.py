@@ -66,13 +66,13 @@ def keep_out(block: Block) -> BoolArray:
     count = np.bincount(block.point, minlength=block.num_points)
     drawn = np.zeros(block.num_points, dtype=np.uint64)
     col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
-    np.add.at(drawn, block.point, _scrambled(col * np.uint64(0x9E3779B97F4A7C15) + row))
-    chosen = _scrambled(drawn) < np.uint64(_CHECK_SHARE * 2.0**64)
+    np.add.at(drawn, block.point, splitmix64(col * np.uint64(0x9E3779B97F4A7C15) + row))
+    chosen = splitmix64(drawn) < np.uint64(_CHECK_SHARE * 2.0**64)
     chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
     return chosen[block.point]
 
 
-def _scrambled(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+def splitmix64(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     """Return the numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
     numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -279,7 +279,7 @@ def _robust(
     s = observations.squared(residual, counted)
     for _ in range(ITERATIONS):
         least = float(np.sqrt(np.quantile(s[use], BEST) / BEST)) if use.any() else 1.0
-        noise = max(float(np.sqrt(_weighted_median(s, counted) / MEDIAN)), least, _MIN_NOISE_RATIO)
+        noise = max(float(np.sqrt(weighted_median(s, counted) / MEDIAN)), least, _MIN_NOISE_RATIO)
         if scale <= 3.6 * noise:
             break
         clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT
@@ -325,8 +325,8 @@ def retriangulate_rejected(
     return replace(state, points=points), residual
 
 
-def _weighted_median(values: Array, weights: Array) -> float:
-    """Return the median of `values`, each counted as often as its weight says."""
+def weighted_median(values: Array, weights: Array) -> float:
+    """Return the median of `values` (n,), each counted as often as its weight (n,) says; 1 where all weigh nothing."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     if not len(total) or not total[-1] > 0:

@@ -65,7 +65,7 @@ class PriorTest:
 
 
 @dataclass(frozen=True, eq=False)
-class _Around:
+class QuadraticProblem:
     """The problem near a minimum, quadratic: its cost, minimum and covariance under other priors."""
 
     problem: Problem
@@ -114,7 +114,7 @@ def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
 class _Posterior:
     """The information on every view under some priors: other priors of a view are an update of rank q."""
 
-    around: _Around
+    around: QuadraticProblem
     evidence: float  # logarithm, but for a constant
     offset: Array  # (N, q) unknowns minus their priors' means
     blocks: Array  # (N, q, q) covariance of every view's unknowns
@@ -225,7 +225,7 @@ class Variances:
         """Return the result of `learnt`, where the matrix can be factorised."""
         if self.learn_waves:
             self = self._going_on(problem.camera_prior.sigma)
-        around = _Around(problem, minimum)
+        around = QuadraticProblem(problem, minimum)
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
         scale, wide, odd = np.ones(len(params)), np.ones(1 + self._degrees), np.zeros(len(params), dtype=bool)
@@ -372,7 +372,7 @@ class Variances:
         total, freedom = (total / scale**2).sum() + squares / float(np.min(scale)) ** 2, freedom.sum() + free
         return freedom > _MIN_FREEDOM and float(chdtrc(freedom, total)) < LEVEL
 
-    def _widened(self, around: _Around, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
+    def _widened(self, around: QuadraticProblem, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """Return the factors (N,) by which each view's prior is widened, and the views that are odd.
 
         Explanations are compared where each is likeliest, and priors are then as wide as they may be.
@@ -416,7 +416,7 @@ class Variances:
         return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
 
     def _odd(
-        self, around: _Around, wide: Array, usual: Array, rival: float | None = None
+        self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
     ) -> tuple[Array, BoolArray, float]:
         """Find a few views whose cameras explain the corrections beside those of `usual` widened priors (N,), by
         forward selection: the factors, the views and the evidence for them.

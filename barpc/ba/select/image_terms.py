@@ -81,7 +81,7 @@ def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solut
     block = parts.inner
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
     best, misses = found, 0
-    for count in _spline_counts(block, options, found.has_waves):
+    for count in spline_counts(block, options, found.has_waves):
         if misses == _TWICE or not (best.has_waves or (asked and best is found)):
             break
         layout = _Layout(AdditionalParameters(count, _given_edges(block, options)))
@@ -155,8 +155,13 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
     return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
 
 
-def _spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
-    """Return the numbers of splines to try, the fewest first, as many as the observations of a view hold."""
+def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
+    """Return the numbers of splines of an image to try, the fewest first; empty: none.
+
+    Those of `options.jitter` (rows [px] between knots), or of `_SPACING` rows, halved where the residuals of the
+    cameras alone vary with rows (`has_waves`); 0 are steps alone. An image of `block` has `FEW` observations in use a
+    spline, by the median of the images, and all have `LARGEST` unknowns together.
+    """
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []

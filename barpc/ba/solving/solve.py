@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
 SCIPY_UNKNOWNS = (
-    200  # 22 views of nine: beyond, the dense products of `_WhitenedProblem` take over a tenth of an adjustment
+    200  # 22 views of nine: beyond, the dense products of `WhitenedProblem` take over a tenth of an adjustment
 )
 
 
@@ -94,7 +94,7 @@ def minimise(
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `_has_converged`). `solver` is "scipy", "sparse" or "auto"
+    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "scipy", "sparse" or "auto"
     (see the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
@@ -119,11 +119,12 @@ def minimise(
     return result
 
 
-def _has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
-    """Return whether a step that should gain `gain`, after one that should have gained `before`, is the last.
+def has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
+    """Return whether a step that should lower the cost by `gain`, after one by `before`, is the last.
 
-    The gains shrink at least in the proportion of the last two: what the step leaves is gain^2 / before. Without noise
-    the cost is rounding alone: the tolerance is a thousandth of a standard deviation at least.
+    `cost` is that before the step, `tolerance` the share of it that does not matter. The gains shrink at least in the
+    proportion of the last two: what the step leaves is gain^2 / before. Without noise the cost is rounding alone: the
+    tolerance is a thousandth of a standard deviation at least.
     """
     cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
@@ -171,7 +172,7 @@ def _levenberg_marquardt(
             damping = max(10.0 * damping, 1e-8)
             continue
         ahead = state.moved(step, reduced, max(state.cost - gain, 0.0))
-        if _has_converged(gain, before, state.cost, tolerance):
+        if has_converged(gain, before, state.cost, tolerance):
             status = _status(state, "the next step gains too little")
             return Minimum(ahead, reduced, None if damping else factor, status)
         residual, projected = problem.prepare(ahead.params, ahead.points)
@@ -200,7 +201,7 @@ def _status(state: State, reason: str) -> str:
     return f"sparse Levenberg-Marquardt, {len(state.history)} evaluations in all: {reason}"
 
 
-class _WhitenedProblem:
+class WhitenedProblem:
     """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
 
     In them the matrix is nearly the identity: the gradient's size is what a step would gain.
@@ -266,7 +267,7 @@ class _WhitenedProblem:
 def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
     from scipy.optimize import least_squares  # a twentieth of a second, which large blocks do not need
 
-    compressed = _WhitenedProblem(problem, state, weight, projected)
+    compressed = WhitenedProblem(problem, state, weight, projected)
     found = least_squares(
         compressed.residual,
         np.zeros(len(compressed.whitened)),

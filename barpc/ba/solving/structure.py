@@ -92,7 +92,7 @@ def _separator(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntA
     """Return two sides of the views and the fewest between them; None where every cut leaves a side empty."""
     own = graph[views][:, views]
     at = place[views]
-    order, cut = min((_best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]
+    order, cut = min((best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]
     if not cut:
         return None
     near, far = np.sort(order[:cut]), np.sort(order[cut:])
@@ -121,7 +121,7 @@ def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
     yield breadth_first_order(graph, last, return_predecessors=False).astype(np.int64)
 
 
-def _best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
+def best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
     """Return an order, how many of it stand before its best cut (0: there is none), and its cost.
 
     A cut that s views touch from one side, and that leaves a and b, costs s / (a b): few views, and balanced sides.

@@ -109,7 +109,7 @@ class _GridSearch:
         step *= self._least
         area = float((boxes[:, 2] * boxes[:, 3]).sum())
         self.pitch = step * max(HALF // 2, int((area / count) ** 0.5 / step))
-        return step, np.concatenate([_grid_points(box, self.pitch) for box in windows])
+        return step, np.concatenate([lattice_points(box, self.pitch) for box in windows])
 
     def matches(self) -> Matches:
         """Return the best place of every point on whole bands, refined in finer pictures."""
@@ -165,9 +165,9 @@ class _GridSearch:
         tile = PatchTile.of(sampling, at, centers, reach, HALF)
         surface = tile.surfaces()
         if self._whole:
-            surface = _supported(surface, _adjacency(at, _RING * self.pitch), _SAY)
+            surface = supported(surface, adjacency(at, _RING * self.pitch), _SAY)
         elif asked.probes:  # neighbours are moved alike
-            near = _adjacency(at, self.pitch)
+            near = adjacency(at, self.pitch)
             surface = np.tensordot(near, surface, axes=1) / near.sum(axis=1)[:, None, None]
         off = tile.offsets() @ axes.T  # along, across
         part = (tile.left @ tile.matrix.T @ axes.T)[:, None, None]
@@ -196,12 +196,12 @@ class _GridSearch:
         return (0.5 * (first + last), 0.5 * (last - first)) if first <= last else (0.0, 0.0)
 
 
-def _adjacency(at: Array, reach: float) -> FloatImage:
+def adjacency(at: Array, reach: float) -> FloatImage:
     """Return the matrix (n, n) of points (n, 2) within reach [px] of each other along both axes: 1, else 0."""
     return np.asarray(np.abs(at[:, None] - at[None]).max(axis=2) <= reach, np.float32)
 
 
-def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
+def supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage:
     """Return correlations (n, y, x) averaged with neighbours' (n, n) best about the same place, of weight `loud`."""
     others = near - np.eye(len(near), dtype=np.float32)
     kernel = np.ones((2 * DUPLICATE_DISTANCE + 1,) * 2, np.uint8)
@@ -210,8 +210,8 @@ def _supported(surface: FloatImage, near: FloatImage, loud: float) -> FloatImage
     return np.asarray((surface + np.tensordot(share * others, about, axes=1)) / np.float32(1.0 + loud))
 
 
-def _grid_points(box: Box, pitch: int) -> Array:
-    """Return the points (n, 2) in a box whose coordinates are multiples of the pitch."""
+def lattice_points(box: Box, pitch: int) -> Array:
+    """Return the points (n, 2) [px], col and row, in a box (col, row, width, height) at multiples of the pitch [px]."""
     axes = [
         np.arange(-(-first // pitch) * pitch, first + length, pitch)
         for first, length in zip(box[:2], box[2:], strict=True)

@@ -22,7 +22,7 @@ ALLOWANCE = 4.0
 """Pixels of a coarser picture that a surface may lie beyond what that shows."""
 WINDOW = 7
 """Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
-_SGBM = {
+SGBM = {
     "blockSize": 5,
     "P1": 16 * 5**2,  # twice OpenCV's own, as disparities are twice as fine: 0.62 m, of its own 0.71 m
     "P2": 64 * 5**2,
@@ -33,7 +33,7 @@ _SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_NOISE_VARIANCE, _SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise of variance 1 and of its slope
+NOISE_VARIANCE, SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise of variance 1 and of its slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ def dense_matches(
         disparity, good = _about_coarse(left, right, *about)
     seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
     good &= seen
-    disparity, sigma = _refined_disparity(left, right, disparity, good)
+    disparity, sigma = refined_disparity(left, right, disparity, good)
     # a match a pixel: the mean of those about it that differ by less than a pixel or so, which is one surface
     single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::COLUMNS_PER_PIXEL], np.float32)
     level = cv2.bilateralFilter(single, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
@@ -253,7 +253,7 @@ def _both_ways(
     """Match both ways: `num` disparities of `left` from the first on, kept where the way back from `right` ends at most
     a pixel beside.
     """
-    matcher = cv2.StereoSGBM.create(minDisparity=first, numDisparities=num, **_SGBM)
+    matcher = cv2.StereoSGBM.create(minDisparity=first, numDisparities=num, **SGBM)
     there = matcher.compute(left, right).astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
     back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
@@ -263,7 +263,7 @@ def _both_ways(
     return there, good
 
 
-def _refined_disparity(
+def refined_disparity(
     left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
 ) -> tuple[FloatImage, FloatImage]:
     """Refine SGBM's disparities [columns] by a step of least squares matching; return also sigmas [px].
@@ -293,8 +293,8 @@ def _refined_disparity(
     shift = (a_s - ab * bs / bb) / told
     pixels, hat = WINDOW**2 * total, 2 / 12  # variance of two roundings: of grey values, of what SGBM says [columns^2]
     left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
-    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / _NOISE_VARIANCE, hat)  # 3: the unknowns
-    variance = noise / pixels / np.maximum(told - noise * _SLOPE_VARIANCE / 4, 0.1 * told)
+    noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / NOISE_VARIANCE, hat)  # 3: the unknowns
+    variance = noise / pixels / np.maximum(told - noise * SLOPE_VARIANCE / 4, 0.1 * told)
     found = start - shift * hat / (hat + variance)
     kept = np.clip(found, disparity - 1.0, disparity + 1.0)
     return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / COLUMNS_PER_PIXEL, np.float32)

@@ -181,7 +181,7 @@ def register_patches(
     best = PatchRegistration.none(start)
     if not all(mask.any() for mask in valid):
         return best
-    fine, pictures = _upsampled(images[1]), _with_derivatives(images[0])
+    fine, pictures = upsampled(images[1]), _with_derivatives(images[0])
     smaller = int(_INNER * patch) | 1
     for side in (patch, smaller):
         template = _Template(pictures, images[0].shape[1], side)
@@ -204,8 +204,8 @@ def _at(mask: BoolArray, xy: Array) -> BoolArray:
     return np.asarray(inside & mask[row.clip(0, mask.shape[0] - 1), col.clip(0, mask.shape[1] - 1)])
 
 
-def _upsampled(image: FloatImage) -> FloatImage:
-    """Upsample by a windowed sinc; the sample `_SUBPIXEL_SAMPLES` (row, col) is the pixel (row, col).
+def upsampled(image: FloatImage) -> FloatImage:
+    """Upsample an image (H, W) by a windowed sinc to (4 H, 4 W): the sample (4 row, 4 col) is the pixel (row, col).
 
     Between these a linear sample moves no phase; OpenCV's bicubic one would, by up to a twentieth of the step.
     """
