@@ -205,6 +205,18 @@ def test_few_points_or_none_that_tell_believe_nothing() -> None:
     assert judged(lambda lon, lat: np.full(len(lon), np.nan), ground) is None
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_hills_that_are_seen_on_one_side_only_are_hills(side: float) -> None:
+    """What all slopes have in common tells no less of the others: as seen from where the sun was, or the camera."""
+    ground = points(3000)
+    lon, lat, _ = ground.T
+    rises = HILLS(lon + 5.0 / UNIT[0], lat) - HILLS(lon - 5.0 / UNIT[0], lat)
+    seen = ground[side * rises > 0.0]
+    assert 1000 < len(seen) < 2000
+    np.testing.assert_allclose(sure(judged(sum_of(HILLS), seen)).gains[:3], 1.0, atol=0.1)
+    np.testing.assert_allclose(sure(judged(sum_of(HILLS), ground)).gains[:3], 1.0, atol=0.1)
+
+
 def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     ground = points(200)
     tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
