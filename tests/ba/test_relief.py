@@ -397,3 +397,16 @@ def test_values_within_five_standard_deviations_of_the_median_are_the_middle_one
     """Of values whose median lies at 2 and whose median distance from it is 1: 1.4826 is a standard deviation."""
     values = 2.0 + np.array([-1.0, -1.0, 0.0, 1.0, 1.0, -7.4, 7.5, 1.0, -1.0])
     assert _middling(values).tolist() == [True] * 6 + [False] + [True] * 2
+
+
+@pytest.mark.parametrize("part", [(0.0, 1.0), (0.0, 0.4), (0.6, 1.0)])
+def test_bends_are_counted_from_the_middle_of_the_points_to_their_edges(part: tuple[float, float]) -> None:
+    """Wherever the DEM begins and the points lie on it: what is said of bends is said of sizes at the scene's edges."""
+    ground = points(2000)
+    x = (ground[:, 0] - LON) * UNIT[0] / SIDE + 0.5
+    ground = ground[(x >= part[0]) & (x <= part[1])]
+    level, east, north = sure(judged(sum_of(HILLS), ground)).bends[:, :3].T
+    at = (ground[:, :2] - ground[:, :2].mean(axis=0)) * UNIT
+    half = np.abs(at).max()
+    np.testing.assert_array_equal(level, 1.0)
+    np.testing.assert_allclose(np.column_stack([east, north]), at / half, atol=0.02)
