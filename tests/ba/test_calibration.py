@@ -173,6 +173,7 @@ def test_blocks_of_other_widths_and_too_few_are_refused() -> None:
         learn([made, made])
     with pytest.raises(InputError, match="of 2 widths"):
         learn([made, made, replace(made, width=50)])
+    assert learn([made] * 3).curve.width == SIZE[0]  # three are enough
 
 
 def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:

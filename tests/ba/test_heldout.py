@@ -321,3 +321,23 @@ def test_known_points_are_where_they_project_and_where_rays_meet() -> None:
     assert (control.names, checks.names) == (("a", "c"), ("b",))
     with pytest.raises(InputError, match="named x, y"):
         split_points(points, ["b", "y", "x"])
+
+
+def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made) -> None:
+    """Residuals and stated deviations twenty times as large scatter as much: degrees of freedom have no unit."""
+    block = block_of(made)
+    problem = make_problem(block, OPTIONS, centers_of(made), None)
+    exact = np.array(
+        [np.r_[c.rotation * d, c.translation]
+         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
+    )  # fmt: skip
+    true = np.full((2, len(block.view)), np.nan)
+    for v, (view, correction) in enumerate(zip(made.views, made.truth.corrections, strict=True)):
+        rows = block.view == v
+        true[:, rows] = Corrected(view.sensor, correction).project(made.truth.ground[block.point[rows]]).T
+    found = [
+        measure(problem, exact, replace(block, xy=true + times * (block.xy - true), sigma=times * block.sigma))
+        for times in (1.0, 20.0)
+    ]
+    np.testing.assert_allclose(found[1].noise, found[0].noise, rtol=1e-3)
+    np.testing.assert_allclose(found[1].rms, 20.0 * found[0].rms, rtol=1e-3)

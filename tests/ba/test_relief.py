@@ -205,6 +205,18 @@ def test_few_points_or_none_that_tell_believe_nothing() -> None:
     assert judged(lambda lon, lat: np.full(len(lon), np.nan), ground) is None
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_hills_that_are_seen_on_one_side_only_are_hills(side: float) -> None:
+    """What all slopes have in common tells no less of the others: as seen from where the sun was, or the camera."""
+    ground = points(3000)
+    lon, lat, _ = ground.T
+    rises = HILLS(lon + 5.0 / UNIT[0], lat) - HILLS(lon - 5.0 / UNIT[0], lat)
+    seen = ground[side * rises > 0.0]
+    assert 1000 < len(seen) < 2000
+    np.testing.assert_allclose(sure(judged(sum_of(HILLS), seen)).gains[:3], 1.0, atol=0.1)
+    np.testing.assert_allclose(sure(judged(sum_of(HILLS), ground)).gains[:3], 1.0, atol=0.1)
+
+
 def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     ground = points(200)
     tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
@@ -385,3 +397,16 @@ def test_values_within_five_standard_deviations_of_the_median_are_the_middle_one
     """Of values whose median lies at 2 and whose median distance from it is 1: 1.4826 is a standard deviation."""
     values = 2.0 + np.array([-1.0, -1.0, 0.0, 1.0, 1.0, -7.4, 7.5, 1.0, -1.0])
     assert _middling(values).tolist() == [True] * 6 + [False] + [True] * 2
+
+
+@pytest.mark.parametrize("part", [(0.0, 1.0), (0.0, 0.4), (0.6, 1.0)])
+def test_bends_are_counted_from_the_middle_of_the_points_to_their_edges(part: tuple[float, float]) -> None:
+    """Wherever the DEM begins and the points lie on it: what is said of bends is said of sizes at the scene's edges."""
+    ground = points(2000)
+    x = (ground[:, 0] - LON) * UNIT[0] / SIDE + 0.5
+    ground = ground[(x >= part[0]) & (x <= part[1])]
+    level, east, north = sure(judged(sum_of(HILLS), ground)).bends[:, :3].T
+    at = (ground[:, :2] - ground[:, :2].mean(axis=0)) * UNIT
+    half = np.abs(at).max()
+    np.testing.assert_array_equal(level, 1.0)
+    np.testing.assert_allclose(np.column_stack([east, north]), at / half, atol=0.02)

@@ -304,6 +304,7 @@ def passes(
     )
     outcome = made.run()
     assert outcome.noise == noise[min(outcome.passes, len(noise) - 1)]
+    np.testing.assert_array_equal(outcome.told, outcome.inlier / (outcome.noise if options.estimate_noise else 1.0))
     return outcome.passes, again
 
 

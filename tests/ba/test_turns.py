@@ -71,7 +71,7 @@ def test_turns_that_ties_see_say_nothing_of_the_place(turn: float, alike: bool, 
         assert one.left < max(1.5 * plain.left, 0.1)
         np.testing.assert_allclose(one.found.gauge.sigma, plain.found.gauge.sigma, rtol=0.3)
         nees.append(one.nees)
-        turned.append(one.found.prior.turned * PRIOR / np.abs(turn) / one.found.cameras.unknowns.distance.mean())
+        turned.append(one.found.prior.wide[-1] * PRIOR / np.abs(turn) / one.found.cameras.unknowns.distance.mean())
     assert 0.15 < np.mean(nees) < 3.0
     assert alike or 0.2 < np.mean(turned) < 2.0  # as large as they are: but a move along the line is none
 

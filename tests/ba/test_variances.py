@@ -118,7 +118,7 @@ def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four(
     expected = np.sqrt([(4 + 18) / (4 + 6), (4 + 4) / (4 + 6), 1.0])
     np.testing.assert_allclose(tested.wide[:3], expected)
     np.testing.assert_allclose(prior.sigma[:, 6:12], [np.repeat(expected[1:], 3)] * 2)
-    assert tested.turned == 1.0
+    assert tested.wide[-1] == 1.0
 
 
 def test_a_drift_grows_thirtyfold_at_most_from_one_linearisation_to_the_next() -> None:
@@ -127,7 +127,7 @@ def test_a_drift_grows_thirtyfold_at_most_from_one_linearisation_to_the_next() -
     params, known = v.given.mean.copy(), np.ones((2, 6))
     params[:, 3] += 1e6
     first = learnt(v, params, known)[1]
-    assert (first.wide[0], first.turned) == (30.0, 1.0)
+    assert (first.wide[0], first.wide[-1]) == (30.0, 1.0)
     assert learnt(v, params, known, first)[1].wide[0] == 900.0
 
 
@@ -521,7 +521,7 @@ def test_where_waves_are_followed_a_drift_is_as_large_as_it_shows() -> None:
     params, known = np.zeros((2, 6)), np.ones((2, 6))
     params[0, 3] = 30.0
     tested = learnt(v, params, known)[1]
-    np.testing.assert_allclose([tested.wide[0], tested.turned], np.sqrt([(4 + 225) / (4 + 6), 1.0]))
+    np.testing.assert_allclose([tested.wide[0], tested.wide[-1]], np.sqrt([(4 + 225) / (4 + 6), 1.0]))
 
 
 @pytest.fixture(scope="module")

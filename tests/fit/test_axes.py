@@ -137,8 +137,10 @@ def test_points_that_are_a_grid_are_told_as_a_model_is(name: str) -> None:
     assert EXCHANGED in wrong_axes_of_grid(ground[:, [1, 0, 2]], image)
     assert NEGATIVE in wrong_axes_of_grid(ground * [1, 1, -1], image)
     assert wrong_axes_of_grid(ground[1:, [1, 0, 2]], image[1:]) == ""  # a node is missing
-    few = np.isin(image[:, 0], axes[0][:4])
-    assert wrong_axes_of_grid(ground[few][:, [1, 0, 2]], image[few]) == ""
+    for axis in (0, 1):  # five nodes along a line tell, four do not
+        for count, told in ((4, False), (5, True)):
+            few = np.isin(image[:, axis], axes[axis][:count])
+            assert (EXCHANGED in wrong_axes_of_grid(ground[few][:, [1, 0, 2]], image[few])) == told
     level = ground[:, 2] == alts[0]
     assert wrong_axes_of_grid(ground[level][:, [1, 0, 2]], image[level]) == ""
     ground[:] = ground[0]  # of no use, and no error

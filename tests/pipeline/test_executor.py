@@ -423,3 +423,14 @@ def test_of_a_function_whose_time_is_not_known_one_task_goes_ahead(tmp_path) -> 
         for n in range(40):
             caching.submit(square, n)
         assert [len(args[1]) for _, args in pool.batches] == [1] * len(pool.batches)
+
+
+def test_of_tasks_that_wait_behind_others_one_goes_ahead_while_their_time_is_not_known(tmp_path) -> None:
+    pool = Later()
+    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}, pool) as caching:
+        for n in range(66):  # six are in flight
+            caching.submit(square if n < 6 else refuse, n + 5)
+        assert [fn for _, (fn, *_) in pool.batches] == [square] * 6
+        pool.finish(0, lambda fn, tasks: [(0.001, fn(*task), None) for task in tasks])
+        assert [(fn, len(tasks)) for _, (fn, tasks, _) in pool.batches[5:]] == [(refuse, 1)]
+        caching.shutdown()

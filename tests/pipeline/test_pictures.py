@@ -74,10 +74,11 @@ def test_an_image_without_contrast_has_no_thumbnail_and_one_of_noise_fits_its_by
         assert cv2.imdecode(np.frombuffer(made, np.uint8), 0) is not None
 
 
-def test_rows_of_tiles_are_epipolar_lines_and_what_the_cameras_miss_is_across_them():
+@pytest.mark.parametrize("order", [1, -1])
+def test_rows_of_tiles_are_epipolar_lines_and_what_the_cameras_miss_is_across_them(order):
     """Rays, not the code of tiles: ground points along a line of sight at other heights stand on the middle row."""
     block = simulate_block(2, 40, seed=3)
-    a, b = (view.sensor for view in block.views)
+    a, b = (view.sensor for view in block.views[::order])
     here = np.array([[300.0, 400.0], [1200.0, 900.0], [2000.0, 1500.0]])
     alt = np.full(3, float(np.mean(block.views[0].alt_range)))
     there = b.project(np.column_stack([a.localize(here, alt)[:, :2], alt]))

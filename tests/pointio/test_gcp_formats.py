@@ -66,12 +66,22 @@ SAME = {
                   f"Accuracy_(m),Error_(m)\np,left,{LON},{LAT},{ALT},{COL + 0.5},{ROW + 0.5},,0.3\n# Total Error\n"),
     "micmac": ("g.xml", micmac()),
     "old geojson": ("g.geojson", old_geojson([EAST, NORTH], col=COL, row=ROW)),
+    "geojson in words": ("g.geojson", old_geojson([1.0, 2.0], lon="005d24'00\"E", lat="43 18 00 N", col=str(COL),
+                         row=f" {ROW} ").replace("EPSG::32631", "OGC:1.3:CRS84")),
     "asp": ("g.gcp", f"p {LAT} {LON} {ALT} 1 1 1 left.tif {COL} {ROW} 0.5 0.5\n"),
     "csv dms": ("g.csv", "Lat;Lon;Alt [ft];photo;pixel x;pixel y\n43°18'00.0\"N;005° 24' 00\"E;"
                 f"{ALT / 0.3048:.9f};C:\\flight\\LEFT.JPG;263,25;889,75\n"),
 }  # fmt: skip
 """The same point in the syntax of each tool, its pixels counted as that tool does."""
-NO_ALTITUDE = ("qgis new", "qgis old", "odm proj", "envi degrees", "envi image first", "old geojson")
+NO_ALTITUDE = (
+    "qgis new",
+    "qgis old",
+    "odm proj",
+    "envi degrees",
+    "envi image first",
+    "old geojson",
+    "geojson in words",
+)
 
 
 @pytest.mark.parametrize("name", SAME)
@@ -420,6 +430,13 @@ def test_without_a_library_a_layer_says_what_to_install(tmp_path, monkeypatch, h
         ("g.csv", "lon,lat,h,image,col,row\n5;6,43,1,left,1,2\n", "line 2: expected"),
         ("g.dat", "what is this\n", r"in no format that is read \(.*QGIS \.points"),
         ("g.csv", "lon,lat,h,image,col,row\n5°24'N,43,1,left,1,2\n", "line 2: .*is no lon"),
+        ("g.geojson", old_geojson([5, 43], col="1°30'E", row=2), "'col' of a point: .* is no number"),
+        ("g.geojson", old_geojson([5, 43], col=1, row="2 30"), "'row' of a point: .* is no number"),
+        ("g.geojson", old_geojson([5, 43, "high"], col=1, row=2), "'alt' of a point: 'high' is no number"),
+        ("g.geojson", old_geojson(["5°24'N", 43], col=1, row=2), "'lon' of a point: .*is no lon"),
+        ("g.geojson", old_geojson([5, True], col=1, row=2), "'lat' of a point: 'True' is no number"),
+        ("g.geojson", old_geojson([5, None], col=1, row=2), "'lat' of a point: 'None' is no number"),
+        ("g.geojson", old_geojson([5, 43], col=None, row=2), "'col' of a point: 'None' is no number"),
     ],
 )
 def test_a_message_names_the_place_and_no_python(tmp_path, file, text, says) -> None:

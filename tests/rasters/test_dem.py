@@ -12,7 +12,7 @@ import rasterio
 
 from barpc.base.errors import BarpcWarning, InputError
 from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
-from barpc.rasters.vertical import Vertical, geoid_file
+from barpc.rasters.vertical import Vertical, geoid_file, vertical_of
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import altitude_range
 from tests.sensor.conftest import make_rpc
@@ -335,3 +335,29 @@ def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, si
     sized(cells_read=19)
     with pytest.raises(InputError, match="spread over 20 cells"):
         dem(lon, lat)
+
+
+@pytest.mark.parametrize("turn", [0.0, 360.0, -360.0])
+@pytest.mark.parametrize("end", [5.2, 4.9])
+def test_a_line_passes_the_posts_between_its_ends_however_longitudes_are_counted(tmp_path, end, turn):
+    """From 5.05 E, on the DEM, to the east and to beyond its western edge: not once around the Earth."""
+    dem = Dem.open(write_dem(tmp_path / "a.tif", 4979))
+    start, stop = np.array([[5.05, 43.9, 0.0]]), np.array([[end + turn, 43.93, 0.0]])
+    for one, other in ((start, stop), (stop, start)):
+        posts, lowest, highest = dem.between(one, other)
+        assert posts == pytest.approx(abs(end - 5.05) / STEP, abs=1e-6)
+        assert lowest <= 100 + 10 * min(5, 100 * (end - 5)) + 7 or end < 5.0
+        assert highest >= 100 + 10 * 5 + 7
+
+
+@pytest.mark.parametrize(
+    ("vertical", "metres", "unit"),
+    [(5714, 1.0, ""), (5715, -1.0, ""), (6357, -1.0, ""), (6358, -1200 / 3937, "US survey foot"),
+     (8051, -0.3048, "foot"), (8228, 0.3048, "foot")],
+)  # fmt: skip
+def test_the_unit_of_a_system_of_heights_counts_where_no_band_says_one(vertical, metres, unit):
+    """Of what has no unit of a band, as a GeoTIFF of GDAL's always has; depths go down."""
+    wkt = pyproj.CRS(f"EPSG:4326+{vertical}").to_wkt()
+    found = vertical_of(wkt)
+    assert (found.metres, found.unit) == (pytest.approx(metres, rel=1e-12), unit)
+    assert vertical_of(wkt, "cm").metres == np.copysign(0.01, metres)

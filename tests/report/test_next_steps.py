@@ -321,3 +321,18 @@ def test_the_page_shows_the_steps_before_its_questions_and_links_to_parts_that_i
 def test_the_file_holds_the_steps_and_gives_them_back(triplet):
     summary, _ = triplet.adjusted()
     assert Summary.read(json_form(summary)).next == summary.next
+
+
+@pytest.mark.parametrize("apart", [0.05, 0.15, 0.25])
+def test_a_third_line_of_sight_tells_of_the_height_what_least_squares_say(apart):
+    """Of points seen along lines of slopes t: places on the ground are x + t h, of one accuracy each."""
+    pair, _ = Case(2, per_site=2, attitude=3e-6).adjusted()
+    far = 2.0 * np.tan(np.radians(10.0))
+    slopes = np.array([[-apart / 2.0, 0.0], [apart / 2.0, 0.0], [0.0, np.sqrt(far**2 - apart**2 / 4.0)]])
+    sigma = []
+    for count in (2, 3):
+        rows = np.vstack([np.column_stack([np.eye(2), slope]) for slope in slopes[:count]])
+        sigma.append(np.sqrt(np.linalg.inv(rows.T @ rows)[2, 2]))
+    as_narrow = replace(pair, pairs=(replace(pair.pairs[0], base_to_height=apart),))
+    (found,) = [one for step in next_steps(as_narrow) for one in step.expected if one.source == "image"]
+    assert found.sigma_enu_m[2] / pair.scene.sigma_enu_m[2] == pytest.approx(sigma[1] / sigma[0], rel=1e-6)

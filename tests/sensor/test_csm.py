@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Geod
 from scipy.interpolate import BarycentricInterpolator
 from scipy.spatial.transform import Rotation
 
@@ -315,7 +316,9 @@ def test_a_corrected_camera_is_written_as_a_state_that_the_library_reads_as_mean
     state = json.loads(text[text.index("{") :])
     assert state["m_centerEphemerisTime"] == state["m_detectorLineOrigin"] == 0.0  # times count from the first row's
     assert offset(state, ground, image) < 1e-3  # m: pixels of 7
-    assert state["m_halfSwath"] == pytest.approx(state["m_gsd"] * SIZE[0] / 2.0, rel=0.1)
+    sides = moved.localize(np.array([[0.0, 0.0], [1.0, 0.0], [SIZE[0] - 1.0, 0.0]]), np.full(3, 500.0)).T
+    wide, far = Geod(ellps="WGS84").inv(*np.repeat(sides[:2, :1], 2, axis=1), *sides[:2, 1:])[2] * (1 + 500.0 / 6.37e6)
+    assert (state["m_gsd"], state["m_halfSwath"]) == pytest.approx((wide, far / 2.0), rel=1e-4)
     off = np.abs(model.project(ground) - image).max()
     assert off > 0.5  # the correction is seen
 

@@ -231,6 +231,21 @@ def test_grey_values_do_not_compare_where_under_half_of_the_matches_register_and
     assert _unlike(linked, registered, [(0, 2)]) == []  # no match of it is left to look at
 
 
+def test_of_a_pair_with_tracks_of_its_own_those_of_a_third_view_vouch_for_nothing() -> None:
+    """Of 60 tracks that only two see ten register, and all of 60 that a third sees as well."""
+    own, shared = given_matches(60), given_matches(60)
+    shared = replace(shared, xy=shared.xy + 0.5, index=shared.index - 1000)
+    linked = link([(0, 1), (0, 1), (1, 2)], [own, shared, shared])
+    of_two = np.bincount(linked.point)[linked.point] == 2
+    assert of_two.sum() == 120
+    assert (~of_two).sum() == 180
+    registered = linked.select(~of_two | (linked.point < np.unique(linked.point[of_two])[10]))
+    assert _unlike(linked, registered, [(0, 1)]) == [(0, 1)]
+    third = linked.select(~of_two)  # without tracks of its own they are what there is
+    assert _unlike(third, third, [(0, 1), (1, 2)]) == []
+    assert _unlike(third, third.select(third.point < third.point.max() // 4), [(0, 1)]) == [(0, 1)]
+
+
 def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered(caplog) -> None:
     two, given = views(camera(0.0), camera(0.0)), {(0, 1): given_matches(40)}
     places = given[0, 1].xy[:20]

@@ -167,6 +167,20 @@ def test_a_grid_beside_a_raster_or_of_no_place_shows_nothing(tmp_path, first) ->
     assert not valid.any()
 
 
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(("first", "shown"), [(-39.0, 39), (SIZE[0] - 1.0, 0)])
+def test_a_grid_that_only_reaches_the_outermost_pixels_shows_these(tmp_path, first, shown, turned) -> None:
+    """By its last column the raster's first, or by its first the raster's last; and rows alike."""
+    path = str(write_image(tmp_path / "a.tif", RAMP.T if turned else RAMP))
+    nodes = grid((first, 20.0), 1.0, (30, 40))
+    nodes, size = (nodes.swapaxes(0, 1)[..., ::-1], SIZE[::-1]) if turned else (nodes, SIZE)
+    found, valid = picture(path, (1,), size, nodes, (40, 30) if turned else (30, 40))
+    found, valid = (found.T, valid.T) if turned else (found, valid)
+    np.testing.assert_array_equal(np.flatnonzero(valid.all(axis=0)), [shown])
+    assert not np.delete(valid, shown, axis=1).any()
+    np.testing.assert_allclose(found[:, shown], RAMP[20:50, 0 if shown else SIZE[0] - 1], atol=1.0)
+
+
 def test_what_is_coarser_than_the_raster_is_averaged(tmp_path) -> None:
     """Noise of every pixel alone: of 16 of them a quarter is left, and a blur for what a whole factor leaves."""
     noise = np.random.default_rng(0).normal(2000, 200, (400, 400)).clip(1).astype(np.uint16)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import rasterio
 
 from barpc.base.errors import ImageError
 from barpc.tie.pixels import Stretch, grow, levelled, read_pixels, sample_stretch
@@ -179,3 +180,18 @@ def test_a_window_of_one_value_is_level() -> None:
         pixels = np.full((8, 8), value)
         for valid in (np.ones((8, 8), bool), np.eye(8, dtype=bool), np.zeros((8, 8), bool)):
             np.testing.assert_array_equal(levelled(pixels, valid), np.zeros((8, 8), np.float32))
+
+
+def test_a_stretch_of_jpeg_2000_is_that_of_its_overviews(tmp_path) -> None:
+    """Where decoding is dear: noise of pixels is between a quarter, as averages of 16 leave, and a half of it."""
+    noise = np.random.default_rng(0).normal(1000, 100, (700, 900)).astype(np.uint16)
+    found, place = {}, {"crs": "EPSG:32631", "transform": rasterio.Affine(2, 0, 5e5, 0, -2, 5e6)}
+    for driver, given in (("GTiff", {}), ("JP2OpenJPEG", {"REVERSIBLE": "YES", "QUALITY": "100", "BLOCKXSIZE": 256})):
+        path = tmp_path / driver
+        with rasterio.open(path, "w", driver, 900, 700, 1, dtype="uint16", **place, **given) as file:
+            file.write(noise, 1)
+        stretch = sample_stretch(path)
+        assert stretch is not None
+        found[driver] = (stretch.high - stretch.low) / 515.2  # 0.5 to 99.5 % of a normal distribution
+    assert found["GTiff"] == pytest.approx(1.0, abs=0.03)
+    assert 0.24 < found["JP2OpenJPEG"] < 0.5

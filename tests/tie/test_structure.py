@@ -276,7 +276,7 @@ def test_the_cameras_error_is_looked_for_in_pictures_as_coarse_as_the_search_is_
     assert pitch == step * int((3000 * 3000 / 200) ** 0.5 / step)
 
 
-@pytest.mark.parametrize(("half", "step"), [(20.0, 2), (200.0, 4)])
+@pytest.mark.parametrize(("half", "step"), [(20.0, 2), (129.0, 2), (131.0, 4), (200.0, 4)])
 def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step) -> None:
     """Half of the length; a window that B does not see says nothing."""
 
@@ -286,9 +286,11 @@ def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step
         return EpipolarSegments(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
 
     view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
-    for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2)):
+    for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2), ([], 1)):
         search = _GridSearch(view, view, 1, Prediction(where, 3.0, lambda windows=windows: windows))
         assert search._step == found
+        assert bool(len(search._points)) == bool(windows)
+    assert not len(search.matches().xy)  # without a window nothing is searched
 
 
 @pytest.mark.parametrize(("side", "step"), [(480, 8), (479, 4), (240, 4), (239, 2), (100, 2), (20, 2)])

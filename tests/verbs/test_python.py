@@ -331,6 +331,14 @@ def test_jobs_are_processes_a_cluster_or_the_executor_given(monkeypatch):
             barpc.check(VIEWS, jobs=jobs)
 
 
+def test_a_verb_works_in_the_process_that_calls_it_unless_told_otherwise():
+    """Processes of its own need a script behind `if __name__ == "__main__":`."""
+    defaults = {name: inspect.signature(public(name)).parameters.get("jobs") for name in COMMANDS if name in PUBLIC}
+    found = {name: parameter.default for name, parameter in defaults.items() if parameter is not None}
+    assert set(found) >= {"adjust", "match", "check", "dsm"}
+    assert set(found.values()) == {1}
+
+
 @pytest.mark.slow
 def test_two_processes_write_what_one_does(tmp_path):
     for jobs in (1, 2):

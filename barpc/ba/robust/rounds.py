@@ -162,7 +162,6 @@ class Rounds:
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use, redundancy)
             if found.covariance(self.problem.free).is_large:
                 tested = self.variances.learnt(self.problem, found, self.learnt, exact=True)[1]
-            noise = self.noise if self.options.estimate_noise else 1.0
             return Outcome(
                 **vars(found),
                 problem=self.problem,
@@ -171,7 +170,7 @@ class Rounds:
                 inlier=self.use,
                 noise=self.noise,
                 passes=self.passes,
-                told=self.observations.told_by(self.use / (self.observations.sigma * noise)),
+                told=self.observations.told_by(self.use / (self.observations.sigma * self._weighting_noise)),
                 prior=tested,
                 smooth=smooth,
                 by_point=self._by_points().by_point.copy(),  # the next projection overwrites it
@@ -179,10 +178,14 @@ class Rounds:
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
 
+    @property
+    def _weighting_noise(self) -> float:
+        """The noise by which observations are weighted."""
+        return self.noise if self.options.estimate_noise else 1.0
+
     def _weights_stand(self) -> bool:
         """Return whether the noise and the misfit of this solution would weigh observations as they were for it."""
-        noise = self.noise if self.options.estimate_noise else 1.0
-        next_weight = self.observations.weight(self.use, noise, self.misfit)[self.use]
+        next_weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)[self.use]
         return bool((np.abs(self.weight[self.use] / next_weight - 1.0) < STANDS).all())
 
     def _cut(self) -> None:
@@ -197,8 +200,7 @@ class Rounds:
         """Return the least squares of the observations in use; the second pass, which always comes, is exact."""
         again = self.passes > 1 or self.goes_on
         tolerance = TOLERANCE if again or not self.robust else STANDS
-        noise = self.noise if self.options.estimate_noise else 1.0
-        self.weight = weight = self.observations.weight(self.use, noise, self.misfit)
+        self.weight = weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)
         if self.earlier is not None and self.again is not None:
             given = replace(self.problem, joint_prior=self.earlier)
             known = weight * self.observations.tied(self.use & self.again)

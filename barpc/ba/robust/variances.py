@@ -58,11 +58,6 @@ class PriorTest:
     # by how much those of the drift's degrees, and of turns about the lines of sight, were widened
     wide: tuple[float, ...] = (1.0,)
 
-    @property
-    def turned(self) -> float:
-        """By how much the standard deviations of turns about the lines of sight were widened."""
-        return self.wide[-1]
-
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProblem:
