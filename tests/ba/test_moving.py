@@ -21,7 +21,7 @@ from barpc.ba.solving.solve import State
 from barpc.ba.terms import MovingObjects, moving_ground
 from barpc.ba.terms.moving_ground import GROUND_CELLS, GroundMotion, group_of, members
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
-from barpc.base.statistics import LEVEL
+from barpc.base.statistics import LEVEL, SAMPLE
 from barpc.scene import BoolArray, GroundPoints, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
@@ -179,6 +179,24 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
     if cut:
         assert inside[0] == 1.0
+
+
+@pytest.mark.parametrize(("metres", "shown"), [(0.0, False), (0.1, False), (0.6, True), (2.0, True)])
+@pytest.mark.parametrize("tracks", [300, 2400])
+def test_moving_ground_is_looked_for_where_a_region_shows_it(tracks: int, metres: float, shown: bool) -> None:
+    """By a sample of the tracks, too, which chance moves."""
+    made, ties, _ = drifting(3, tracks, 0.3, metres)
+    block, problem, state = started(made, ties)
+    linear, nothing = linearise(problem, state, block.use, block.sigma, 800.0), np.zeros((2, 0, len(block.view)))
+    assert (linear.thinned(SAMPLE) is linear) == (tracks == 300)
+    seen: Any = SimpleNamespace(
+        linear=linear,
+        ground=GroundMotion.of(problem, state),
+        base=fit_mixture(linear),
+        extra=nothing,
+        sigma=np.zeros(0),
+    )
+    assert MovingObjects.shows(seen) == shown
 
 
 def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:

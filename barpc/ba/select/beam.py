@@ -267,7 +267,8 @@ class TermSearch:
         out = out or ([] if self.taken else self.first)
         made = self._with([], self._worth_more(list(proposed(seen, out, periods))))
         made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
-        if (out or self.group or not self.taken) and not self._leaves_nothing(made):
+        moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
+        if moves and not self._leaves_nothing(made):
             made = self._sorted([row[:2] for row in (*made, *self._moving())])
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)

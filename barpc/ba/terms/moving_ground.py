@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import gammainccinv
 
 from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, linearise
@@ -21,7 +22,7 @@ from barpc.ba.robust.heldout import seen_in
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import LEVEL, SAMPLE, TIMES
+from barpc.base.statistics import LEVEL, SAMPLE, SURE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 GROUND_CELLS = 6  # a side of the ground: the group's share is free in each
@@ -100,12 +101,30 @@ class MovingGroup:
     fit: MixtureFit
 
 
+def shows(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> bool:
+    """Return whether a region of the ground may move: whether its score, by a sample of tracks, may pay for a group.
+
+    Chance leaves the best of R regions half of what a chi-square of as many degrees as unknowns exceeds once in R.
+    """
+    few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
+    if not few.tracks:
+        return False
+    chance = float(gammainccinv(0.5 * len(group.sigma), 1.0 / len(_REGIONS)))
+    all_of, some = (sum(tracks.rows.size for tracks in one.tracks) for one in (linear, few))
+    gain = _region_gains(few, group, base, extra, sigma).max() - chance
+    return bool(gain * all_of / some > price_of_group(linear, group.cell) + SURE)
+
+
+def _any_group(linear: Linear, ground: GroundMotion) -> Group:
+    """Return a group that any track may be of, with its unknowns' prior."""
+    by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
+    return Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
+
+
 def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
     """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
-    few = linear.thinned(SAMPLE)
-    by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
-    group = Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
-    rows = few.taking_part
+    few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
+    cell, rows = group.cell, few.taking_part
     if not rows.any():
         return None
     starts = [replace(group, share=share) for share in _first_shares(linear, group, base, extra, sigma)]

@@ -23,6 +23,12 @@ class MovingObjects(Term):
         "{between[1]} apart from an effect of height, and were excluded{control}{larger}"
     )
 
+    @staticmethod
+    def shows(residuals: Residuals) -> bool:
+        """Return whether a region of the ground may move."""
+        seen = residuals
+        return moving_ground.shows(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
+
     @classmethod
     def of(cls, residuals: Residuals) -> list[Self]:
         """Return the most likely group."""
