@@ -237,7 +237,8 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
         fails.append(True)
         far = float((residual(start + (step if nearer else 1e3)) ** 2).sum())
         fails.clear()
-        assert far == problem.reduce(*tried[-1]).cost > 1e3 * float((residual(start) ** 2).sum())
+        assert far == pytest.approx(problem.reduce(*tried[-1]).cost, rel=1e-12)  # processors sum in orders of their own
+        assert far > 1e3 * float((residual(start) ** 2).sum())
         return least_squares(residual, start, jacobian, **given)
 
     tried, reduce, least_squares = [], type(problem).reduce, scipy.optimize.least_squares
