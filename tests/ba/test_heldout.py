@@ -22,12 +22,13 @@ from barpc.ba.robust.heldout import (
     split_points,
     splitmix64,
 )
+from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate
-from barpc.simulate import simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen
 from tests.distributions import gamma
@@ -118,14 +119,17 @@ def test_a_track_with_an_observation_that_is_not_used_is_never_drawn(made) -> No
     assert (again == out)[block.point != block.point[one]].all()
 
 
+def true_unknowns(made: SimulatedBlock, problem: Problem) -> np.ndarray:
+    """The cameras' unknowns (N, 6) by the truth."""
+    each = zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)
+    return np.array([np.r_[c.rotation * d, c.translation] for c, d in each])
+
+
 def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
     """With the truth's cameras: white noise of 0.1 px a coordinate."""
     block = block_of(made)
     problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = np.array(
-        [np.r_[c.rotation * d, c.translation]
-         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
-    )  # fmt: skip
+    exact = true_unknowns(made, problem)
     found = measure(problem, exact, block)
     assert found.noise.mean() == pytest.approx(1.0, abs=0.12)  # medians, of two views' tracks and of more
     assert (np.abs(found.noise - 1.0) < 0.3).all()
@@ -327,10 +331,7 @@ def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made) -> None:
     """Residuals and stated deviations twenty times as large scatter as much: degrees of freedom have no unit."""
     block = block_of(made)
     problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = np.array(
-        [np.r_[c.rotation * d, c.translation]
-         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
-    )  # fmt: skip
+    exact = true_unknowns(made, problem)
     true = np.full((2, len(block.view)), np.nan)
     for v, (view, correction) in enumerate(zip(made.views, made.truth.corrections, strict=True)):
         rows = block.view == v

@@ -309,6 +309,9 @@ def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_
     # as many more as the other has and two, none gaining more than the last
     for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):
         assert combined(("step", 0, 30.0)).may_pass(combined(*[("step", 0, gain) for gain in best])) == may
+    # as many more as six terms are, none gaining more than the best: 30 + 20 + 4 x 30
+    for noise, may in ((169.0, True), (170.0, False)):
+        assert combined(("step", 0, 30.0), ("step", 0, 20.0)).may_exceed(noise) == may
     best, other = combined(("sinusoid", 1, 60.0)), combined(("decay", 0, 30.0))
     for beside, adds in ((30.0 - SURE + 0.1, True), (30.0 - SURE, False)):  # beside the best: no other way
         assert other.adds_to(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
