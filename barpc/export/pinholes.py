@@ -16,9 +16,9 @@ from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
 from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
-from barpc.sensor.curve import rotation_left_jacobian, rotation_matrix
 
-_DISTANCE_FACTORS = 1.0, 2.0, 3.0  # an image that is affine along its flight is best seen from farther away than it was
+_DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
+_STEPS = 100  # at most
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
 
@@ -37,79 +37,76 @@ class Pinhole:
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
 
 
-def fit_pinhole(samples: Sampled, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """Return the nearest pinhole camera without skew.
+def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pinhole:
+    """Return the pinhole camera without skew that shows the points nearest to their image points, in least squares.
+
+    A camera (a.X + a4, b.X + b4) / (c.X + 1) has no skew where (a x c).(b x c) = 0. From the direct linear
+    transformation (Abdel-Aziz and Karara 1971), Gauss-Newton steps that hold this constraint in its linear form
+    (sequential quadratic programming: Nocedal and Wright 2006, 18.1) end after some ten: the image points are nearly
+    linear in the eleven unknowns.
 
     Parameters
     ----------
-    at, pixel : (3,), (2,), a point in the middle of the scene [m] and where the image shows it [px]
-    rows : (2, 3), derivative of the image point there [px/m]
-    sight : (3,), unit vector to the sensor there
-    far : float, distance of the sensor [m]
+    sight : (3,), unit vector to the sensor
+    far : float, optional, the distance along it that the camera shall have [m]; else the best one, which may be
+        behind the ground, as an image says little of its distance
     """
-    starts = [_start(sign, at, pixel, rows, sight, times * far) for times in _DISTANCE_FACTORS for sign in (1.0, -1.0)]
-    found = [_least_squares_pinhole(start, samples) for start in starts]
-    return min(found, key=lambda pinhole: samples.error(pinhole.project(samples.world)))
+    span, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
+    world, image = samples.world / span, samples.image - middle
+    unknowns = np.linalg.lstsq(_derivative(world, image, np.ones(len(world))), image.ravel(), rcond=None)[0]
+    for _ in range(_STEPS):
+        depth = world @ unknowns[8:] + 1.0
+        seen = (world @ unknowns[:8].reshape(2, 4)[:, :3].T + unknowns[[3, 7]]) / depth[:, None]
+        slope = _derivative(world, seen, depth)
+        size = np.linalg.norm(slope, axis=0)
+        skew, normal = _skew(unknowns)
+        gaps, normals = np.array([skew]), normal[None]
+        if far is not None:
+            gaps = np.append(gaps, unknowns[8:] @ sight + span / far)
+            normals = np.vstack([normals, np.append(np.zeros(8), sight)])
+        normals /= size
+        steep = np.linalg.norm(normals, axis=1)
+        if not (np.isfinite(slope).all() and steep.all()):  # parallel rays, or points beside the camera
+            break
+        left, values, axes = np.linalg.svd(normals / steep[:, None])
+        held, free = axes[: len(gaps)], axes[len(gaps) :]
+        step = -(left.T @ (gaps / steep) / values) @ held
+        missed = (image - seen).ravel() - slope @ (step / size)
+        step += np.linalg.lstsq(slope / size @ free.T, missed, rcond=None)[0] @ free
+        unknowns = unknowns + step / size
+        if np.linalg.norm(step) < 1e-12 * np.linalg.norm(unknowns * size):
+            break
+    return _of_unknowns(unknowns, span, middle)
 
 
-def _start(sign: float, at: Array, pixel: Array, rows: Array, sight: Array, far: float) -> Pinhole:
-    """Return the pinhole of a derivative: axes that are not perpendicular are seen far from the principal point."""
-    length = np.linalg.norm(rows, axis=1)
-    axes = rows / length[:, None]
-    mirrored = 1.0 if np.cross(axes[0], axes[1]) @ sight < 0 else -1.0
-    axes[1] *= mirrored
-    skew = float(axes[0] @ axes[1])
-    a = sign * np.sqrt(abs(skew) / (1.0 - abs(skew)))
-    ray = np.array([a, np.copysign(a, a * skew) if skew else 0.0, 1.0])  # to the point, in the camera
-    size = np.linalg.norm(ray)
-    tilted = np.array([[1.0, 0.0, -ray[0]], [0.0, 1.0, -ray[1]], ray / size])
-    long = np.linalg.norm(tilted[:2], axis=1)
-    left, _, right = np.linalg.svd(np.linalg.solve(tilted, np.vstack([axes * long[:, None], -sight])))
-    rotation, depth = left @ right, far / size
-    focal = length * depth / long * [1.0, mirrored]
-    return Pinhole(focal, pixel - focal * ray[:2], rotation, -rotation @ (at + far * sight))
+def _derivative(world: Array, seen: Array, depth: Array) -> Array:
+    """Return the derivative (2 N, 11) of the image points `seen` by the unknowns a, a4, b, b4, c."""
+    out = np.zeros((len(world), 2, 11))
+    out[:, 0, :4] = out[:, 1, 4:8] = np.column_stack([world, np.ones(len(world))]) / depth[:, None]
+    out[:, :, 8:] = -seen[:, :, None] * (world / depth[:, None])[:, None]
+    return out.reshape(-1, 11)
 
 
-def _least_squares_pinhole(start: Pinhole, samples: Sampled) -> Pinhole:
-    """Return the least squares solution: Levenberg-Marquardt on turn, move, logarithms of focal lengths, centre."""
-    from scipy.optimize import least_squares  # a tenth of a second, of pinholes alone
-
-    def left(step: Array) -> Array:
-        return (_stepped(start, step).project(samples.world) - samples.image).ravel()
-
-    def slope(step: Array) -> Array:
-        jacobian = _jacobian(_stepped(start, step), samples.world)
-        jacobian[:, :3] = jacobian[:, :3] @ rotation_left_jacobian(step[:3])
-        return jacobian
-
-    found = least_squares(left, np.zeros(10), slope, method="lm", x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
-    return _stepped(start, found.x)
+def _skew(unknowns: Array) -> tuple[float, Array]:
+    """Return (a x c).(b x c), which is zero without skew, and its derivative (11,)."""
+    a, b, c = unknowns[:3], unknowns[4:7], unknowns[8:]
+    normal = np.zeros(11)
+    normal[:3], normal[4:7] = b * (c @ c) - c * (b @ c), a * (c @ c) - c * (a @ c)
+    normal[8:] = 2.0 * (a @ b) * c - a * (b @ c) - b * (a @ c)
+    return float((a @ b) * (c @ c) - (a @ c) * (b @ c)), normal
 
 
-def _jacobian(pinhole: Pinhole, world: Array) -> Array:
-    """Return the derivative (2 N, 10) of the projections by a further small turn and the other unknowns."""
-    turned = world @ pinhole.rotation.T
-    x, y, depth = (turned + pinhole.translation).T
-    out = np.zeros((len(world), 2, 10))
-    for axis, over in enumerate((x, y)):
-        by_point = np.zeros((len(world), 3))
-        by_point[:, axis], by_point[:, 2] = 1.0 / depth, -over / depth**2
-        by_point *= pinhole.focal[axis]
-        out[:, axis, :3] = np.cross(turned, by_point)  # of a small turn w: w x (R X)
-        out[:, axis, 3:6] = by_point
-        out[:, axis, 6 + axis] = over / depth * pinhole.focal[axis]
-        out[:, axis, 8 + axis] = 1.0
-    return out.reshape(-1, 10)
-
-
-def _stepped(pinhole: Pinhole, step: Array) -> Pinhole:
-    turn = rotation_matrix(step[:3])
-    return Pinhole(
-        pinhole.focal * np.exp(step[6:8]),
-        pinhole.center + step[8:],
-        turn @ pinhole.rotation,
-        pinhole.translation + step[3:6],
-    )
+def _of_unknowns(unknowns: Array, span: float, middle: Array) -> Pinhole:
+    """Return the camera of the unknowns, of places in `span` metres and image points from `middle`."""
+    rows = unknowns[:8].reshape(2, 4)
+    far = 1.0 / np.linalg.norm(unknowns[8:])
+    forward = far * unknowns[8:]
+    center = far * rows[:, :3] @ forward
+    across = far * rows[:, :3] - np.outer(center, forward)
+    right = across[0] / np.linalg.norm(across[0])
+    rotation = np.array([right, np.cross(forward, right), forward])
+    focal = (across * rotation[:2]).sum(axis=1)
+    return Pinhole(focal, center + middle, rotation, np.append((rows[:, 3] - center) / focal, 1.0) * far * span)
 
 
 # --- the model ----------------------------------------------------------------------------------------------
@@ -117,12 +114,14 @@ def _stepped(pinhole: Pinhole, step: Array) -> Pinhole:
 
 def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
     """Return the nearest pinhole of a shot, and its largest error over the scene [px]."""
-    pinhole = fit_pinhole(scene.samples(shot), **scene.view_of(shot))
-    checked = scene.samples(shot, checked=True)
-    error = checked.error(pinhole.project(checked.world))
-    if not (np.isfinite(error) and (pinhole.focal > 0).all()):
+    samples, checked = scene.samples(shot), scene.samples(shot, checked=True)
+    sight, far = scene.sight_of(shot)
+    found = [fit_pinhole(samples, sight, times and times * far) for times in _DISTANCE_FACTORS]
+    shown = [(checked.error(one.project(checked.world)), n) for n, one in enumerate(found) if (one.focal > 0).all()]
+    error, best = min(shown, default=(np.inf, 0))
+    if not np.isfinite(error):
         raise InputError(f"{shot.name}: shows the ground mirrored, or no pinhole camera comes near its RPC")
-    return pinhole, error
+    return found[best], error
 
 
 def colmap(scene: Scene, out: Path) -> Files:

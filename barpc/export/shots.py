@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
 from barpc.report.compare import written_rpc
@@ -23,7 +23,7 @@ from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.sources import Sunlight, light_of
 from barpc.scene import IntArray
-from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, sight_enu
+from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid
 from barpc.sensor.rpc import RPC
 from barpc.workspace import Homes
 
@@ -116,22 +116,12 @@ class Scene:
             raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
         return Sampled(self.world(ground[known]), image[known])
 
-    def view_of(self, shot: Shot) -> dict[str, Any]:
-        """Return the approximate view of a shot's ground middle, where `approx.fit_pinhole` starts."""
-        pixel = (np.array(shot.size) - 1.0) / 2
-        ground = shot.rpc.localize(pixel, np.array(self.origin[2]))
-        local = enu_basis(ground) @ enu_basis(self.origin).T  # of the world's axes there
-        derivative = shot.rpc.project_jacobian(ground)[1] / metres_per_unit(ground)
-        stand = camera_center(shot.rpc, shot.size, self.alt_range).ecef
-        far = float(np.linalg.norm(stand - ecef_from_ground(ground)))
-        sight = sight_enu(shot.rpc, ground) @ local
-        return {
-            "at": self.world(ground),
-            "pixel": pixel,
-            "rows": derivative @ local,
-            "sight": sight,
-            "far": far,
-        }
+    def sight_of(self, shot: Shot) -> tuple[Array, float]:
+        """Return the unit vector (3,) in the world from a shot's ground middle to its sensor, and the distance [m]."""
+        ground = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(self.origin[2]))
+        away = camera_center(shot.rpc, shot.size, self.alt_range).ecef - ecef_from_ground(ground)
+        far = float(np.linalg.norm(away))
+        return enu_basis(self.origin) @ away / far, far
 
     def file_names(self, out: Path) -> list[str]:
         """Return the images' names for files in `out`: file names where all lie in one folder, else relative paths."""

@@ -96,21 +96,17 @@ def test_the_world_is_metres_east_north_up(south):
     assert matrix[3].tolist() == [0, 0, 0, 1]
 
 
-def test_a_view_is_what_a_pinhole_starts_from(south):
+def test_the_sight_of_a_shot_leads_from_its_middle_to_its_sensor(south):
     shot = south.shots[1]
-    view = south.view_of(shot)
-    assert view["pixel"].tolist() == [449.5, 349.5]
-    ground = shot.rpc.localize(view["pixel"], np.array(south.origin[2]))
-    assert view["at"] == pytest.approx(south.world(ground[None])[0])
+    sight, far = south.sight_of(shot)
+    ground = shot.rpc.localize(np.array([449.5, 349.5]), np.array(south.origin[2]))
     center = camera_center(shot.rpc, shot.size, south.alt_range).ecef
-    assert view["far"] == pytest.approx(np.linalg.norm(center - ecef_from_ground(ground)))
-    degree, steps = metres_per_unit(ground), np.eye(3) * 0.5
-    local = enu_basis(ground) @ enu_basis(south.origin).T
-    for axis, step in enumerate(steps @ local.T):  # half a metre along the axes of the world
-        both = [shot.rpc.project(ground + sign * step / degree) for sign in (1.0, -1.0)]
-        assert view["rows"][:, axis] == pytest.approx(both[0] - both[1], abs=1e-5)
-    away = enu_basis(south.origin) @ (center - ecef_from_ground(ground))
-    assert view["sight"] == pytest.approx(away / np.linalg.norm(away), abs=2e-2)
+    place = south.world(ground[None])[0] + far * sight
+    assert south.world_to_ecef @ np.append(place, 1.0) == pytest.approx(np.append(center, 1.0), abs=1e-6)
+    assert far == pytest.approx(np.linalg.norm(center - ecef_from_ground(ground)))
+    upper = shot.rpc.localize(np.array([449.5, 349.5]), np.array(south.origin[2] + 100.0))
+    along = south.world(upper[None])[0] - south.world(ground[None])[0]
+    assert sight == pytest.approx(along / np.linalg.norm(along), abs=2e-2)
 
 
 def test_samples_lie_on_a_grid_over_image_and_altitudes(south):
