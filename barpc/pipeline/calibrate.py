@@ -32,7 +32,7 @@ from barpc.rpcio.sources import sensor_of
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
-from barpc.sensor.timing import is_clocked
+from barpc.sensor.timing import Clocked
 
 if TYPE_CHECKING:
     from barpc.tie.tasks import Progress
@@ -312,7 +312,7 @@ def common_errors(run: Run) -> CommonErrors:
     found = []
     for view, source in zip(run.views, run.sources, strict=True):
         used = run.calibrated.get(view.name)
-        if used is None and not is_clocked(view.sensor):
+        if used is None and not isinstance(view.sensor, Clocked):
             used = Calibration.prior(_stated(view, source), view.size[0])
         found.append(used)
     return CommonErrors(tuple(found))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -35,11 +35,6 @@ LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
-
-
-def is_radar(sensor: object) -> TypeGuard[Clocked]:
-    """Return whether a model knows where its beam comes from: asking the protocol itself costs 70 us a view."""
-    return hasattr(sensor, "to_radar")
 
 
 def altitude_range(rpc: RPC) -> tuple[float, float]:
@@ -132,7 +127,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
     """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
-    if is_radar(sensor):
+    if isinstance(sensor, Clocked):
         return np.asarray((enu_basis(ground) @ sensor.to_radar(ground)[..., None])[..., 0])
     return sight_enu(sensor, ground)
 
@@ -280,7 +275,7 @@ def camera_centers(
     how: Literal["line", "projective"] = "line",
 ) -> list[CameraCenter]:
     """Estimate the centres of cameras: `camera_center` of each, in one go."""
-    number = [i for i, sensor in enumerate(sensors) if not is_radar(sensor)]
+    number = [i for i, sensor in enumerate(sensors) if not isinstance(sensor, Clocked)]
     ecef = np.full((len(sensors), 3), np.nan)
     if how == "line":
         some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
@@ -292,7 +287,7 @@ def camera_centers(
     found = []
     for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
         low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
-        if is_radar(sensor):
+        if isinstance(sensor, Clocked):
             found.append(_center_stated(sensor, size, alt_range))
         elif low <= altitude[i] <= high:
             found.append(CameraCenter(ecef[i], altitude[i], how))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Self, TypeGuard
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -17,7 +17,7 @@ from numpy.polynomial import polynomial
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, Array, ground_from_ecef, pointwise, up, wrap_longitude
-from barpc.sensor import Behind, Pointwise, SensorModel
+from barpc.sensor import Behind, Pointwise
 from barpc.sensor.curve import Curve, cross
 
 
@@ -170,11 +170,6 @@ class Clocked(Pointwise, ABC):
         """Longitude of the image's middle [deg]."""
         lon = float(super().localize(0.5 * np.array(self.size), np.array(np.mean(self.alt_range)))[0])
         return lon if np.isfinite(lon) else 0.0
-
-
-def is_clocked(sensor: SensorModel) -> TypeGuard[Clocked]:
-    """Return whether a model is a radar whose clocks can be corrected: 70 us faster than by the protocol."""
-    return hasattr(sensor, "timed")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import is_clocked
+from barpc.sensor.timing import Clocked
 
 DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
 DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
@@ -170,7 +170,7 @@ def _stated_accuracy(view: View) -> tuple[float, float]:
     clocks [m].
     """
     sensor = view.sensor
-    if (isinstance(sensor, Pushbroom) or is_clocked(sensor)) and sensor.accuracy is not None:
+    if isinstance(sensor, Pushbroom | Clocked) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy
         return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
     return (stated_accuracy(view),) * 2
@@ -195,7 +195,7 @@ def prior_sigmas(
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         return np.full((count, size), IMAGE_MODEL_SIGMA)
-    radars = [is_clocked(view.sensor) for view in views]
+    radars = [isinstance(view.sensor, Clocked) for view in views]
     parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
     parts += [np.full((count, 3), DRIFT_SIGMA)] * drift
     parts.append(np.full((count, waves), FIRST_SIGMA))

@@ -21,7 +21,7 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_centers
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.rpc import localize_stack
-from barpc.sensor.timing import Clocked, Timed, Timing, is_clocked
+from barpc.sensor.timing import Clocked, Timed, Timing
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models: which of the terms 1, col, row each coordinate's correction has."""
@@ -232,6 +232,6 @@ def make_unknowns(
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
     sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
-    radars = {i: sensor for i, sensor in sensors if is_clocked(sensor)}
+    radars = {i: sensor for i, sensor in sensors if isinstance(sensor, Clocked)}
     half = size.T / 2.0
     return Unknowns(model, drift, centers, distance, half - 0.5, half, place, waves, radars, direction)
