@@ -44,7 +44,7 @@ Move = Callable[[Curve], Curve]
 
 @dataclass(frozen=True)
 class Opaque:
-    """A camera of which nothing is known but its three methods and where it stands."""
+    """A camera of which nothing is known but its three methods."""
 
     model: Clocked
 
@@ -56,9 +56,6 @@ class Opaque:
 
     def localize(self, image: Array, alt: Array) -> Array:
         return self.model.localize(image, alt)
-
-    def to_radar(self, ground: Array) -> Array:
-        return self.model.to_radar(ground)
 
 
 def moved(off: tuple[float, ...], rate: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Move:

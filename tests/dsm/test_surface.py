@@ -22,12 +22,13 @@ from barpc.dsm.surface import _delivered, draped, show_in_report
 from barpc.pipeline import load_views
 from barpc.report.runfiles import run_key
 from barpc.rpcio import read_rpc
-from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
+from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.workspace import Workspace, own_files
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow
 from tests.scenes import Scene
 from tests.scenes.files import _write_image
+from tests.sensor.s1_product import Product
 
 OPTIONS = DsmOptions(alt=ALTS)
 
@@ -263,11 +264,7 @@ def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp
     monkeypatch.undo()
     views = load_views(rendered.paths[:2]).views
 
-    class Seen(ImageCorrected):
-        def to_radar(self, ground):
-            return ground
-
-    radar = replace(views[0], sensor=Seen(views[0].sensor, ImageAffine(np.zeros(2), np.zeros((2, 2)))))
+    radar = replace(views[0], sensor=RangeDoppler.from_annotation(read_annotation(Product().xml(), name="slc")))
     with pytest.raises(NoSurfaceError, match="view_00: a radar image"):
         stereo.block_of_images([radar, views[1]])
     assert not list(tmp_path.iterdir())
