@@ -255,6 +255,7 @@ class Mosaic:
         self.dtypes = tuple(band.dtype for band in vrt.bands)
         self.nodatavals = tuple(band.nodata for band in vrt.bands)
         self.nodata = self.nodatavals[0]
+        self.scales, self.offsets = zip(*(band.linear for band in vrt.bands), strict=True)
         self.block_shapes = [(min(BLOCK_SIZE, self.height), min(BLOCK_SIZE, self.width))] * self.count
         names = ColorInterp.__members__
         self.colorinterp = tuple(names.get(band.color, ColorInterp.undefined) for band in vrt.bands)
@@ -275,6 +276,15 @@ class Mosaic:
             return CRS.from_string(text) if text else None
         except CRSError as error:
             raise ImageError(f"{self.name}: the VRT's coordinate system cannot be read ({error})") from error
+
+    @property
+    def units(self) -> tuple[str | None, ...]:
+        """Units of the bands: of their first source where the VRT states none, as gdalbuildvrt leaves them out."""
+        firsts = [(band.unit, next(iter(band.sources), None)) for band in self._vrt.bands]
+        return tuple(
+            self._of_source(source).units[source.band - 1] if unit is None and source else unit
+            for unit, source in firsts
+        )
 
     @property
     def gcps(self) -> tuple[list[GroundControlPoint], CRS | None]:
@@ -343,6 +353,12 @@ class Mosaic:
             self._open[file] = self._stack.enter_context(self._opener(file))
         return self._open[file]
 
+    def _of_source(self, source: Source) -> Any:
+        dataset = self._dataset(source.file)
+        if source.band > dataset.count or source.band < 1:
+            raise ImageError(f"{self.name}: there is no band {source.band} in {os.fspath(source.file)}")
+        return dataset
+
     def _assembled(self, band: Band, box: Rect) -> PixelArray:
         dtype = np.dtype("complex64" if band.dtype == "complex_int16" else band.dtype)
         out = np.broadcast_to(_converted(np.array(band.fill), dtype), (box[3], box[2])).copy()
@@ -352,9 +368,7 @@ class Mosaic:
         return out
 
     def _paste(self, source: Source, band: Band, box: Rect, out: PixelArray) -> None:
-        dataset = self._dataset(source.file)
-        if source.band > dataset.count or source.band < 1:
-            raise ImageError(f"{self.name}: there is no band {source.band} in {os.fspath(source.file)}")
+        dataset = self._of_source(source)
         whole = (0, 0, dataset.width, dataset.height)
         src, dst = source.src or whole, source.dst or (0, 0, self.width, self.height)
         if src[2:] != dst[2:]:

@@ -119,6 +119,8 @@ class Band:
     nodata: float | None
     fill: float
     color: str
+    unit: str | None  # of its values, and what makes these of the numbers: scale and offset
+    linear: tuple[float, float]
     sources: tuple[Source, ...]
 
 
@@ -248,6 +250,8 @@ class _ElementReader:
             nodata=None if hidden else value,
             fill=0.0 if value is None else value,
             color=element.findtext("ColorInterp", colour).strip().lower(),
+            unit=element.findtext("UnitType"),
+            linear=(float(element.findtext("Scale", "1")), float(element.findtext("Offset", "0"))),
             sources=tuple(self.source(e) for e in element if e.tag in ("SimpleSource", "ComplexSource")),
         )
 

@@ -9,8 +9,9 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+import rasterio.shutil
 
-from barpc.base.errors import BarpcWarning, InputError
+from barpc.base.errors import BarpcWarning, ImageError, InputError
 from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
 from barpc.rasters.vertical import Vertical, geoid_file, vertical_of
 from barpc.rpcio import read_rpc
@@ -152,6 +153,25 @@ def test_a_unit_that_is_no_length_is_refused(tmp_path) -> None:
     path = write_dem(tmp_path / "a.tif", 4979, band={"units": "kelvin"})
     with pytest.raises(InputError, match=r"a.tif: the unit 'kelvin' of its heights is not known"):
         Dem.open(path)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_tiles_in_a_vrt_are_heights_as_the_tiles_themselves_are(tmp_path, stated) -> None:
+    """GDAL's own VRT, and one that leaves the unit to its source, as gdalbuildvrt does: by GDAL and by the tile."""
+    tile = write_dem(tmp_path / "a.tif", "EPSG:4979", band={"units": "ft", "scales": 0.5, "offsets": 10.0})
+    rasterio.shutil.copy(tile, tmp_path / "a.vrt", driver="VRT")
+    text = (tmp_path / "a.vrt").read_text()
+    assert all(name in text for name in ("<UnitType>ft", "<Scale>", "<Offset>"))
+    (tmp_path / "a.vrt").write_text(text if stated else text.replace("<UnitType>ft</UnitType>", ""))
+    dem, own = (Dem.open(tmp_path / name) for name in ("a.vrt", "a.tif"))
+    at = np.array([5.003, 5.1, 5.29]), np.array([43.99, 43.85, 43.81])
+    np.testing.assert_array_equal(dem(*at), own(*at))
+    assert dem(5.0, 44.0) == pytest.approx((100.0 * 0.5 + 10.0) * 0.3048)
+    (tmp_path / "a.vrt").write_text(
+        text.replace("<SourceBand>1<", "<SourceBand>2<").replace("<UnitType>ft</UnitType>", "")
+    )
+    with pytest.raises(ImageError, match="there is no band 2"):
+        Dem.open(tmp_path / "a.vrt")
 
 
 def test_an_unknown_reference_raises_a_loud_warning_unless_a_person_says_it(tmp_path):

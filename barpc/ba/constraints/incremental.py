@@ -167,7 +167,7 @@ class BlockPrior:
             arrays |= {"information": own, "pairs": self.information.pairs}
             diagonal = own.diagonal(axis1=1, axis2=2) if own.shape == (n, q, q) else np.zeros(1)
         else:
-            diagonal = self.information.diagonal()
+            diagonal = self.information.diagonal() if self.information.ndim == 2 else np.zeros(1)
         return (
             n * q > 0
             and len(set(self.names)) == n
