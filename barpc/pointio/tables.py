@@ -372,7 +372,11 @@ class _GrowingTable:
                 cells = [row[place].strip() if place < len(row) else "" for row in rows]
                 found[name] = [float(_pointed(cell, sign)) if cell else None for cell in cells]
             elif name in self.texts:
-                found[name] = [row[place].lstrip(" ").rstrip("\r\n") for row in rows]
+                cells = [row[place].rstrip("\r\n") for row in rows]
+                # a blank before a name in quotes is its own
+                found[name] = [
+                    cell if '"' in line else cell.lstrip(" ") for cell, line in zip(cells, lines, strict=True)
+                ]
             else:
                 cells = [row[place] for row in rows]
                 found[name] = _numeric([_pointed(cell, sign) for cell in cells] if sign in ";\t" else cells, name)

@@ -19,12 +19,13 @@ def _tracks() -> Tracks:
     return Tracks(view, [0, 0, 1, 1, 1, 2, 2], rng.uniform(0, 1e4, (7, 2)), rng.uniform(0.05, 0.5, 7))
 
 
+@pytest.mark.parametrize("names", [NAMES, ["%20", 'q"t', " lead"], [" b", "b", "a,b"]])
 @pytest.mark.parametrize("ending", ["csv", "npz"])
-def test_tracks_come_back_to_the_bit(tmp_path, ending):
+def test_tracks_come_back_to_the_bit(tmp_path, ending, names):
     tracks = _tracks()
     path = tmp_path / f"t.{ending}"
-    write_matches(path, tracks, NAMES)
-    again = read_matches(path, NAMES)
+    write_matches(path, tracks, names)
+    again = read_matches(path, names)
     for name in ("view", "point", "xy", "sigma"):
         np.testing.assert_array_equal(getattr(again, name), getattr(tracks, name))
 
@@ -40,7 +41,7 @@ def test_views_may_stand_in_another_order_and_others_are_left_out(tmp_path, endi
 
 def test_a_csv_by_hand_needs_four_columns_in_any_order(tmp_path):
     path = tmp_path / "hand.csv"
-    path.write_text("# mine\ntrack, row, col, image\nx7, 2.5, 1.5, /data/a.tif\nx7, 4, 3, b.tif\n")
+    path.write_text('# mine\ntrack, row, col, image\nx7, 2.5, 1.5, /data/a.tif\nx7, 4, 3, "b.tif"\n')
     found = read_matches(path, NAMES)
     np.testing.assert_array_equal(found.xy, [[1.5, 2.5], [3, 4]])
     assert (found.sigma == IMAGE_SIGMA).all()
