@@ -231,17 +231,18 @@ class Workspace:
             self._lock.release()
 
     def _end(self, status: str) -> None:
-        """Save the last state; where that fails, the same command is to go on and not to find a finished run."""
+        """Save the last state; of a run that failed, even here, the same command goes on: it has no summary."""
         try:
             if status == "done" and self._adds and self.outputs:
                 self._add_layer()
+            elif status == "failed" and LAST in self.outputs:
+                with suppress(OSError):
+                    (self.folder / LAST).unlink(missing_ok=True)
             self._save_state(status)
         except BarpcError:
             if status == "done":  # it may say so, and only the disk was not told
-                with suppress(BarpcError, OSError):
-                    if LAST in self.outputs:
-                        (self.folder / LAST).unlink(missing_ok=True)
-                    self._save_state("failed")
+                with suppress(BarpcError):
+                    self._end("failed")
             raise
 
     def _discard(self) -> None:

@@ -617,6 +617,16 @@ def test_a_sealed_folder_lists_its_outputs_and_names_what_they_were_made_from(tm
     assert "link.tif" not in own_files(tmp_path / "run")
 
 
+def test_a_run_that_fails_after_its_summary_has_none(tmp_path):
+    """A disk that is full when the list of outputs is written, last of all."""
+    with pytest.raises(OutputError), Workspace(tmp_path / "out") as run:
+        run.write_text("a.txt", "a")
+        run.write_text("summary.json", "{}")
+        raise OutputError("No space left on device")
+    assert (tmp_path / "out/a.txt").exists()
+    assert not (tmp_path / "out/summary.json").exists()
+
+
 def test_what_is_added_to_a_sealed_folder_is_a_layer_and_the_same_again_is_none(tmp_path):
     folder = tmp_path / "run"
     with Workspace(folder) as run:
