@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import BarpcError
+from barpc.base.errors import BarpcError, listed
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.remote import is_url
 from barpc.pipeline.executor import by_groups
@@ -51,19 +51,21 @@ def write_pictures(workspace: Workspace, run: Run, summary: Summary, work: Work)
     band: int = getattr(getattr(run.options, "tie", None), "band", 1)
     most = min(_MOST_BYTES, _ALL_BYTES // max(len(chosen), 1))
     found = by_groups(work.executor, thumbnails, chosen, (band, most), "pictures", None)
-    images = [one for group in found for one in group]
+    images = [one for group in found for one in group if "picture" in one]
+    if left := [one for group in found for one in group if "picture" not in one]:
+        logger.warning("%s: no picture in the report, as %s", listed([one["image"] for one in left]), left[0]["error"])
     pairs = [strip] if (strip := _worst_pair(run, summary, band)) else []
     workspace.write_text(f"{FOLDER}/{PICTURES}", json.dumps({"images": images, "pairs": pairs}))
 
 
 def thumbnails(group: Sequence[View], band: int, most: int) -> list[dict[str, Any]]:
-    """Return the thumbnails of some views that can be read, as `barpc.report.runfiles.Draped`."""
-    found = []
+    """Return the thumbnails of some views as `barpc.report.runfiles.Draped`; of one that cannot be read, the error."""
+    found = list[dict[str, Any]]()
     for view in group:
         try:
             grey = None if is_url(view.path) else thumbnail(view.path, view.size, _SIDE, band)
         except (BarpcError, OSError) as error:
-            logger.debug("%s: no thumbnail: %s", view.name, error)
+            found.append({"image": view.name, "error": str(error)})
             continue
         if grey is not None:
             found.append({"image": view.name, **encoded(grey, most)})
@@ -106,7 +108,7 @@ def _worst_pair(run: Run, summary: Summary, band: int) -> dict[str, Any] | None:
             for view, nodes in list(zip(views, places, strict=True))[bool(lines) :]:  # of the first image once
                 lines.append(np.hstack([_tile(view, band, one) for one in nodes]))
     except (BarpcError, OSError) as error:
-        logger.debug("%s - %s: no pictures: %s", *(view.name for view in views), error)
+        logger.warning("%s - %s: no pictures along epipolar lines, as %s", *(view.name for view in views), error)
         return None
     words = [views[0].name, *(f"{views[1].name}, {name} cameras" for name, *_ in cameras)]
     told = {"rows": words, "tiles": len(rows), "half_px": half}

@@ -168,4 +168,8 @@ def test_damaged_pictures_are_named_in_one_line(adjusted, tmp_path, text):
 def test_an_image_that_is_gone_or_elsewhere_is_left_out(matched, tmp_path):
     first, second, _ = matched[0].run.views
     gone = [first, replace(second, path=str(tmp_path / "no.tif")), replace(second, path="https://example.org/a.tif")]
-    assert [one["image"] for one in pictures.thumbnails(gone, 1, 60_000)] == [first.name]
+    shown, unread = pictures.thumbnails(gone, 1, 60_000)
+    assert (shown["image"], unread["image"]) == (first.name, second.name)
+    assert "picture" in shown
+    assert unread.keys() == {"image", "error"}
+    assert "no.tif" in unread["error"]

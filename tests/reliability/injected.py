@@ -54,6 +54,7 @@ CALLS = {
 """Call of Linux -> what it does, in the words of the tables."""
 ERRORS = ("ENOSPC", "EIO", "EINTR")
 _LINE = re.compile(r"^(\d+)\s+(\w+)\((.*)$")
+_SHOWN, _NO_PICTURE = ("SHA256SUMS", "tables/pictures.json", "report.html"), "no picture"  # which is said, not refused
 _CODES = (0, 1, 3)  # of a run that nobody interrupts (docs/reliability.md)
 _ANYBODY, _PTRACER = ctypes.c_ulong(-1), 0x59616D61  # PR_SET_PTRACER: where only ancestors may trace
 _GO = signal.SIGUSR1
@@ -228,7 +229,7 @@ class Scene:
         if self.hashes() != before:
             return "an input was changed"
         for name, data in outputs(self.out).items() if self.out.is_dir() else ():
-            if self.truth.get(name) != data:
+            if self.truth.get(name) != data and not (name in _SHOWN and _NO_PICTURE in ended.said):
                 return f"{name} is not what it should be (exit {ended.code}: {ended.said.strip()[-300:]})"
         if ended.code == self.code:
             missing_ones = self.truth.keys() - outputs(self.out).keys()
