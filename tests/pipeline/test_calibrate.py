@@ -7,7 +7,6 @@ import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,8 +28,10 @@ from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio.images import put_tag
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, scene
+from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
 RUNS = 7
@@ -238,7 +239,7 @@ def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> 
     assert found[0] is own
     keys = [one.sha256 for one in found if one is not None]
     assert [keys.index(key) for key in keys] == [0, 0, 0, 3, 3, 3, 6, 6, 8]
-    radar = replace(views[1], sensor=SimpleNamespace(timed=None))
+    radar = replace(views[1], sensor=RangeDoppler.from_annotation(read_annotation(Product().xml(), name="slc")))
     assert common_errors(replace(run, views=(radar,), sources=tuple(sources[1:2]))).of_view == (None,)
 
 
