@@ -210,6 +210,8 @@ def parts() -> dict[str, list[str]]:
     """Every part of barpc -> its tests, those of a folder or those that stand beside the folders."""
     names = dict.fromkeys(part_of(path.relative_to(ROOT)) for path in sorted((ROOT / "barpc").rglob("*.py")))
     tests = {name: sorted((ROOT / "tests" / name).glob("test_*.py")) for name in names}
+    if {"verbs", "cli"} <= set(tests):
+        tests["verbs"] += tests["cli"]  # which call them
     tests[TOP] = sorted((ROOT / "tests").glob("test_*.py"))
     own = Path("tests/test_mutation.py")
     return {name: [str(p) for path in tests[name] if (p := path.relative_to(ROOT)) != own] for name in names}

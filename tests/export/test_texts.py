@@ -318,8 +318,11 @@ def test_the_yaml_of_cars(south):
 
 
 def test_a_stac_item_says_where_when_and_how(south, southern):
-    name = south.shots[0].name
-    item = json.loads(made_of.stac(south, OUT)[f"{name}.json"])
+    name, texts = south.shots[0].name, made_of.stac(south, OUT)
+    item = json.loads(texts[f"{name}.json"])
+    boxes = np.array([json.loads(text)["bbox"] for key, text in texts.items() if key != "collection.json"])
+    ends = [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
+    assert json.loads(texts["collection.json"])["extent"]["spatial"]["bbox"] == [pytest.approx(ends, abs=1e-12)]
     assert (item["type"], item["stac_version"], item["id"]) == ("Feature", "1.1.0", name)
     assert [(one["rel"], one["href"]) for one in item["links"]] == [
         (rel, "./collection.json") for rel in ("root", "parent", "collection")

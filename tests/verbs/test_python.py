@@ -25,6 +25,7 @@ from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
 from barpc.verbs.images import camera_of, every
 from barpc.verbs.options import FLAG_NAMES, run_options
+from barpc.verbs.points import with_altitudes
 from tests.rpcio.conftest import make_rpc
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
@@ -37,6 +38,15 @@ def public(name: str) -> Any:
     """What stands behind a name: of a folder the verb that it is when called."""
     found = getattr(barpc, name)
     return found.__wrapped__ if inspect.ismodule(found) else found
+
+
+def test_a_terrain_gives_points_their_altitudes():
+    def plane(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        return 10.0 * lon + lat
+
+    found = with_altitudes([[5.0, 44.0], [6.0, 43.0]], None, plane)
+    assert found.tolist() == [[5.0, 44.0, 94.0], [6.0, 43.0, 103.0]]
+    assert with_altitudes([[5.0, 44.0, 1.0]], None, plane).tolist() == [[5.0, 44.0, 94.0]]
 
 
 # --- a function a verb ------------------------------------------------------------------------------------
