@@ -18,7 +18,7 @@ from barpc.export.files import Files, as_json
 from barpc.export.shots import Sampled, Scene, Shot, relative_link
 
 _DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
-_MOST_STEPS = 100  # at most
+_PINHOLE_STEPS = 100  # at most
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
 
 
@@ -54,7 +54,7 @@ def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pin
     span, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
     world, image = samples.world / span, samples.image - middle
     unknowns = np.linalg.lstsq(_derivative(world, image, np.ones(len(world))), image.ravel(), rcond=None)[0]
-    for _ in range(_MOST_STEPS):
+    for _ in range(_PINHOLE_STEPS):
         depth = world @ unknowns[8:] + 1.0
         seen = (world @ unknowns[:8].reshape(2, 4)[:, :3].T + unknowns[[3, 7]]) / depth[:, None]
         slope = _derivative(world, seen, depth)
