@@ -23,22 +23,24 @@ def replacing(
     """Yield a temporary path for `path`, renamed to it when the block ends without an error.
 
     It has the target's own name, in a folder of its own: what a writer takes from a name stays right, however long.
+    In a run folder's room, where everything is on its way already, it is the path itself.
 
     Parameters
     ----------
     path : Path or str, the file to be written; its folder is made where it is missing
     overwrite : bool, replace an existing file, else an OutputError
-    durable : bool, wait until the file is on the disk; not needed for what can be made again, never for what is on
-        its way through a run folder's room
+    durable : bool, wait until the file is on the disk; not needed for what can be made again
     room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
     """
     path = Path(path)
     refuse_existing(path, overwrite)
-    durable = durable and f"/{STATE}/{PARTIAL}/" not in path.as_posix()
     place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
     partial = place / path.name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if f"/{STATE}/{PARTIAL}/" in path.as_posix():
+            yield path
+            return
         place.mkdir(parents=True)
         yield partial
         if durable:
@@ -54,6 +56,8 @@ def replacing(
     finally:
         try:
             place.rmdir()
+        except FileNotFoundError:  # it was not needed
+            pass
         except OSError:  # something is left in it
             shutil.rmtree(place, ignore_errors=True)
 

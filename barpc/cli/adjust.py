@@ -88,9 +88,9 @@ def _run_pipeline(work: Callable[..., AdjustResult], flags: dict[str, Any]) -> i
 
 
 def _tell_result(result: AdjustResult) -> int:
-    if wants_json() or is_quiet():
+    if wants_json():
         tell(result.summary)
-    else:
+    elif not is_quiet():
         print_summary(result.record, result.root)
     if result.passed:
         return 0

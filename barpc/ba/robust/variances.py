@@ -387,7 +387,7 @@ class Variances:
             return careful, np.zeros(n, dtype=bool)
         both, beyond, together = self._odd(around, wide, careful)
         if self.cautious:
-            together = max(together, around.posterior(self._prior(usual, wide)).evidence)
+            together = max(together, around.under(self._prior(usual, wide))[0])
         # turns of all views explain what a wrong one shows: it is looked for without
         few, odd, alone = self._odd(around, np.append(wide[:-1], 1.0), np.ones(n), together)
         if alone >= together + _LIKELIER:
