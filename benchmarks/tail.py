@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,7 +33,7 @@ import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from scipy.interpolate import RectBivariateSpline
-from whole import RUN
+from whole import ROOT, RUN, as_installed
 
 from barpc.base.geodesy import metres_per_unit
 from barpc.pointio.matches import write_matches
@@ -48,7 +48,6 @@ from tests.pointio.stages import read_matches
 SIDE, GSD = 512, 20.0  # px, m: images of ten kilometres
 LAYOUT = {"size": (SIDE, SIDE), "gsd": GSD, "attitude": 5e-5, "overlap": 0.1}
 PICTURES = {"gsd": 2.0, "overlap": 0.5, "alt_range": (0.0, 60.0)}  # to be matched
-THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -143,14 +142,15 @@ def _write_blank(folder: Path, view: View, side: int) -> Path:
     return path
 
 
-def run(listed: Path, out: Path, jobs: int, only: bool = True) -> Trial:
-    """`barpc adjust` in a process of its own."""
+def run(listed: Path, out: Path, jobs: int, only: bool, environment: dict[str, str]) -> Trial:
+    """`barpc adjust` in a process of its own, and from nothing."""
+    shutil.rmtree(out, ignore_errors=True)
     matches = listed.parent / "matches.npz"
     command = [sys.executable, "-c", RUN, "-q", "adjust", "--image-list", listed]
     command += ["--matches", matches, *["--matches-only"] * only] * matches.exists()
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = [str(word) for word in (*command, "-o", out, "--overwrite", "-j", jobs)]
-    done = subprocess.run(words, capture_output=True, text=True, env=os.environ | THREADS, check=False)
+    words = [str(word) for word in (*command, "-o", out, "-j", jobs)]
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 3):
         raise SystemExit(done.stderr)
@@ -187,16 +187,17 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.folder or Path(temporary)
         print(" images   tracks    pairs  CPU [s]  clock [s]  memory [MB]  report.html [MB]", flush=True)
-        trials = {}
+        trials, environment = {}, as_installed(ROOT, Path(temporary, "compiled"))
         for num in options.views:
             if options.matching is None:
                 name = f"block_{num}" if options.blank is None else f"blank_{num}"
                 listed = write_block(folder / name, num, options.tracks, options.blank)
             else:
                 listed = write_pictures(folder / f"pictures_{num}", num, options.matching)
-            trials[num] = found = run(listed, folder / f"run_{listed.parent.name}", options.jobs, options.blank is None)
+            out = folder / f"run_{listed.parent.name}"
+            trials[num] = found = run(listed, out, options.jobs, options.blank is None, environment)
             if options.matching is not None:
-                before, after = left(listed, folder / f"run_{listed.parent.name}")
+                before, after = left(listed, out)
                 print(f"{num} images: exact tie points are left with {before:.2f} -> {after:.3f} px", flush=True)
             counts = f"{num:7d}  {found.summary['tracks']['num_tracks']:7d}  {len(found.summary['pairs']):7d}"
             print(

@@ -3,7 +3,7 @@
     python benchmarks/whole.py IMG IMG [IMG...] [--against FOLDER] [--turns 7] [-- OPTION...]
 
 Each turn is a process of its own with an output folder of its own, so that nothing is kept from one to the next; user
-and system time, one thread, the median of the turns after a first one that compiles the sources, as installing does.
+and system time, one thread, the median of the turns after a first one; sources are compiled before, as installing does.
 "start" is what no stage counts: the interpreter, imports, the end. Other tools that read RPCs, which a development
 environment has, are hidden: to import them takes longer than to verify with them. "floor" is a process that imports
 numpy, scipy, OpenCV and rasterio, as far as they are used, and ends.
@@ -22,19 +22,31 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-HIDE = "import sys; sys.modules.update(dict.fromkeys(('boto3', 'rpcm', 'shareloc', 'orthority')))"
+PEERS = ("boto3", "rpcm", "shareloc", "orthority")
 FLOOR = "import cv2, numpy, rasterio, scipy.linalg, scipy.optimize, scipy.sparse.csgraph, scipy.spatial"
-RUN = f"{HIDE}; from barpc.cli import main; main()"
+RUN = "from barpc.cli import main; main()"
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
-def turn(checkout: Path, compiled: str, arguments: list[str]) -> dict[str, float]:
+def as_installed(checkout: Path, compiled: Path) -> dict[str, str]:
+    """The environment of a process, and of its workers, that runs a checkout as if installed alone: its sources are
+    compiled once, into a folder, and other tools that read RPCs are hidden.
+    """
+    hidden = compiled / "hidden"
+    for name in PEERS:
+        hidden.mkdir(parents=True, exist_ok=True)
+        (hidden / f"{name}.py").write_text("raise ImportError\n")
+    found = {"PYTHONPATH": f"{checkout}{os.pathsep}{hidden}", "PYTHONDONTWRITEBYTECODE": ""}
+    environment = os.environ | THREADS | found | {"PYTHONPYCACHEPREFIX": str(compiled)}
+    subprocess.run([sys.executable, "-m", "compileall", "-q", str(checkout / "barpc")], check=True, env=environment)
+    return environment
+
+
+def turn(environment: dict[str, str], arguments: list[str]) -> dict[str, float]:
     """CPU seconds of one run by stage, "start" and "whole"."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-c", RUN, "-q", "adjust", *arguments, "-o", f"{folder}/out"]
-        places = {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
-        environment = os.environ | THREADS | places
-        floor = cpu([sys.executable, "-c", f"{HIDE}; {FLOOR}"], environment, folder)
+        floor = cpu([sys.executable, "-c", FLOOR], environment, folder)
         whole = cpu(command, environment, folder)
         state = json.loads(Path(folder, "out", ".barpc", "state.json").read_text())
     stages = {entry["stage"]: entry["cpu_seconds"] for entry in state["stages"]}
@@ -60,9 +72,12 @@ def main() -> int:
     arguments = [str(Path(text).resolve()) if Path(text).exists() else text for text in given.arguments]
     found: dict[Path, list[dict[str, float]]] = {checkout: [] for checkout in checkouts}
     with tempfile.TemporaryDirectory() as compiled:
+        environments = {
+            checkout: as_installed(checkout, Path(compiled, str(n))) for n, checkout in enumerate(checkouts)
+        }
         for number in range(given.turns + 1):
             for checkout in checkouts:
-                one = turn(checkout, compiled, arguments)
+                one = turn(environments[checkout], arguments)
                 if number:
                     found[checkout].append(one)
     stages = dict.fromkeys(stage for turns in found.values() for one in turns for stage in one)
