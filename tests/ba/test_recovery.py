@@ -115,7 +115,9 @@ def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, 
     assert found.steps <= {"scipy": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
     assert found.cost_history[0] > 100 * found.cost_history[-1]
     tight = solve(block, **L2, solver=solver, tolerance=1e-14)
-    assert found.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-9)
+    # not of costs, which rounding alone moves by a billionth
+    apart = ((found.residuals - tight.residuals) ** 2).sum()
+    assert apart < 1e-10 * (tight.residuals**2).sum()
 
 
 @pytest.mark.slow
