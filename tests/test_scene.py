@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -36,6 +37,20 @@ def test_tracks_are_read_only_copies():
     with pytest.raises(ValueError, match="read-only"):
         tracks.xy[0, 0] = 1
     assert (len(tracks), tracks.num_points) == (2, 1)
+
+
+def test_a_record_shares_the_arrays_of_another_and_nobody_elses():
+    given = np.array([[10.0, 20.0], [11.0, 21.0]])
+    locked = given.copy()
+    base = locked[:]
+    base.setflags(write=False)  # who has what it is a part of writes to it
+    one, other = (Tracks([0, 1], [0, 0], xy, [0.3, 0.3]) for xy in (given, base))
+    given += 1.0
+    locked += 1.0
+    assert one.xy[0, 0] == other.xy[0, 0] == 10.0
+    again = replace(one, sigma=[0.1, 0.1])
+    assert np.shares_memory(again.xy, one.xy)
+    assert again.sigma[0] == 0.1
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.control.agreement import UNCONSTRAINED_SIGMA, Agreement, agreement, offsets_of
 from barpc.ba.control.snooping import ControlTest, control_test
 from barpc.ba.parameters.priors import DRIFT_SIGMA, NOISE_FLOOR
-from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.consensus import agreeing
 from barpc.ba.robust.heldout import HeldOut, is_better, measure
 from barpc.ba.robust.rounds import Outcome, Rounds, downweighting, retriangulate_rejected
@@ -51,7 +50,6 @@ class Solution:
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
     agreed: Agreement | None = None  # which control points hold it
-    by_point: Array | None = None  # (2, 3, K) derivatives at the start [px/m], where they were kept
 
     @property
     def final(self) -> State:
@@ -79,21 +77,9 @@ class Solution:
         points, shown, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
         mended = replace(self.problem, xy=shown, point_prior=staying(points, np.flatnonzero(some & weak)))
         points = np.where(weak[:, None], points, self.state.points)  # from there it is linear
-        points = mended.triangulate(points, self._as_delivered(points), block.use / block.sigma)
+        delivered = self.problem.project_points(self.problem.camera_prior.mean, points)
+        points = mended.triangulate(points, delivered, block.use / block.sigma)
         return np.where(some[:, None], points, np.nan)
-
-    def _as_delivered(self, points: Array) -> Projected:
-        """Return the projection by the delivered cameras of points (P, 3) of which only weak ones have moved."""
-        problem, delivered = self.problem, self.problem.camera_prior.mean
-        if self.by_point is None:
-            return problem.project_points(delivered, points)
-        image, by_point, structure = self.before + problem.xy, self.by_point.copy(), problem.structure
-        rows = np.flatnonzero(self.heights.weak[structure.point])
-        if len(rows):
-            part, bounds = problem.cameras.seeing(problem.xy[:, rows]), np.searchsorted(rows, structure.bounds)
-            moved = part.project(delivered, structure.of_points(points)[:, rows], bounds, "points")
-            image[:, rows], by_point[..., rows] = moved.image, moved.by_point
-        return Projected(image, by_point, by_point[:, :0])
 
     @property
     def has_trend(self) -> bool:
@@ -139,7 +125,6 @@ def solve_block(
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
     before, agreed, free = rounds.residual, None, None
-    by_point = None if rounds.projected is None else rounds.projected.by_point.copy()
     if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, heights, block.use)
@@ -157,11 +142,11 @@ def solve_block(
         problem, outcome = _with_more_drift((problem, less), block, options, heights)
         asked = {} if outcome is less else {"drift": less.smooth}
     if block.gcps.names and agreed is None:
-        free = Solution(problem, state, before, heights, outcome, start, start, None, asked, by_point=by_point)
+        free = Solution(problem, state, before, heights, outcome, start, start, None, asked)
         agreed, heights = _with_control(block, given, outcome)
         outcome = Rounds(problem, block, outcome.state, heights, block.use, outcome).run()
     _check_inliers(outcome, block)
-    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed, by_point)
+    first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed)
     found = finished(first, problem, block, outer, outcome)
     if free is None or not found.heights.has_control:
         return found

@@ -73,7 +73,10 @@ class Frozen(Shown):
         finite: bool = True,
     ) -> Any:
         """Make a field a read-only array of the given shape (None: any length), its numbers `finite` if so asked."""
-        value: npt.NDArray[Any] = np.array(getattr(self, name), dtype=dtype)
+        given = getattr(self, name)
+        # of another record, which nobody can write to either
+        kept = isinstance(given, np.ndarray) and given.flags.owndata and not given.flags.writeable
+        value: npt.NDArray[Any] = np.array(given, dtype=dtype, copy=None if kept else True)
         what = f"{type(self).__name__} {name}"
         if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
             raise error(f"{what}: shape {value.shape}, expected {shape}")

@@ -301,23 +301,27 @@ class TermSearch:
         return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
 
     def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
-        """Return the terms, best first, with ends, periods and lengths refined where these may gain most."""
+        """Return the terms, best first, with ends, periods and lengths refined where these may gain most.
+
+        Where nothing is left beside the best, another kind of its image says the same by more.
+        """
         kinds = [kind for kind in TERMS.values() if kind.LOCAL]
         local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
         # where one is sure already, one that is not waits for the next round
         least = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
-        return self._sorted(
-            self._refine(one, found)
-            if gain > least and (one in local or not (one.LOCAL or one.group))
-            else (one, found)
-            for one, found, gain in made
-        )
+        out, enough = list[tuple[Term, MixtureFit]](), False
+        for one, found, gain in made:
+            asked = gain > least and (one in local or not (one.LOCAL or one.group))
+            same = enough and _of_one_image(one, made[0][0]) and one.NAME != made[0][0].NAME
+            out.append(self._refine(one, found) if asked and not same else (one, found))
+            enough = self._leaves_nothing(self._sorted(out)) if len(out) == 1 else enough
+        return self._sorted(out)
 
     def _worth_more(self, offered: list[Term]) -> list[Term]:
         """Return the terms that, by a sample of tracks, may gain most, alone or as the largest of several."""
-        few = self.seen.few
-        if few is self.seen.linear or len(offered) < 3:
-            return offered
+        few, linear = self.seen.few, self.seen.linear
+        if 2 * np.count_nonzero(few.taking_part) > np.count_nonzero(linear.taking_part) or len(offered) < 3:
+            return offered  # half of them are tried with all tracks then
         base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
         gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
         least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
