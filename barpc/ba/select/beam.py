@@ -349,8 +349,7 @@ class TermSearch:
             better, made = found, one
             for shape in one.shapes(self.seen, self._fit):
                 again = shape.refined(self.seen, found, others)
-                # a term that stays as it was gains no more than another did
-                if better.evidence < found.evidence + LIKELIHOOD_TOLERANCE or not _unchanged(again, one):
+                if not _unchanged(again, one):  # a term that stays as it was gains nothing
                     fitted = self._fit(again, base=found)
                     better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
