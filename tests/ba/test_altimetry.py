@@ -332,6 +332,7 @@ def test_fewer_tie_points_than_a_patch_needs_are_said(scene: Any):
     after = adjust_tracks(views, few, altimetry=heights(3), hold_out=False)
     assert after.altimetry is not None
     assert "are needed" in after.altimetry.why_not
+    assert (after.altimetry.near, after.altimetry.agree) == (0, 0)
 
 
 def plane_of(slope: tuple[float, float], sigma: float) -> Any:

@@ -212,6 +212,13 @@ def test_a_grid_that_goes_around_the_earth_has_no_seam(tmp_path):
     assert grid.sample(180.0, 90.0) == pytest.approx(-1.0)
 
 
+@pytest.mark.parametrize(("step", "columns", "period"), [(10, 36, 36), (10, 37, 36), (10, 35, 0), (16, 22, 22)])
+def test_a_grid_goes_around_the_earth_where_no_more_than_half_a_column_lacks(step, columns, period, tmp_path):
+    header = np.array([-80.0, -180.0, step, step], ">f8").tobytes() + np.array([3, columns], ">i4").tobytes()
+    (tmp_path / "g.gtx").write_bytes(header + bytes(4 * 3 * columns))
+    assert HeightGrid.open(tmp_path / "g.gtx").period == period
+
+
 HEADER = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
 
 

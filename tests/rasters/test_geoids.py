@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -52,6 +53,12 @@ def test_egm2008_is_found_where_proj_keeps_it(nowhere, tmp_path, variable, file)
     path = Path(shutil.copy(geoid_file("egm96"), tmp_path / "grids" / file))
     nowhere.setenv(variable, f"/no/such/folder:{tmp_path / 'grids'}")
     assert geoid_file("egm2008") == str(path)
+    nowhere.delenv(variable)
+    package = {"PROJ_DATA": ("rasterio", "proj_data"), "PROJ_LIB": ("pyproj", "proj_dir/share/proj")}[variable]
+    nowhere.setattr(geoids, "find_spec", lambda name: name == package[0] and SimpleNamespace(origin=str(path)) or None)
+    own = tmp_path / "grids" / package[1]
+    own.mkdir(parents=True)
+    assert str(shutil.move(path, own)) == geoid_file("egm2008")
 
 
 def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere, tmp_path):

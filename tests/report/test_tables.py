@@ -330,12 +330,19 @@ def test_a_surface_is_shown_beside_the_results_that_it_was_made_of_alone(block_r
     path = tmp_path / "tables/surface.json"
     path.write_text(json.dumps({"run": run_key(summary), "shown": shown}))
     assert [one.cameras for one in read_tables(summary, tmp_path).reliefs] == ["delivered", "corrected"]
+    images = [{"image": name, **{key: RELIEF[key] for key in ("size", "picture")}} for name in "ab"]
+    path.write_text(json.dumps({"run": run_key(summary), "shown": shown + images}))
+    found = read_tables(summary, tmp_path)
+    assert ([one.cameras for one in found.reliefs], [one.image for one in found.draped]) == (
+        ["delivered", "corrected"], ["a", "b"]
+    )  # fmt: skip
     first, *others = summary.outputs
     later = replace(summary, outputs=(replace(first, sha256="0" * 64), *others))
     assert read_tables(later, tmp_path).reliefs == ()  # of an earlier run in the same folder
     path.write_text("[]")
     assert read_tables(replace(summary, outputs=()), tmp_path).reliefs == ()  # a run at work looks at none
-    for text in ("[]", "{}", json.dumps({"run": run_key(summary), "shown": shown[:1]})):
+    wrong = (shown[:1], shown[::-1], shown + images[:1], shown + images + images[:1])
+    for text in ("[]", "{}", *(json.dumps({"run": run_key(summary), "shown": rows}) for rows in wrong)):
         path.write_text(text)
         with pytest.raises(InputError, match=r"surface\.json: damaged"):
             read_tables(summary, tmp_path)
