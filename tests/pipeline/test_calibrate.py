@@ -19,6 +19,7 @@ from barpc.ba.calibration import SensorTies, learn
 from barpc.ba.interior import Calibration
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
+from barpc.base.statistics import SURE
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
@@ -274,5 +275,15 @@ def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Se
         directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
         found.append(_FinishedRun(Path(f"run{i}"), ties, directions, 2))
     assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
+    learnt = learn([one.ties for one in found])
     with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):
-        _refuse_unsure("A", learn([one.ties for one in found]), found)
+        _refuse_unsure("A", learnt, found)
+    sure = replace(learnt, covariance=0.0 * learnt.covariance, change=(2, SURE))
+    _refuse_unsure("A", replace(sure, gain=np.array([2.0 * SURE, 0.5, 0.6, -1.0])), found)
+    for fields, why in (
+        ({"gain": np.array([3.0 * SURE, 0.5, -0.1, 0.0])}, "of only 2 of 4 runs left out in turn"),
+        ({"gain": np.full(4, SURE / 2.0)}, "of only 4 of 4 runs left out in turn"),
+        ({"change": (2, SURE + 0.1)}, f"before {found[2].ties.date}: calibrate"),
+    ):
+        with pytest.raises(InputError, match=why):
+            _refuse_unsure("A", replace(sure, **fields), found)
