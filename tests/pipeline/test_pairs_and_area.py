@@ -138,7 +138,8 @@ def test_new_images_are_matched_with_their_best_partners_and_farther_where_none_
     assert of(620.0, 0.0, 100.0, old=1) == [(0, 1), (0, 2), (1, 2)]  # none overlaps the old one as delivered
     assert of(450.0, 0.0, 600.0, -20.0, old=1) == [(0, 1), (0, 2), (0, 3), (1, 3)]  # 1, 2 and 2, 3 only by errors
     assert of(0.0, 50.0, 110.0, 180.0, 160.0, old=4, neighbours=2) == [(2, 4), (3, 4)]
-    assert of(0.0, 60.0, 100.0, old=1, neighbours=1) == [(1, 2)]
+    assert of(0.0, 60.0, 100.0, old=1, neighbours=1) == [(0, 1), (1, 2)]
+    assert [pair for pair in of(100.0, *range(12), old=1) if 0 in pair] == [(0, 12)]  # to the others each is nearer
 
 
 def run(*args: object) -> tuple[int, str]:
