@@ -109,6 +109,8 @@ def test_runs_tell_the_curve_and_how_well(calibration: Path, archive: list[Path]
     assert len({one["root"] for one in text["runs"]}) == RUNS
     assert sum(one["gain"] > 0 for one in text["runs"]) == RUNS
     assert calibration.stat().st_size < 60_000
+    for key, digits in {"coefficients_px": 7, "steps_px": 7, "size_px": 5, "sigma_px": 5, "held_out_noise": 4}.items():
+        np.testing.assert_array_equal(text[key], np.round(text[key], digits))
 
 
 @pytest.mark.slow
