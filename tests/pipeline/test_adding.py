@@ -222,7 +222,9 @@ def test_an_image_that_meets_none_is_refused(eleven: Path, archive: Path, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_images_that_are_tied_to_each_other_only_are_refused(eleven: Path, made: SimulatedBlock, tmp_path: Path) -> None:
+def test_images_that_are_tied_to_each_other_only_are_refused(
+    eleven: Path, made: SimulatedBlock, tmp_path: Path
+) -> None:
     names, own = ["view_0004", "fresh"], made.tracks.view == 4
     shutil.copy(eleven / "view_0004.tif", tmp_path / "fresh.tif")
     with rasterio.open(tmp_path / "fresh.tif", "r+") as image:

@@ -55,6 +55,14 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     in_image = np.array(by_image).T @ root
     assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=2e-3)
     assert shift == pytest.approx(pixel - sensor.sensor.project(middle), abs=1e-5)
+    # an error that images have in common moves the unknowns, and the image besides: what is left of it counts
+    response = root @ np.random.default_rng(5).normal(0.0, 0.3, (6, 2))
+    beside = np.random.default_rng(6).normal(size=(2, 2)) * in_image.std()
+    padded = np.vstack([response, np.ones((3, 2))])
+    left = np.array(by_image).T @ response - beside
+    alone = np.array(by_image).T @ (root @ root.T - response @ response.T) @ np.array(by_image)
+    _, shared, _ = moved_in_space(sensor, covariance, model, middle, None, (padded, beside))
+    assert shared**2 == pytest.approx(np.diag(alone + left @ left.T), rel=5e-3)
     _, _, found = moved_in_space(sensor, covariance, model, middle)
     values, axes = np.linalg.eigh(np.array(by_ground).T @ root @ root.T @ np.array(by_ground))
     assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=2e-3)
