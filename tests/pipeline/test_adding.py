@@ -235,7 +235,7 @@ def test_images_that_are_tied_to_each_other_only_are_refused(
     both = Tracks(np.repeat([0, 1], len(xy)), np.tile(point, 2), np.vstack([xy, xy + 1.0]), np.full(2 * len(xy), 0.3))
     write_matches(tmp_path / "ties.npz", both, names)
     options = RunOptions(matches=(str(tmp_path / "ties.npz"),), matches_only=True, add_to=str(eleven / "first"))
-    with pytest.raises(BarpcError, match="no tie point of the images given is seen in one of .*first"):
+    with pytest.raises(BarpcError, match=r"no tie point of the images given is seen in one of .*first"):
         adjust([eleven / "view_0004.tif", tmp_path / "fresh.tif", eleven / "view_0003.tif"], tmp_path / "out", options)
 
 

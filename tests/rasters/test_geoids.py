@@ -55,7 +55,9 @@ def test_egm2008_is_found_where_proj_keeps_it(nowhere, tmp_path, variable, file)
     assert geoid_file("egm2008") == str(path)
     nowhere.delenv(variable)
     package = {"PROJ_DATA": ("rasterio", "proj_data"), "PROJ_LIB": ("pyproj", "proj_dir/share/proj")}[variable]
-    nowhere.setattr(geoids, "find_spec", lambda name: name == package[0] and SimpleNamespace(origin=str(path)) or None)
+    nowhere.setattr(
+        geoids, "find_spec", lambda name: (name == package[0] and SimpleNamespace(origin=str(path))) or None
+    )
     own = tmp_path / "grids" / package[1]
     own.mkdir(parents=True)
     assert str(shutil.move(path, own)) == geoid_file("egm2008")

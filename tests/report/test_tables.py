@@ -21,8 +21,8 @@ from barpc.report.runfiles import (
     RESIDUALS,
     TABLES,
     gcps_geojson,
-    ply,
     map_layers,
+    ply,
     read_tables,
     run_key,
 )

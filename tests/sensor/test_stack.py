@@ -89,20 +89,10 @@ def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
     """One behind many corrections, or, where their drifts are of several degrees, each by itself; in any order."""
     rng, rpcs = np.random.default_rng(2), [view.sensor for view in simulate_block(3, 0, num_checks=0).views]
     center = ecef_from_ground(rpcs[0].ground_offset) * 1.1
-    some = [
-        Corrected(
-            rpc,
-            Correction(
-                *rng.normal(0, (2e-5, 3.0), (3, 2)).T,
-                center + 9.0 * k,
-                rng.normal(0, 1e-5, (n, 3)),
-                9e3,
-                8e3,
-                1.0 + 1e-6 * k,
-            ),
-        )
-        for k, (rpc, n) in enumerate(zip(rpcs, drifts, strict=True))
-    ]
+    some = []
+    for k, (rpc, degree) in enumerate(zip(rpcs, drifts, strict=True)):
+        turn, move, drift = (rng.normal(0, size, shape) for size, shape in ((2e-5, 3), (3.0, 3), (1e-5, (degree, 3))))
+        some.append(Corrected(rpc, Correction(turn, move, center + 9.0 * k, drift, 9e3, 8e3, 1.0 + 1e-6 * k)))
     view = rng.integers(0, 3, 60)
     image, alt = rng.uniform(0, 20_000, (60, 2)), rng.uniform(0, 600, 60)
     many, alone = Several(some, view), [some[v] for v in view]
@@ -117,11 +107,9 @@ def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
     asked = many.each(lambda sensor, points: points + some.index(sensor), ground)
     np.testing.assert_array_equal(asked, ground + view[:, None])
     sizes = [(20_000, 19_000), (9_000, 8_000), (5_000, 20_000)]
-    grids = ground_grids(
-        [(s, size, (0.0, 90.0 * (k + 1))) for k, (s, size) in enumerate(zip(some, sizes, strict=True))]
-    )
-    for k, (sensor, size, found) in enumerate(zip(some, sizes, grids, strict=True)):
-        at, level = image_grid(size, (0.0, 90.0 * (k + 1)), GRID_NODES)
+    cameras = [(sensor, size, (0.0, 0.01 * size[0])) for sensor, size in zip(some, sizes, strict=True)]
+    for (sensor, size, alts), found in zip(cameras, ground_grids(cameras), strict=True):
+        at, level = image_grid(size, alts, GRID_NODES)
         np.testing.assert_allclose(found, np.column_stack([sensor.localize(at, level), at]), rtol=0, atol=1e-5)
 
 

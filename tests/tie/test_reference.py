@@ -18,6 +18,7 @@ from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
+from barpc.tie.patches.channels import INVALID_MARGIN, Patch, of_image, of_reference
 from barpc.tie.reference import (
     PEAK,
     Accuracy,
@@ -29,7 +30,6 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
-from barpc.tie.patches.channels import INVALID_MARGIN, Patch, of_image, of_reference
 from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
@@ -348,8 +348,8 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
 def test_the_peak_of_all_votes_is_told_in_robust_standard_deviations_from_the_middle():
     rng = np.random.default_rng(0)
     votes = [rng.normal(0, 0.1, (9, 9)).astype(np.float32) for _ in range(3)]
-    for vote in votes:
-        vote[2, 7] += 1.0
+    for one in votes:
+        one[2, 7] += 1.0
     z, at = peak([votes[0], None, *votes[1:]])
     total = np.sum(votes, axis=0)
     away = np.abs(total - np.median(total))
