@@ -216,6 +216,10 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
     refused("2 runs given: at least 3")
     refused("is given twice", archive[0])
     refused("no finished run", tmp_path / "nowhere")
+    told: list[Any] = []
+    with pytest.raises(InputError, match="is given twice"):
+        barpc.calibrate([archive[0]] * 3, tmp_path / "a.cal", progress=lambda *now: told.append(now))
+    assert told == [(stage, number, 3) for stage in ("open", "read") for number in (1, 2, 3)]
     refused("was changed since", copied("tables/observations.csv", "view,track\n"))
     table = (archive[2] / "tables/observations.csv").read_text()
     refused("was changed since", copied("tables/observations.csv", table[: len(table) // 2]))
