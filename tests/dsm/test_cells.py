@@ -96,22 +96,32 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (100.0, 300.0))
     asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     sizes: list[Any] = []
+    coarse = SimpleNamespace(share=1.0, alt=np.linspace(140.0, 240.0, 101), a=np.array([7.0]), b=np.array([9.5]))
 
     def framed(a: np.ndarray, b: np.ndarray, alt: np.ndarray) -> Any:
         asked.append((a, b, alt))
-        return SimpleNamespace(num=2 * 64 * 4 - 1, across=0.0)
+        return SimpleNamespace(num=2 * 64 * 4 - 1, across=0.0, metres=3.0)
+
+    def matched(paths: Any, size: Any, frame: Any, band: int, near: Any) -> Any:
+        sizes.append(size if near is None else (size, near))
+        return coarse if near is None else None
 
     monkeypatch.setattr(stereo, "epipolar_frame", framed)
-    monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, *more: sizes.append(size))
+    monkeypatch.setattr(stereo, "dense_matches", matched)
     project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
     pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
     assert stereo._tile_points(pair, tile, 1) == []
     ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], TILE_NODES**2)])
-    for (*seen, alt), side in zip(asked, (1, 4), strict=True):
+    for (*seen, alt), side in zip(asked[:2], (1, 4), strict=True):
         for found, one in zip(seen, project, strict=True):
             np.testing.assert_allclose(found, (one(ground) + 0.5) / side - 0.5)
         np.testing.assert_array_equal(alt, ground[:, 2])
-    assert sizes == [[(100, 20), (100, 20)]]
+    assert sizes[0] == [(100, 20), (100, 20)]
+    size, near = sizes[1]  # of half as coarse pictures, near the matches of the coarse ones, among their altitudes
+    assert size == [(201, 40), (201, 40)]
+    assert near == ([14.5], [19.5], 2.0)
+    ends = 141.0 - 3.0 * stereo.ALLOWANCE, 239.0 + 3.0 * stereo.ALLOWANCE
+    assert (asked[-1][2].min(), asked[-1][2].max()) == pytest.approx(np.clip(ends, 100.0, 300.0))
 
 
 @pytest.mark.parametrize(("at", "size"), [((0, 0), (5, 5)), ((5, 0), (3, 5)), ((0, 5), (5, 1)), ((5, 5), (3, 1))])
