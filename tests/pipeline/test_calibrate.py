@@ -302,7 +302,7 @@ def test_a_calibration_is_read_as_it_stands(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.covariance[np.tril_indices(60)], text["covariance_px2"])
     numbers = text["covariance_px2"]
     for changes in (
-        {"columns": 4000.0}, {"sensor": 5}, {"coefficients_px": [[0.0, 0.0]] * 27}, {"coefficients_px": [[1e3, 0]] * 28},
+        {"columns": 4000.0}, {"sensor": 5}, {"coefficients_px": [[0, 0]] * 27}, {"coefficients_px": [[1e3, 0]] * 28},
         {"steps_px": [[0.0, 0.0], [0.0, -1e3]]}, {"edges": [900.5]}, {"covariance_px2": numbers[:-1]},
         {"covariance_px2": [-1.0, *numbers[1:]]},
     ):  # fmt: skip
