@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import errno
+import mmap
 
 import pytest
 
-from barpc.base import errors
 from barpc.base.errors import BarpcError, DisconnectedError, InputError, has_room, out_of_memory, plain
 
 
@@ -30,6 +30,10 @@ def cv2_error(text: str) -> Exception:
 def because(error: Exception, cause: Exception) -> Exception:
     error.__cause__ = cause
     return error
+
+
+def unmapped(*_: int) -> None:
+    raise OSError(errno.ENOMEM, "no")
 
 
 def reworded(error: Exception) -> None:
@@ -60,7 +64,8 @@ def test_memory_is_out_where_an_error_says_so_or_may_and_none_can_be_had(monkeyp
     assert has_room(1 << 20)
     assert not has_room(1 << 60)
     for room, said in ((True, always), (False, short)):
-        monkeypatch.setattr(errors, "has_room", lambda room=room: room)
+        if not room:
+            monkeypatch.setattr(mmap, "mmap", unmapped)
         assert out_of_memory(error) == said
         if said and error is not None and not isinstance(error, MemoryError):
             with pytest.raises(BarpcError if room else MemoryError):  # no other sentence is put on it
