@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm import stereo
+from barpc.base.verb_options import DsmOptions
+from barpc.dsm import NoSurfaceError, stereo
 from barpc.dsm.stereo import TILE_NODES, CameraErrors, Tile, gathered
 from barpc.dsm.surface import Grid
+from tests.tie.test_pairs import camera, views
 
 
 @pytest.mark.parametrize(("code", "west"), [(32631, 450_000.0), (32760, 810_000.0)])
@@ -122,6 +125,22 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     assert near == ([14.5], [19.5], 2.0)
     ends = 141.0 - 3.0 * stereo.ALLOWANCE, 239.0 + 3.0 * stereo.ALLOWANCE
     assert (asked[-1][2].min(), asked[-1][2].max()) == pytest.approx(np.clip(ends, 100.0, 300.0))
+
+
+@pytest.mark.parametrize(("east", "width"), [(0.0, 500.0), (300.0, 200.0), (-350.0, 150.0), (520.0, 0.0)])
+def test_cells_of_two_dates_are_where_pairs_of_both_see_the_ground(east: float, width: float) -> None:
+    """Pairs of 500 m squares of half-metre pixels, those of the other date to the east."""
+    made = views(*(camera(east / 111_320.0 * date, lean=lean) for date in (0, 1) for lean in (0.0, 0.2)))
+    made = [replace(view, alt_range=(99.0, 101.0)) for view in made]
+    block: Any = SimpleNamespace(views=made, groups=[[(0, 1)], [(2, 3)]])
+    if not width:
+        with pytest.raises(NoSurfaceError, match="the images do not overlap at the altitudes that they are used for"):
+            Grid(block, DsmOptions(gsd=2.0))
+        return
+    found = Grid(block, DsmOptions(gsd=2.0))
+    assert np.array(found.whole.size) == pytest.approx([width / 2.0, 250.0], abs=4)
+    assert [tile.size for _, tile, _ in found.tiles] == [found.whole.size]
+    assert [groups for *_, groups in found.tiles] == [[[(0, 1)], [(2, 3)]]]
 
 
 @pytest.mark.parametrize(("at", "size"), [((0, 0), (5, 5)), ((5, 0), (3, 5)), ((0, 5), (5, 1)), ((5, 5), (3, 1))])
