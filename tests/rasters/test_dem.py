@@ -361,7 +361,7 @@ def test_that_lines_meet_no_terrain_is_said_where_it_reaches_out_of_the_altitude
      ((-3.0, -0.1), (1.0, 2.0)), ((1.0, 2.0), (-3.0, -0.1)), ((6.1, 7.0), (1.0, 2.0)), ((1.0, 2.0), (8.1, 9.0)),
      ((6.0, 7.0), (8.0, 9.0)), ((np.nan, np.nan), (1.0, 2.0)), ((0.0, 0.4), (0.0, 0.6))],
 )  # fmt: skip
-def test_the_ends_of_the_heights_about_places_are_those_of_the_nodes_around_them(row, col, tmp_path):
+def test_the_ends_of_the_heights_about_places_are_those_of_the_nodes_around_them(row, col, tmp_path, sized):
     """Of the nodes of the smallest window that holds all; beyond the grid, and among voids, nothing is known."""
     heights = np.random.default_rng(3).uniform(0, 900, (7, 9)).astype(np.float32)
     heights[:2, :2] = np.nan
@@ -375,6 +375,9 @@ def test_the_ends_of_the_heights_about_places_are_those_of_the_nodes_around_them
     beyond = any(np.max(at) < 0 or np.min(at) > end for at, end in ((row, 6), (col, 8)))
     expected = (-np.inf, np.inf) if beyond or not np.isfinite(part).any() else (np.nanmin(part), np.nanmax(part))
     assert grid.extremes(np.array([row, col])) == expected
+    for most, told in ((part.size, expected), (part.size - 1, (-np.inf, np.inf))):
+        sized(cells_read=most)
+        assert grid.extremes(np.array([row, col])) == told
 
 
 def test_datums_are_those_of_the_dems_that_count_where_the_points_lie(tmp_path):
