@@ -219,6 +219,10 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     assert len(regions) == len(moving_ground._REGIONS)
     best = np.argsort(-gains)[[0, 10, 100]]
     assert gains[best[0]] > 20.0
+    first, *others = starts = moving_ground._distinct(moving_ground._REGIONS, gains)
+    assert (first == moving_ground._REGIONS[best[0]]).all()
+    assert len(others) == moving_ground._STARTS - 1
+    assert all(2 * (a & b).sum() <= (a | b).sum() for n, a in enumerate(starts) for b in starts[:n])
     for n in best:
         region = moving_ground._REGIONS[n]
         part = across[region].sum(axis=0)
