@@ -104,14 +104,17 @@ def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, mod
 
 def test_errors_that_images_share_are_in_the_ellipse_of_each():
     """Of a sensor whose columns are known to some pixels: what its cameras follow of it is none."""
-    block = simulate_block(3, 250, seed=3, size=(2000, 2000))
+    block = simulate_block(3, 250, seed=3, size=(2000, 1200))
     prior = Calibration.prior("A", 2000)
     wide = replace(prior, covariance=1e4 * prior.covariance)
     common, options = CommonErrors((wide, None, wide)), AdjustOptions(jitter="off")
     found = adjust_tracks(block.views, block.tracks, options, common=common, hold_out=False)
     run = Run("adjust", block.views, (), block.tracks, adjustment=found)
     for i, one in enumerate(measure_views(run)):
-        sensor, middle = found.sensors[i], block.views[i].sensor.localize(np.full(2, 999.5), np.array(run.altitude))
+        sensor, middle = (
+            found.sensors[i],
+            block.views[i].sensor.localize(np.array([999.5, 599.5]), np.array(run.altitude)),
+        )
         off = common.moved(np.array([i]), sensor.project(middle)[None, 0])[:, 0].T
         shared = found.covariance.shared.by_unknown.reshape(3, -1, off.shape[1])[i], off
         given = sensor, found.covariance.view(i), found.cameras.unknowns.model, middle
