@@ -299,6 +299,7 @@ def test_what_goes_together_is_taken() -> None:
     dem = {"dem": ("d.tif",)}
     for values in (
         {"tie": {"angles": [30.0, 30.0]}}, {"adjust": {"detectors": [4, 5]}}, {"update": True, "add_to": "run"},
+        {"adjust": {"jitter": "0.5"}},
         {"geoid": "egm96", **dem}, {"geoid": "egm96", "gcp": ("a",)}, {"geoid": "egm96", "check_points": ("a",)},
         {"reference": ("a.tif",), "reference_sigma": 2.0, **dem}, {"matches": ("a",), "matches_only": True},
         {"matches": ("a",), "aoi": "a", "overlap_list": "b"}, {"allow_remote": ("a.org", "a.org:80", "s3://b")},
