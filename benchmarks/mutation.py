@@ -122,6 +122,7 @@ class Places:
     def __init__(self, raw: bytes) -> None:
         self.raw = raw
         self.lines = [0, *accumulate(map(len, raw.splitlines(keepends=True)))]
+        self.open: set[ast.AST] = set()  # the 1 of a length -1 that a reshape works out: any negative one says so
 
     def _span(self, node: Any) -> tuple[int, int]:
         start = self.lines[node.lineno - 1] + node.col_offset
@@ -174,7 +175,7 @@ class Places:
 
     def _constant(self, node: ast.Constant) -> Iterator[Change]:
         number = node.value
-        if isinstance(number, bool | int | float):
+        if isinstance(number, bool | int | float) and node not in self.open:
             other = not number if isinstance(number, bool) else number + 1
             if isinstance(number, float):
                 other = 2 * number or 1.0
@@ -193,6 +194,8 @@ class Places:
             yield (*self._span(node), "pass")
 
     def _call(self, node: ast.Call) -> Iterator[Change]:
+        if getattr(node.func, "attr", "") == "reshape":
+            self.open.update(arg.operand for arg in node.args if isinstance(arg, ast.UnaryOp))
         symmetric = isinstance(node.func, ast.Attribute) or self._text(node.func) in ("min", "max")
         if len(node.args) > 1 and not symmetric:
             one, two = node.args[:2]

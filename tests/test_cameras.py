@@ -32,7 +32,7 @@ from barpc.sensor.csm import open_state
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import CorrectionGrid
 from tests.pipeline.known import part
-from tests.rpcio.conftest import make_rpc, write_image
+from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 from tests.sensor.conftest import MODELS
 from tests.sensor.linescan_files import Flight, isd
 from tests.sensor.terrasar_files import Terrasar
@@ -328,3 +328,13 @@ def test_altitudes_are_an_interval_that_ground_may_lie_in(text, taken):
     else:
         with pytest.raises(ValueError):
             cameras.OPENERS["csm"].choices["altitudes"](text)
+
+
+@pytest.mark.parametrize("physical", [True, False])
+def test_a_vendor_s_xml_alone_says_its_image_s_size_and_whether_it_holds_more(physical, tmp_path):
+    inside = "<NCOLS>700</NCOLS><NROWS>500</NROWS>" + "<ATTLIST>1 2</ATTLIST>" * physical
+    text = dimap_v2(make_rpc()).replace("</Dimap_Document>", f"{inside}</Dimap_Document>")
+    (tmp_path / "RPC_a.XML").write_text(text)
+    found = open_camera(tmp_path / "RPC_a.XML")
+    assert found.size == (700, 500)
+    assert ("it holds a physical camera model, too: FILE,model=physical" in found.notes) == physical

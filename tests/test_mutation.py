@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import random
 import sys
@@ -51,6 +52,12 @@ def test_mutants_named_equivalent_are_still_there(mutation, every) -> None:
     files = {file for file, _ in listed}
     known = {(mutant.file, mutation.changed(mutant)) for mutant in every if mutant.file in files}
     assert set(listed) <= known
+
+
+def test_a_length_that_a_reshape_works_out_has_a_sign_and_no_size(mutation) -> None:
+    raw = b"x = a.reshape(-1, 3)\ny = b[-1]"
+    found = [(raw[start:stop], new) for start, stop, new in mutation.Places(raw).walk(ast.parse(raw))]
+    assert found == [(b"-1", "(1)"), (b"3", "4"), (b"-1", "(1)"), (b"1", "2")]
 
 
 def test_the_score_leaves_out_equivalents(mutation) -> None:

@@ -20,6 +20,7 @@ from barpc.scene import (
     connected_groups,
     connected_labels,
     middle_altitude,
+    row_pairs,
 )
 
 from .sensor.conftest import make_rpc
@@ -224,3 +225,12 @@ def test_selecting_keeps_tracks_of_two_and_closes_up_their_numbers():
     assert kept.view.tolist() == [0, 1, 1, 2]
     assert kept.sigma.tolist() == [3.0, 4.0, 5.0, 6.0]
     assert kept.xy[0].tolist() == [4.0, 5.0]
+
+
+@pytest.mark.parametrize("most", [1, 2, np.inf])
+def test_pairs_of_rows_are_those_of_one_label_that_stand_near_each_other(most) -> None:
+    label = np.array([4, 4, 4, 4, 1, 7, 7, 0])
+    wanted = {(i, j) for j in range(8) for i in range(j) if label[i] == label[j] and j - i <= most}
+    assert {*map(tuple, row_pairs(label, most).T.tolist())} == wanted
+    assert row_pairs(label, most).shape == (2, len(wanted))
+    assert row_pairs(np.arange(3), most).shape == row_pairs(np.zeros(0, int), most).shape == (2, 0)

@@ -195,14 +195,12 @@ def _without_distorting_control(
 
 def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
     """Return the control points that agree at an outcome without control, and the constraints on points."""
-    count, first = len(block.gcps.names), block.num_tracks
-    mine = (block.point >= first) & (block.point < block.num_known)
-    lost = np.isin(np.arange(count), block.point[mine & block.use & ~outcome.inlier] - first)  # by hundreds of sigmas
-    told = np.isin(np.arange(count), block.point[mine & outcome.inlier] - first) & ~lost
+    every, first = np.arange(len(block.gcps.names)), block.num_tracks
+    of = block.point - first
+    lost = np.isin(every, of[block.use & ~outcome.inlier])  # by hundreds of sigmas
+    told = np.isin(every, of[outcome.inlier]) & ~lost
     # on ground that moves: seen, and excluded with it
-    gone = np.isin(np.arange(count), block.gcps.point) & ~np.isin(
-        np.arange(count), block.point[mine & block.use] - first
-    )
+    gone = np.isin(every, block.gcps.point) & ~np.isin(every, of[block.use])
     covariance = outcome.covariance(outcome.problem.free)
     faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
     found = agreement(offsets_of(covariance, block, outcome.state.points, faint), told)

@@ -12,6 +12,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from barpc.report.runfiles import table_path
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprints
-from barpc.tie.pairing.overlaps import Footprints, overlapping_pairs, reach_of
+from barpc.tie.pairing.overlaps import Footprints, forests, overlapping_pairs, reach_of
 from barpc.workspace import Homes, portable
 
 logger = logging.getLogger(__name__)
@@ -266,15 +267,17 @@ def _new_names(paths: Sequence[str], earlier: Earlier) -> list[str]:
 
 
 def chosen_pairs(views: Sequence[View], is_old: Sequence[bool], tie: TieOptions) -> list[tuple[int, int]]:
-    """Return the pairs to match: of each new view the best partners, old or new."""
+    """Return the pairs to match: of each new view the best partners, old or new, and those that connect all."""
     pairs = sorted(overlapping_pairs(views, tie), key=lambda pair: (-pair.score, pair.views))
     if not any(is_old[i] != is_old[j] for i, j in (pair.views for pair in pairs)):
         reaches = [reach_of(view, tie.search) for view in views]
         pairs = sorted(overlapping_pairs(views, tie, reaches), key=lambda pair: (-pair.score, pair.views))
+    links = [*pairwise(np.flatnonzero(is_old).tolist()), *(pair.views for pair in pairs)]
+    tree = {links[k] for k in forests(links, len(views), 1)}
     taken, chosen = [0] * len(views), []
     for pair in pairs:
         own = [i for i in pair.views if not is_old[i]]
-        if any(taken[i] < tie.neighbours for i in own):
+        if any(taken[i] < tie.neighbours or pair.views in tree for i in own):
             chosen.append(pair.views)
             for i in own:
                 taken[i] += 1

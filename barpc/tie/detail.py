@@ -44,7 +44,7 @@ def seen_detail(files: KeypointFiles, size: tuple[int, int], partners: Sequence[
     keypoints = files.load()[0]
     xy, weight = keypoints.xy, np.zeros(len(keypoints))
     tied = [np.isin(xy @ [1.0, 1.0j], here @ [1.0, 1.0j]) for here, _, _ in partners]
-    ties = np.any([weight > 0.0, *tied], axis=0)
+    ties = np.any([np.zeros(len(xy), dtype=bool), *tied], axis=0)
     strong = keypoints.response >= np.quantile(keypoints.response[ties], LEVEL) if ties.any() else ~ties
     for own, (here, there, other) in zip(tied, partners, strict=True):
         linear = np.linalg.lstsq(_affine_design(here), there, rcond=None)[0]

@@ -332,10 +332,11 @@ def test_fewer_tie_points_than_a_patch_needs_are_said(scene: Any):
     after = adjust_tracks(views, few, altimetry=heights(3), hold_out=False)
     assert after.altimetry is not None
     assert "are needed" in after.altimetry.why_not
+    assert (after.altimetry.near, after.altimetry.agree) == (0, 0)
 
 
-def plane_of(slope: tuple[float, float], sigma: float) -> Any:
-    """A surface that is known but for a scatter."""
+def plane_of(slope: tuple[float, float], sigma: float, reach: float) -> Any:
+    """A surface that is known but for a scatter, in patches."""
     east, north = slope
 
     def at(place: Any) -> Any:
@@ -346,19 +347,22 @@ def plane_of(slope: tuple[float, float], sigma: float) -> Any:
         at=at,
         slope=lambda place, nearest: (np.tile([east, north], (len(place), 1)), np.zeros((len(place), 2, 2))),
         variance=lambda place, nearest: np.full(len(place), sigma**2),
-        reach=np.full(3, 500.0),
+        reach=np.full(3, reach),
     )
 
 
-@pytest.mark.parametrize("noise", [0.7, 1.5])
-def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
-    """Huber's: by Tukey's weights, whose cut is 4.685 sigmas; nothing shared, as all lie within one patch."""
+@pytest.mark.parametrize(("noise", "reach"), [(0.7, 500.0), (1.5, 500.0), (1.0, 30.0)])
+def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float, reach: float):
+    """Huber's: by Tukey's weights, whose cut is 4.685 sigmas; nothing shared where all lie within one patch, else as
+    much as sums over patches scatter more than sums of independent errors do.
+    """
     rng = np.random.default_rng(3)
     place = np.column_stack([rng.uniform(0.0, 400.0, (80, 2)), np.zeros(80)])
     place[:, 2] = place[:, :2] @ [0.3, -0.2] + rng.normal(0.0, 0.8, 80)
     place[:9, 2] += rng.uniform(2.0, 30.0, 9)
+    place[:, 2] += (reach < 100.0) * 0.8 * np.sin(place[:, 0] // 60.0 + 2.0 * (place[:, 1] // 60.0))
     heights = GivenHeights(place, np.full(80, 0.5), np.full(80, 0.9))
-    surface: Any = plane_of((0.3, -0.2), 0.4)
+    surface: Any = plane_of((0.3, -0.2), 0.4, reach)
     free = np.diag(np.arange(1.0, 8.0) ** -2.0)
     found = registration.registration_at(surface, heights, np.zeros(7), 200.0, noise, free)
     scale, cut = max(noise, 1.0), registration.BIWEIGHT
@@ -382,7 +386,15 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float):
     bread = (rows[inside].T @ rows[inside]) * rate / (scale * sigma) ** 2 + free
     forms = rows[inside] * (psi(z[inside]) / (scale * sigma))[:, None]
     inverse = np.linalg.inv(bread)
-    told = inverse @ (forms.T @ forms + free) @ inverse
+    factor, size = np.ones(7), 2.0 * reach
+    while len(cells := {tuple(one) for one in place[inside, :2] // size}) >= altimetry.FEWEST:
+        sums = np.array([forms[(place[inside, :2] // size == cell).all(axis=1)].sum(axis=0) for cell in cells])
+        ratio = (sums**2).sum(axis=0) / (forms**2).sum(axis=0) * len(cells) / (len(cells) - 7)
+        for part in ([2, 3, 4], [0, 1, 5, 6]):  # up, and level
+            factor[part] = np.maximum(factor[part], np.sqrt(ratio[part].mean()))
+        size *= 2.0
+    assert (factor.max() > 1.2) == (reach < 100.0)
+    told = inverse @ (factor[:, None] * (forms.T @ forms) * factor + free) @ inverse
     expected = np.linalg.inv(np.linalg.inv(told) + free)
     np.testing.assert_allclose(found.covariance, expected, rtol=2e-3, atol=1e-6)
     rest = np.sort(off[near & ~found.agree])

@@ -151,6 +151,19 @@ def test_blocks_of_one_curve_scatter_as_their_noise_does() -> None:
     assert np.mean(scatter[8:]) == pytest.approx(1.0, abs=0.075)
 
 
+def test_ties_show_a_curve_as_large_as_it_is_and_how_surely() -> None:
+    rng = np.random.default_rng(3)
+    curve = ColumnSpline(SIZE[0], rng.normal(0, 0.3, (28, 2)))
+    bent = ties(scene(any_looks(3, rng), Sensor(curve.at, curve.edges), rng, 250, size=SIZE))
+    straight = ties(scene(any_looks(3, rng), Sensor(lambda col: 0.0 * curve.at(col), curve.edges), rng, 250, size=SIZE))
+    shown, sigma = share_shown(bent, curve)
+    assert 0.001 < sigma < 0.05
+    assert shown == pytest.approx(1.0, abs=5.0 * sigma)
+    assert share_shown(bent, replace(curve, coeffs=2.0 * curve.coeffs))[0] == pytest.approx(0.5, abs=0.05)
+    shown, sigma = share_shown(straight, curve)
+    assert shown == pytest.approx(0.0, abs=5.0 * sigma)
+
+
 def test_a_curve_is_contradicted_where_much_of_it_is_surely_missing() -> None:
     for shown, sigma, wanted in ((0.52, 0.04, True), (-1.0, 0.2, True), (0.7, 0.1, False), (0.9, 0.001, False),
                                  (1.6, 0.01, False), (0.0, 0.3, False)):  # fmt: skip

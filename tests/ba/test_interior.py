@@ -12,10 +12,12 @@ from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.summary.views import _shared_errors, moved_in_space
 from barpc.sensor.corrected import Corrected
+from barpc.sensor.geometry import intersect_pair
 from barpc.sensor.image_corrections import ColumnSpline
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.calibrate import PERFECT, Scene, Sensor, bent_as_said, crossing, in_track, scene
 from tests.ba.conftest import centers_of
+from tests.constants import Sized
 
 WIDTH = 2000
 LINEAR = AdjustOptions(loss="linear", learn_priors=False, estimate_noise=False, jitter="off", drift=1, noise_floor=0.0,
@@ -60,15 +62,25 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     assert isinstance(sensor, Corrected)
     assert moves.shape[2] == len(moved) == common.count == 4
     assert not moved[:, block.tracks.view == 2].any()
+    rows = [np.flatnonzero(block.tracks.view == view) for view in (0, 1)]
+    both, *at = np.intersect1d(*(block.tracks.point[own] for own in rows), return_indices=True)
+    rows, heights = [own[one] for own, one in zip(rows, at, strict=True)], np.zeros((len(both), 0))
+    alt = ground_from_ecef(plain.points[both])[:, 2]
     for k in range(4):
-        ends = []
+        ends, levels = [], []
         for sign in (1, -1):
             tracks = replace(block.tracks, xy=block.tracks.xy + sign * moved[k])
             ends.append(adjust_tracks(block.views, tracks, options, **given))
+            levels.append(intersect_pair(ends[-1].sensors[:2], [tracks.xy[own] for own in rows], alt)[:, 2])
+        heights = np.column_stack([heights, (levels[0] - levels[1]) / 2])
         wanted = (ends[0].points - ends[1].points)[index] / 2
         np.testing.assert_allclose(moves[..., k], wanted, atol=0.02 * np.abs(wanted).max())
         change = (ends[0].sensors[0].project(middle) - ends[1].sensors[0].project(middle)) / 2
         seen = np.column_stack([seen, change - known[1][:, k]])
+    pairs = [pair_heights(one, 0, 1) for one in (plain, found)]
+    for name, off in (("absolute", heights), ("relative", heights - heights.mean(axis=0))):
+        before, after = (getattr(one, name) for one in pairs)
+        assert after**2 - before**2 == pytest.approx((off**2).sum(axis=1).mean(), rel=0.05), name
     # what cameras follow of a displacement is not off in the image
     model = "rotation+translation"
     before = moved_in_space(sensor, plain.covariance.view(0), model, middle)[1]
@@ -85,6 +97,32 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     assert plain.datum.keys() == found.datum.keys()
     for source, shares in plain.datum.items():  # of what is known, not of what is not
         np.testing.assert_allclose(found.datum[source], shares, atol=1e-9)
+
+
+@pytest.mark.parametrize("most", [0, 10**6])
+def test_what_images_share_is_in_every_covariance_sparse_and_dense(sized: Sized, most: int) -> None:
+    sized(dense_views=most)
+    block = simulate_block(6, 250, seed=3, size=(WIDTH, 2000), noise=0.05)
+    common = CommonErrors((of_two_modes(1, "a"), None, of_two_modes(2, "b"), *(of_two_modes(1, "a"),) * 3))
+    given = {"hold_out": False, "centers": centers_of(block)}
+    options = replace(LINEAR, solver="sparse")
+    own, found = (adjust_tracks(block.views, block.tracks, options, common=one, **given).covariance
+                  for one in (CommonErrors((None,) * 6), common))  # fmt: skip
+    assert found.factor.method == ("dense" if most else "multifrontal")
+    assert found.shared is not None
+    q, shared = own.num_unknowns, found.shared.by_unknown
+    more = shared @ shared.T
+    whole = own.joint(np.arange(6)) + more
+    tolerance = 1e-7 * np.abs(whole).max()
+    blocks = whole.reshape(6, q, 6, q)
+    for i, j in ((0, 0), (0, 1), (1, 0), (5, 2), (2, 4)):
+        np.testing.assert_allclose(found.view(i, j), blocks[i, :, j], atol=tolerance)
+    np.testing.assert_allclose(found.of_views(), blocks[np.arange(6), :, np.arange(6)], atol=tolerance)
+    np.testing.assert_allclose(found.variances().ravel(), np.diag(whole), atol=tolerance)
+    np.testing.assert_allclose(
+        found.joint(np.array([4, 0])), blocks[[4, 0]][:, :, [4, 0]].reshape(2 * q, -1), atol=tolerance
+    )
+    assert np.sqrt(np.diag(more)).max() > 1e-3 * np.sqrt(np.diag(whole)).max()
 
 
 def curves(width: int, cols: Array) -> Array:

@@ -209,8 +209,20 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     group = Group(by_move, np.full(4, 30.0), cell, np.full(len(cell), 0.5))
     gains = moving_ground._region_gains(linear, group, base, none, np.zeros(0))
     curvature, _, across = Mixture(linear, none, np.zeros(0), base).scores(by_move, cell, GROUND_CELLS**2)
+    regions, (row, col) = (
+        {one.tobytes() for one in moving_ground._REGIONS},
+        np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS),
+    )
+    spans = [(low, high) for high in range(GROUND_CELLS) for low in range(high + 1)]
+    rectangles = [(row >= a) & (row <= b) & (col >= c) & (col <= d) for a, b in spans for c, d in spans]
+    assert {one.tobytes() for one in rectangles if not one.all()} < regions
+    assert len(regions) == len(moving_ground._REGIONS)
     best = np.argsort(-gains)[[0, 10, 100]]
     assert gains[best[0]] > 20.0
+    first, *others = starts = moving_ground._distinct(moving_ground._REGIONS, gains)
+    assert (first == moving_ground._REGIONS[best[0]]).all()
+    assert len(others) == moving_ground._STARTS - 1
+    assert all(2 * (a & b).sum() <= (a | b).sum() for n, a in enumerate(starts) for b in starts[:n])
     for n in best:
         region = moving_ground._REGIONS[n]
         part = across[region].sum(axis=0)

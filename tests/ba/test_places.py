@@ -103,6 +103,18 @@ def test_wrong_matches_that_stand_together_are_no_error_of_a_camera() -> None:
         assert not worst(unused)
 
 
+@pytest.mark.parametrize(("share", "named"), [(0.15, False), (0.25, False), (0.4, True)])
+def test_rows_are_named_by_those_alike_where_these_are_more_than_may_be_far_off(share: float, named: bool) -> None:
+    """As many again lie far off, each by itself."""
+    unused, _ = observed(1, 600, 0.0, 2)
+    hit = np.flatnonzero((unused.view == 1) & (unused.xy[1] < 0.1 * SIZE[1, 1]))
+    alike, apart = np.split(hit[: 2 * int(share * len(hit))], 2)
+    around = np.arange(len(apart)) * 2.4
+    unused.residual[:, alike] += [[0.0], [3.0]]
+    unused.residual[:, apart] += 10.0 * np.stack([np.cos(around), np.sin(around)])
+    assert [one.rows is not None and one.far > 0.3 for one in worst(unused)] == [True] * named
+
+
 def test_neighbours_that_share_their_error_are_one() -> None:
     """Forty tie points of one roof, all wrong alike, against the image."""
     unused, _ = observed(5, 400, 0.02)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from barpc.base import geodesy
+from barpc.base.errors import InputError
+from barpc.base.statistics import robust_spread
 
 
 @pytest.fixture
@@ -84,3 +86,37 @@ def test_what_is_not_finite_stays_so_without_an_exception():
 )  # fmt: skip
 def test_a_zone_is_six_degrees_wide_and_counted_from_the_antimeridian(lon, lat, zone):
     assert geodesy.utm(lon, lat) == zone
+
+
+def test_points_are_refused_with_the_shape_that_is_expected():
+    assert geodesy.as_ground([1, 2, 3]).dtype == np.float64
+    for wrong, said in (
+        (np.zeros((3, 5)), r"shape \(3, 5\): \(\.\.\., 3\) is expected, lon, .* on the last axis; transpose them$"),
+        (np.zeros((2, 5)), r"shape \(2, 5\): .* on the last axis$"),
+        (np.zeros(4), r"shape \(4,\): .* on the last axis$"),
+        (["a", "b", "c"], r"ground points: numbers are expected, \(\.\.\., 3\)"),
+    ):
+        with pytest.raises(InputError, match=said):
+            geodesy.as_ground(wrong)
+
+
+@pytest.mark.parametrize(
+    ("points", "alt", "shape"),
+    [((4, 5, 2), (5,), (4, 5)), ((2,), (3,), (3,)), ((4, 2), (), (4,)), ((4, 2), (3, 1), (3, 4))],
+)
+def test_altitudes_broadcast_with_points(points, alt, shape):
+    rng = np.random.default_rng(0)
+    xy, level = rng.normal(size=points), rng.normal(size=alt)
+    (found,) = geodesy.pointwise(lambda p, a: [p[:, 0] + 10.0 * p[:, 1] + 100.0 * a], [()], xy, level)
+    np.testing.assert_allclose(found, np.broadcast_to(xy[..., 0] + 10.0 * xy[..., 1] + 100.0 * level, shape))
+    with pytest.raises(InputError, match=r"altitudes of shape \(7,\) for points .*: one, or an array"):
+        geodesy.pointwise(lambda p, a: [p[:, 0]], [()], np.zeros((4, 2)), np.zeros(7))
+
+
+def test_a_robust_spread_is_that_of_a_normal_distribution_and_of_none_it_is_zero():
+    values = np.random.default_rng(1).normal(3.0, 2.0, (3, 40_001))
+    assert robust_spread(values[0], 3.0) == pytest.approx(2.0, rel=0.02)
+    assert robust_spread(values[0]) == pytest.approx(1.4826 * np.median(np.abs(values[0])), rel=1e-4)
+    np.testing.assert_allclose(robust_spread(values, 3.0), 2.0, rtol=0.02)
+    assert robust_spread(np.zeros(0)) == 0.0
+    assert robust_spread(np.array([1.0, -1.0, 50.0])) == pytest.approx(1.4826, rel=1e-4)

@@ -24,7 +24,7 @@ from barpc.base.declarations import Declared, Options, Rule, checked, declared, 
 from barpc.base.errors import InputError, UsageError
 from barpc.base.options import PAPER, AdjustOptions, FitOptions, RunOptions, TieOptions, read_options
 from barpc.base.safe_io import MB
-from barpc.base.verb_options import ConvertOptions, DsmOptions, OrthoOptions, RefitOptions
+from barpc.base.verb_options import ConvertOptions, DsmOptions, OrthoOptions, RefitOptions, VerifyOptions
 from barpc.cli import cli
 from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
 
@@ -273,6 +273,17 @@ def test_records_print_what_differs_from_the_defaults() -> None:
         ({"adjust": {"model": "shift", "drift": 1}}, "drift 1 needs a model with a rotation"),
         ({"adjust": {"jitter": "5e-324"}}, "jitter '5e-324' is not auto, off or a number of rows"),
         ({"adjust": {"jitter": "1e31"}}, "jitter '1e31' is not auto, off or a number of rows"),
+        ({"tie": {"angles": [30.0, 29.9]}}, r"angles: the smallest comes first, found \(30.0, 29.9\)"),
+        ({"adjust": {"detectors": [5, 4]}}, r"detectors: columns ascend, found \[5.0, 4.0\]"),
+        ({"adjust": {"detectors": [4, 4]}}, r"detectors: columns ascend, found \[4.0, 4.0\]"),
+        ({"update": True}, "update is given without add_to"),
+        ({"geoid": "egm96"}, "geoid is given without dem or ground points"),
+        ({"reference": ("a.tif",)}, "reference is given without dem"),
+        ({"reference_sigma": 2.0}, "reference_sigma is given without reference"),
+        ({"matches_only": True}, "matches_only is given without matches"),
+        ({"matches": ("a",), "matches_only": True, "aoi": "a"}, "aoi is given with matches_only"),
+        ({"matches": ("a",), "matches_only": True, "overlap_list": "a"}, "overlap_list is given with matches_only"),
+        ({"allow_remote": ("a/b",)}, "allow_remote 'a/b' is no HOST, HOST:PORT or s3://BUCKET"),
         (
             {"fit": {"grid": [4, 4, 2**24]}},
             r"grid \[4, 4, 16777216\]: 268435456 control points, at most 26843545",
@@ -282,6 +293,24 @@ def test_records_print_what_differs_from_the_defaults() -> None:
 def test_a_message_says_where_and_what(values: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         with_values(RunOptions(), values, "here")
+
+
+def test_what_goes_together_is_taken() -> None:
+    dem = {"dem": ("d.tif",)}
+    for values in (
+        {"tie": {"angles": [30.0, 30.0]}}, {"adjust": {"detectors": [4, 5]}}, {"update": True, "add_to": "run"},
+        {"adjust": {"jitter": "0.5"}},
+        {"geoid": "egm96", **dem}, {"geoid": "egm96", "gcp": ("a",)}, {"geoid": "egm96", "check_points": ("a",)},
+        {"reference": ("a.tif",), "reference_sigma": 2.0, **dem}, {"matches": ("a",), "matches_only": True},
+        {"matches": ("a",), "aoi": "a", "overlap_list": "b"}, {"allow_remote": ("a.org", "a.org:80", "s3://b")},
+    ):  # fmt: skip
+        with_values(RunOptions(), values, "here")
+    assert not ConvertOptions().cut
+    assert all(ConvertOptions(**one).cut for one in ({"window": (1, 2, 3, 4)}, {"bbox": (1, 2, 3, 4)}, {"aoi": "a"}))
+    assert VerifyOptions(expect="aF" * 32).expect == "aF" * 32
+    for wrong in ("a" * 63, "a" * 65, "g" * 64):
+        with pytest.raises(UsageError, match="a root has 64 hexadecimal digits"):
+            VerifyOptions(expect=wrong)
 
 
 def test_the_names_are_public_and_cost_no_numpy() -> None:

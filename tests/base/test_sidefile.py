@@ -36,10 +36,13 @@ from barpc.base.safe_io import (
     opened,
     opened_text,
     parse_json,
+    plain_path,
     read_bytes,
     read_head,
     read_json,
+    read_names,
     read_text,
+    unread,
 )
 from barpc.rpcio import FORMATS
 from barpc.rpcio.formats import parse_rpc
@@ -409,3 +412,29 @@ def test_large_files_of_few_numbers_are_read(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("n" * 100 + ",1\n")
     assert read_text(path, replace(TABLE, most=128)).startswith("nnn")
+
+
+def test_a_path_that_not_every_file_can_hold_is_refused(tmp_path):
+    assert plain_path(tmp_path / "a é b.tif") == tmp_path / "a é b.tif"
+    for char, what in (("\n", r"the character '\\n'"), ("\x7f", "the character"), ("\\", "the character"),
+                       ("\u2028", "the character"), ("\uffff", "the character"), ("\udc80", "bytes that are not UTF-8"),
+                       ("\udfff", "bytes that are not UTF-8"), ("\ud800", "bytes that are not UTF-8")):  # fmt: skip
+        with pytest.raises(InputError, match=f"its path holds {what}.*, which not every file and tool takes"):
+            plain_path(f"a{char}b.tif")
+
+
+def test_a_list_of_names_has_no_endless_line(tmp_path):
+    path = tmp_path / "names.txt"
+    path.write_text("a\n" + "b" * 16384 + "\n")
+    assert [len(one) for one in read_names(path, "a list")] == [1, 16384]
+    path.write_text("a\n" + "b" * 16385 + "\n")
+    with pytest.raises(InputError, match=r"names.txt, line 2: 16385 characters, no name is so long"):
+        read_names(path, "a list")
+
+
+def test_a_zarr_store_is_called_by_its_name(tmp_path):
+    (tmp_path / "b").mkdir()
+    assert unread(tmp_path / "b") == unread(tmp_path / "a.zip") == ""
+    (tmp_path / "b/.zgroup").write_text("{}")
+    for name in ("b", "a.zarr", "A.ZARR.zip"):
+        assert unread(tmp_path / name).startswith("; a Zarr store, which is not read")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from barpc.dsm import stereo
+from barpc.base.verb_options import DsmOptions
+from barpc.dsm import NoSurfaceError, stereo
 from barpc.dsm.stereo import TILE_NODES, CameraErrors, Tile, gathered
 from barpc.dsm.surface import Grid
+from tests.tie.test_pairs import camera, views
 
 
 @pytest.mark.parametrize(("code", "west"), [(32631, 450_000.0), (32760, 810_000.0)])
@@ -96,22 +99,48 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (100.0, 300.0))
     asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     sizes: list[Any] = []
+    coarse = SimpleNamespace(share=1.0, alt=np.linspace(140.0, 240.0, 101), a=np.array([7.0]), b=np.array([9.5]))
 
     def framed(a: np.ndarray, b: np.ndarray, alt: np.ndarray) -> Any:
         asked.append((a, b, alt))
-        return SimpleNamespace(num=2 * 64 * 4 - 1, across=0.0)
+        return SimpleNamespace(num=2 * 64 * 4 - 1, across=0.0, metres=3.0)
+
+    def matched(paths: Any, size: Any, frame: Any, band: int, near: Any) -> Any:
+        sizes.append(size if near is None else (size, near))
+        return coarse if near is None else None
 
     monkeypatch.setattr(stereo, "epipolar_frame", framed)
-    monkeypatch.setattr(stereo, "dense_matches", lambda paths, size, *more: sizes.append(size))
+    monkeypatch.setattr(stereo, "dense_matches", matched)
     project = [lambda ground, k=k: (1 + k) * ground[:, :2] + ground[:, 2:] for k in range(2)]
     pair: Any = [SimpleNamespace(sensor=SimpleNamespace(project=one), size=(403, 80), path="") for one in project]
     assert stereo._tile_points(pair, tile, 1) == []
     ground = np.column_stack([np.tile(tile.nodes(), (3, 1)), np.repeat([100.0, 200.0, 300.0], TILE_NODES**2)])
-    for (*seen, alt), side in zip(asked, (1, 4), strict=True):
+    for (*seen, alt), side in zip(asked[:2], (1, 4), strict=True):
         for found, one in zip(seen, project, strict=True):
             np.testing.assert_allclose(found, (one(ground) + 0.5) / side - 0.5)
         np.testing.assert_array_equal(alt, ground[:, 2])
-    assert sizes == [[(100, 20), (100, 20)]]
+    assert sizes[0] == [(100, 20), (100, 20)]
+    size, near = sizes[1]  # of half as coarse pictures, near the matches of the coarse ones, among their altitudes
+    assert size == [(201, 40), (201, 40)]
+    assert near == ([14.5], [19.5], 2.0)
+    ends = 141.0 - 3.0 * stereo.ALLOWANCE, 239.0 + 3.0 * stereo.ALLOWANCE
+    assert (asked[-1][2].min(), asked[-1][2].max()) == pytest.approx(np.clip(ends, 100.0, 300.0))
+
+
+@pytest.mark.parametrize(("east", "width"), [(0.0, 500.0), (300.0, 200.0), (-350.0, 150.0), (520.0, 0.0)])
+def test_cells_of_two_dates_are_where_pairs_of_both_see_the_ground(east: float, width: float) -> None:
+    """Pairs of 500 m squares of half-metre pixels, those of the other date to the east."""
+    made = views(*(camera(east / 111_320.0 * date, lean=lean) for date in (0, 1) for lean in (0.0, 0.2)))
+    made = [replace(view, alt_range=(99.0, 101.0)) for view in made]
+    block: Any = SimpleNamespace(views=made, groups=[[(0, 1)], [(2, 3)]])
+    if not width:
+        with pytest.raises(NoSurfaceError, match="the images do not overlap at the altitudes that they are used for"):
+            Grid(block, DsmOptions(gsd=2.0))
+        return
+    found = Grid(block, DsmOptions(gsd=2.0))
+    assert np.array(found.whole.size) == pytest.approx([width / 2.0, 250.0], abs=4)
+    assert [tile.size for _, tile, _ in found.tiles] == [found.whole.size]
+    assert [groups for *_, groups in found.tiles] == [[[(0, 1)], [(2, 3)]]]
 
 
 @pytest.mark.parametrize(("at", "size"), [((0, 0), (5, 5)), ((5, 0), (3, 5)), ((0, 5), (5, 1)), ((5, 5), (3, 1))])

@@ -12,6 +12,7 @@ from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, fit_rpc_points
 from barpc.pointio.correspondences import read_correspondences
 from barpc.rpcio import read_rpc
+from barpc.sensor.rational import monomials
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.fit.models import Radar
 
@@ -33,6 +34,19 @@ def test_exact_points_give_an_exact_rpc(camera: Camera, points: tuple[Array, Arr
     assert np.abs(fit.rpc.project(ground) - image).max() <= 1e-6
     assert np.abs(camera.rpc.project(ground) - image).max() >= 1.0
     assert 0.9 < fit.coverage <= 1.0
+
+
+@pytest.mark.landing(2)
+def test_denominators_of_columns_and_of_rows_are_looked_at(camera: Camera, points: tuple[Array, Array]) -> None:
+    """An image that is turned by 90 degrees has those of the image."""
+    ground, image = points
+    turned = np.column_stack([image[:, 1], 30_000.0 - image[:, 0]])
+    fits = [fit_rpc_points(ground, one) for one in (image, turned)]
+    assert fits[1].min_denominator == pytest.approx(fits[0].min_denominator, rel=1e-6)
+    for fit in fits:
+        place = fit.rpc.normalize(ground)
+        least = [(monomials(place).T @ c / c[0]).min() for c in fit.rpc.coeffs[1::2]]
+        assert 0.8 * min(least) < fit.min_denominator <= min(least) + 1e-9
 
 
 @pytest.mark.landing(2)

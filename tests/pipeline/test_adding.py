@@ -22,6 +22,7 @@ from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
+from barpc.scene import Tracks
 from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block
 
@@ -219,6 +220,23 @@ def test_an_image_that_meets_none_is_refused(eleven: Path, archive: Path, tmp_pa
     with pytest.raises(InputError, match="none of its images meets the images given"):
         adjust([tmp_path / "far.tif"], tmp_path / "out", RunOptions(add_to=str(eleven / "first")))
     assert not (tmp_path / "out").exists()
+
+
+def test_images_that_are_tied_to_each_other_only_are_refused(
+    eleven: Path, made: SimulatedBlock, tmp_path: Path
+) -> None:
+    names, own = ["view_0004", "fresh"], made.tracks.view == 4
+    shutil.copy(eleven / "view_0004.tif", tmp_path / "fresh.tif")
+    with rasterio.open(tmp_path / "fresh.tif", "r+") as image:
+        image.write(255 - image.read())
+    rpc = read_rpc(eleven / "view_0004.tif")
+    put_tag(tmp_path / "fresh.tif", replace(rpc, image_offset=rpc.image_offset + 1.0))
+    xy, point = made.tracks.xy[own], np.arange(own.sum())
+    both = Tracks(np.repeat([0, 1], len(xy)), np.tile(point, 2), np.vstack([xy, xy + 1.0]), np.full(2 * len(xy), 0.3))
+    write_matches(tmp_path / "ties.npz", both, names)
+    options = RunOptions(matches=(str(tmp_path / "ties.npz"),), matches_only=True, add_to=str(eleven / "first"))
+    with pytest.raises(BarpcError, match=r"no tie point of the images given is seen in one of .*first"):
+        adjust([eleven / "view_0004.tif", tmp_path / "fresh.tif", eleven / "view_0003.tif"], tmp_path / "out", options)
 
 
 def test_a_list_of_images_is_the_whole_blocks(eleven: Path, archive: Path) -> None:

@@ -19,10 +19,18 @@ from barpc.ba.calibration import SensorTies, learn
 from barpc.ba.interior import Calibration
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
+from barpc.base.statistics import SURE
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import _FinishedRun, _refuse_unsure, _row_direction, common_errors, read_calibration
+from barpc.pipeline.calibrate import (
+    _FinishedRun,
+    _refuse_unsure,
+    _row_direction,
+    calibrations_of,
+    common_errors,
+    read_calibration,
+)
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
@@ -108,6 +116,8 @@ def test_runs_tell_the_curve_and_how_well(calibration: Path, archive: list[Path]
     assert len({one["root"] for one in text["runs"]}) == RUNS
     assert sum(one["gain"] > 0 for one in text["runs"]) == RUNS
     assert calibration.stat().st_size < 60_000
+    for key, digits in {"coefficients_px": 7, "steps_px": 7, "size_px": 5, "sigma_px": 5, "held_out_noise": 4}.items():
+        np.testing.assert_array_equal(text[key], np.round(text[key], digits))
 
 
 @pytest.mark.slow
@@ -213,6 +223,10 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
     refused("2 runs given: at least 3")
     refused("is given twice", archive[0])
     refused("no finished run", tmp_path / "nowhere")
+    told: list[Any] = []
+    with pytest.raises(InputError, match="is given twice"):
+        barpc.calibrate([archive[0]] * 3, tmp_path / "a.cal", progress=lambda *now: told.append(now))
+    assert told == [(stage, number, 3) for stage in ("open", "read") for number in (1, 2, 3)]
     refused("was changed since", copied("tables/observations.csv", "view,track\n"))
     table = (archive[2] / "tables/observations.csv").read_text()
     refused("was changed since", copied("tables/observations.csv", table[: len(table) // 2]))
@@ -265,6 +279,69 @@ def test_a_damaged_calibration_is_one_line(text: str, words: str, tmp_path: Path
     assert str(path) in str(caught.value)
 
 
+def written(path: Path, sensor: str = "SIM1_PAN", **changes: Any) -> Path:
+    """A calibration of two edges, whose numbers are random."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(0, 0.1, (60, 60))
+    content = {
+        "schema": "barpc calibration 1", "sensor": sensor, "columns": SIZE[0], "edges": [900.5, 2100.5],
+        "coefficients_px": rng.normal(0, 0.3, (28, 2)).tolist(), "steps_px": [[0.1, -0.2], [0.3, 0.4]],
+        "covariance_px2": (root @ root.T)[np.tril_indices(60)].tolist(),
+    }  # fmt: skip
+    path.write_text(json.dumps({**content, **changes}))
+    return path
+
+
+def test_a_calibration_is_read_as_it_stands(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.cal")
+    found, text = read_calibration(path), json.loads(path.read_text())
+    assert (found.sensor, found.spline.width, found.path) == ("SIM1_PAN", SIZE[0], str(path))
+    for name, key in (("coeffs", "coefficients_px"), ("edges", "edges"), ("steps", "steps_px")):
+        np.testing.assert_array_equal(getattr(found.spline, name), text[key])
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+    np.testing.assert_array_equal(found.covariance[np.tril_indices(60)], text["covariance_px2"])
+    numbers = text["covariance_px2"]
+    for changes in (
+        {"columns": 4000.0}, {"sensor": 5}, {"coefficients_px": [[0, 0]] * 27}, {"coefficients_px": [[1e3, 0]] * 28},
+        {"steps_px": [[0.0, 0.0], [0.0, -1e3]]}, {"edges": [900.5]}, {"covariance_px2": numbers[:-1]},
+        {"covariance_px2": [-1.0, *numbers[1:]]},
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=r"a\.cal: damaged \(.*\); make it again"):
+            read_calibration(written(path, **changes))
+    read_calibration(written(path, coefficients_px=[[999.0, -999.0]] * 28, covariance_px2=[0.0] * len(numbers)))
+
+
+def test_an_image_takes_the_calibration_of_its_sensor_or_of_none(tmp_path: Path) -> None:
+    """Given, or beside it under the sensor's name; what states no sensor takes what is given alone."""
+    made = scene(any_looks(3, rng := np.random.default_rng(6)), Sensor.made("waves", 1, size=SIZE), rng, 30, size=SIZE)
+    paths = [
+        files(made, tmp_path / name, sensor)[0] for name, sensor in (("one", "SIM1"), ("two", "SIM2"), ("none", ""))
+    ]
+    views = [replace(made.views[0], name=path.parent.name, path=str(path)) for path in paths]
+    sources = [open_camera(path) for path in paths]
+
+    def of(*given: Path, some: bool = False) -> dict[str, str]:
+        found = calibrations_of([str(path) for path in given], views, sources, some=some)
+        return {name: one.path for name, one in found.items()}
+
+    one, other = written(tmp_path / "a.cal"), written(tmp_path / "b.cal", "SIM3_PAN")
+    assert of() == {}
+    assert of(one) == {"one": str(one), "none": str(one)}
+    assert of(one, other, some=True) == {"one": str(one)}
+    assert of(other, some=True) == {"none": str(other)}
+    with pytest.raises(InputError, match=r"b\.cal: is of SIM3_PAN, and no image given is"):
+        of(one, other)
+    with pytest.raises(InputError, match=r"c\.cal: another calibration of SIM1_PAN is given"):
+        of(one, written(tmp_path / "c.cal"))
+    with pytest.raises(InputError, match=r"a\.cal: of 4001 columns, .* has 4000"):
+        of(written(one, columns=SIZE[0] + 1))
+    beside = written(tmp_path / "two/SIM2_PAN.cal", "SIM2_PAN")
+    assert of(written(one)) == {"one": str(one), "two": str(beside), "none": str(one)}
+    written(beside)
+    with pytest.raises(InputError, match=r"SIM2_PAN\.cal: is of SIM1_PAN, not of SIM2_PAN as its name says"):
+        of()
+
+
 def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Sensor) -> None:
     """Pairs of one track, all of the same: along their epipolar lines, which are their rows, nothing is told."""
     rng, found = np.random.default_rng(4), []
@@ -274,5 +351,15 @@ def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Se
         directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
         found.append(_FinishedRun(Path(f"run{i}"), ties, directions, 2))
     assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
+    learnt = learn([one.ties for one in found])
     with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):
-        _refuse_unsure("A", learn([one.ties for one in found]), found)
+        _refuse_unsure("A", learnt, found)
+    sure = replace(learnt, covariance=0.0 * learnt.covariance, change=(2, SURE))
+    _refuse_unsure("A", replace(sure, gain=np.array([2.0 * SURE, 0.5, 0.6, -1.0])), found)
+    for fields, why in (
+        ({"gain": np.array([3.0 * SURE, 0.5, -0.1, 0.0])}, "of only 2 of 4 runs left out in turn"),
+        ({"gain": np.full(4, SURE / 2.0)}, "of only 4 of 4 runs left out in turn"),
+        ({"change": (2, SURE + 0.1)}, f"before {found[2].ties.date}: calibrate"),
+    ):
+        with pytest.raises(InputError, match=why):
+            _refuse_unsure("A", replace(sure, **fields), found)

@@ -12,13 +12,16 @@ import pytest
 from barpc.base.errors import DisconnectedError, InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
+from barpc.pipeline.earlier import chosen_pairs
 from barpc.pipeline.inputs import input_files, read_pairs
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.sensor.geometry import triangulate
-from barpc.tie import read_area
+from barpc.tie import TieOptions, read_area
 from tests.pointio.stages import read_matches
 from tests.reliability.conftest import barpc
+from tests.tie.test_pairs import camera
+from tests.tie.test_pairs import views as overlapping
 
 from .known import SAMPLES
 
@@ -123,6 +126,20 @@ def test_the_files_are_inputs_that_a_run_never_writes() -> None:
 def test_what_tells_how_to_match_contradicts_given_matches(name) -> None:
     with pytest.raises(InputError, match=f"{name} is given with matches"):
         RunOptions(matches="m.csv", matches_only=True, **{name: "file"})
+
+
+def test_new_images_are_matched_with_their_best_partners_and_farther_where_none_is_old() -> None:
+    """Of 500 m on the ground, with cameras wrong by up to 250 m."""
+
+    def of(*east: float, old: int, neighbours: int = 4) -> list[tuple[int, int]]:
+        made = overlapping(*(camera(metres / 111_000.0) for metres in east))
+        return chosen_pairs(made, [k < old for k in range(len(made))], TieOptions(search=500, neighbours=neighbours))
+
+    assert of(620.0, 0.0, 100.0, old=1) == [(0, 1), (0, 2), (1, 2)]  # none overlaps the old one as delivered
+    assert of(450.0, 0.0, 600.0, -20.0, old=1) == [(0, 1), (0, 2), (0, 3), (1, 3)]  # 1, 2 and 2, 3 only by errors
+    assert of(0.0, 50.0, 110.0, 180.0, 160.0, old=4, neighbours=2) == [(2, 4), (3, 4)]
+    assert of(0.0, 60.0, 100.0, old=1, neighbours=1) == [(0, 1), (1, 2)]
+    assert [pair for pair in of(100.0, *range(12), old=1) if 0 in pair] == [(0, 12)]  # to the others each is nearer
 
 
 def run(*args: object) -> tuple[int, str]:

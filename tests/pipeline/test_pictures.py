@@ -13,65 +13,14 @@ import pytest
 import rasterio
 
 from barpc.pipeline import outputs, pictures
-from barpc.rasters import raster
 from barpc.simulate import simulate_block
-from barpc.tie.pixels import jpeg, thumbnail
+from tests.tie.conftest import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
 def decoded(text: str) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_GRAYSCALE)
-
-
-def write(path, pixels, **profile):
-    with rasterio.open(path, "w", "GTiff", pixels.shape[1], pixels.shape[0], 1, dtype=pixels.dtype, **profile) as file:
-        file.write(pixels, 1)
-    return path
-
-
-@pytest.fixture
-def ramp(tmp_path):
-    """An image that grows brighter to the right and, by half as much, downwards; its left border is no data."""
-    rows, cols = np.mgrid[0:900, 0:1300]
-    pixels = (1000 + 2 * cols + rows).astype(np.uint16)
-    pixels[:, :130] = 7
-    return write(tmp_path / "ramp.tif", pixels, nodata=7)
-
-
-@pytest.mark.parametrize("kind", ["file", "mosaic", "small"])
-def test_a_thumbnail_is_the_image_as_it_lies_stretched_with_black_where_nothing_is_known(ramp, tmp_path, kind):
-    path = ramp
-    if kind == "mosaic":
-        path = tmp_path / "m.vrt"
-        path.write_text(
-            '<VRTDataset rasterXSize="1300" rasterYSize="900"><VRTRasterBand dataType="UInt16" band="1">'
-            '<NoDataValue>7</NoDataValue><SimpleSource><SourceFilename relativeToVRT="1">ramp.tif</SourceFilename>'
-            '<SourceBand>1</SourceBand><SrcRect xOff="0" yOff="0" xSize="1300" ySize="900"/>'
-            '<DstRect xOff="0" yOff="0" xSize="1300" ySize="900"/></SimpleSource></VRTRasterBand></VRTDataset>'
-        )
-        with raster.open_raster(path) as dataset:
-            assert isinstance(dataset, raster.Mosaic)
-    grey = thumbnail(path, (1300, 900), 2000 if kind == "small" else 130)
-    assert grey.shape == ((900, 1300) if kind == "small" else (90, 130))
-    shown = cv2.resize(grey, (130, 90), interpolation=cv2.INTER_AREA).astype(float)
-    assert (shown[:, :12] == 0).all()
-    assert shown[10:80, 15:125].min() > 0
-    right, down = np.diff(shown[10:80, 20:120], axis=1).mean(), np.diff(shown[10:80, 20:120], axis=0).mean()
-    rows, cols = np.mgrid[0:900, 130:1300]
-    assert right == pytest.approx(255 * 20 / np.ptp(np.percentile(1000 + 2 * cols + rows, (0.5, 99.5))), rel=0.03)
-    assert down == pytest.approx(right / 2, rel=0.05)
-
-
-def test_an_image_without_contrast_has_no_thumbnail_and_one_of_noise_fits_its_bytes(tmp_path):
-    flat = write(tmp_path / "flat.tif", np.full((50, 50), 9, np.uint8))
-    assert thumbnail(flat, (50, 50), 48) is None
-    noise = np.random.default_rng(1).integers(0, 255, (480, 480)).astype(np.uint8)
-    assert len(jpeg(noise)) > 60_000
-    for most in (60_000, 25_000, 1000, 1):
-        made = jpeg(noise, most)
-        assert len(made) <= most or most == 1
-        assert cv2.imdecode(np.frombuffer(made, np.uint8), 0) is not None
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -102,23 +51,16 @@ def test_rows_of_tiles_are_epipolar_lines_and_what_the_cameras_miss_is_across_th
         assert moved == pytest.approx(4.0 * axis, abs=0.02)
 
 
-def test_cameras_without_a_parallax_and_unknown_heights_end_no_run(ramp):
+def test_cameras_without_a_parallax_and_unknown_heights_end_no_run(tmp_path):
     view = simulate_block(2, 40, seed=3).views[0]
     here = np.array([[300.0, 400.0], [500.0, 600.0]])
     first, second = pictures._along_lines([view.sensor, view.sensor], (here, here), np.array([100.0, np.nan]), 20.0)
     assert np.isnan(first[1]).all()
     assert np.isnan(second[1]).all()
+    ramp = write_image(tmp_path / "ramp.tif", np.add.outer(np.arange(900), 2 * np.arange(1300)).astype(np.uint16))
     shown = replace(view, path=str(ramp), size=(1300, 900))
     assert not pictures._tile(shown, 1, first[1]).any()
     assert pictures._tile(shown, 1, second[0]).shape == (120, 120)
-
-
-@pytest.mark.parametrize("size", [(20, 30_000), (30_000, 3), (1, 1), (2, 1)])
-def test_an_image_of_few_columns_or_rows_has_a_thumbnail_or_none(tmp_path, size):
-    pixels = (np.arange(size[0] * size[1]) % 251).reshape(size[1], size[0]).astype(np.uint8)
-    grey = thumbnail(write(tmp_path / "thin.tif", pixels, nodata=255), size, 480)
-    assert grey is None or (max(grey.shape) <= 480 and min(grey.shape) >= 1)
-    assert (grey is None) <= (max(size) < 3)
 
 
 def test_a_run_keeps_small_pictures_of_what_it_saw_and_they_are_no_results(adjusted):

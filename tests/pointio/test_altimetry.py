@@ -79,3 +79,10 @@ def test_what_is_no_text_is_refused(tmp_path: Path):
     for path in (tmp_path / "a.h5", tmp_path, tmp_path / "missing.csv"):
         with pytest.raises(InputError):
             read_altimetry(path)
+
+
+def test_heights_are_those_that_there_are_on_earth(tmp_path: Path):
+    (tmp_path / "a.csv").write_text(
+        "lon,lat,alt\n" + "".join(f"5,43,{alt}\n" for alt in (-1000.5, -1000, 9500, 9500.5))
+    )
+    assert read_altimetry(tmp_path / "a.csv").lonlatalt[:, 2].tolist() == [-1000.0, 9500.0]

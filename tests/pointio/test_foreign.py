@@ -217,6 +217,13 @@ def odd(shape: tuple[int, ...], kind: str = "f4"):
     return fill
 
 
+def hollow(h5py, file, folder: Path) -> None:
+    """The keypoints of an image are said to be many, and none was written."""
+    with h5py.File(folder / "feats.h5", "a") as features:
+        del features["sub/a.tif/keypoints"]
+        features.create_dataset("sub/a.tif/keypoints", (600, 2), "f4", chunks=(100, 2))
+
+
 def linked(h5py, file, folder: Path) -> None:
     del file["sub-a.tif"], file["sub-b.tif"]
     (folder / "other").mkdir()
@@ -278,6 +285,8 @@ LIES = {
     "keypoints of another shape": (h5(odd((2, 3, 2))), r"keypoints of sub-a\.tif of shape \(2, 3, 2\)"),
     "keypoints of one number": (h5(odd((3, 1))), r"keypoints of sub-a\.tif of shape \(3, 1\)"),
     "keypoints that are complex": (h5(odd((3, 2), "c16")), "and type complex128"),
+    "keypoints that are not there": (h5(hollow), "keypoints claims more bytes than it can hold"),
+    "groups without end": (h5(lambda _, file, __: file.create_group("/".join("g" * 105))), "groups nested more than"),
     "a link to another file": (h5(linked), "no track is seen in two"),
 }  # fmt: skip
 

@@ -12,7 +12,8 @@ import rasterio
 import rasterio.shutil
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
-from barpc.rasters.dem import Dem, HeightGrid, localize_on_terrain
+from barpc.base.geodesy import DEFAULT, STATED
+from barpc.rasters.dem import Dem, HeightGrid, datum_of, localize_on_terrain
 from barpc.rasters.vertical import Vertical, geoid_file, vertical_of
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import altitude_range
@@ -212,6 +213,13 @@ def test_a_grid_that_goes_around_the_earth_has_no_seam(tmp_path):
     assert grid.sample(180.0, 90.0) == pytest.approx(-1.0)
 
 
+@pytest.mark.parametrize(("step", "columns", "period"), [(10, 36, 36), (10, 37, 36), (10, 35, 0), (16, 22, 22)])
+def test_a_grid_goes_around_the_earth_where_no_more_than_half_a_column_lacks(step, columns, period, tmp_path):
+    header = np.array([-80.0, -180.0, step, step], ">f8").tobytes() + np.array([3, columns], ">i4").tobytes()
+    (tmp_path / "g.gtx").write_bytes(header + bytes(4 * 3 * columns))
+    assert HeightGrid.open(tmp_path / "g.gtx").period == period
+
+
 HEADER = np.array([-90.0, -180.0, 10.0, 10.0], ">f8").tobytes() + np.array([19, 36], ">i4").tobytes()
 
 
@@ -345,6 +353,56 @@ def test_that_lines_meet_no_terrain_is_said_where_it_reaches_out_of_the_altitude
             f"heights here are {level:.0f} to {level:.0f} m, the camera is made for 0 to 1000 m: 3 of 3 lines"
             in str(caught[0].message)
         )
+
+
+@pytest.mark.parametrize(
+    ("row", "col"),
+    [((2.0, 3.5), (1.2, 4.0)), ((-2.0, 0.0), (-1.0, 0.5)), ((5.2, 9.0), (7.0, 20.0)), ((3.0, 3.0), (4.0, np.nan)),
+     ((-3.0, -0.1), (1.0, 2.0)), ((1.0, 2.0), (-3.0, -0.1)), ((6.1, 7.0), (1.0, 2.0)), ((1.0, 2.0), (8.1, 9.0)),
+     ((6.0, 7.0), (8.0, 9.0)), ((np.nan, np.nan), (1.0, 2.0)), ((0.0, 0.4), (0.0, 0.6))],
+)  # fmt: skip
+def test_the_ends_of_the_heights_about_places_are_those_of_the_nodes_around_them(row, col, tmp_path, sized):
+    """Of the nodes of the smallest window that holds all; beyond the grid, and among voids, nothing is known."""
+    heights = np.random.default_rng(3).uniform(0, 900, (7, 9)).astype(np.float32)
+    heights[:2, :2] = np.nan
+    grid = HeightGrid.open(write_dem(tmp_path / "a.tif", "EPSG:4979", heights))
+    known = np.isfinite(row) & np.isfinite(col)
+    inside = [
+        [n for n in range(count) if known.any() and np.floor(np.min(at)) <= n <= np.ceil(np.max(at))]
+        for at, count in ((np.array(row)[known], 7), (np.array(col)[known], 9))
+    ]
+    part = heights[np.ix_(*inside)]
+    beyond = any(np.max(at) < 0 or np.min(at) > end for at, end in ((row, 6), (col, 8)))
+    expected = (-np.inf, np.inf) if beyond or not np.isfinite(part).any() else (np.nanmin(part), np.nanmax(part))
+    assert grid.extremes(np.array([row, col])) == expected
+    for most, told in ((part.size, expected), (part.size - 1, (-np.inf, np.inf))):
+        sized(cells_read=most)
+        assert grid.extremes(np.array([row, col])) == told
+
+
+def test_datums_are_those_of_the_dems_that_count_where_the_points_lie(tmp_path):
+    heights = np.full((9, 9), 100.0, np.float32)
+    near, far = (
+        write_dem(
+            tmp_path / f"{name}.tif", "EPSG:4326", heights, transform=rasterio.Affine(0.1, 0, west, 0, -0.1, 45.0)
+        )
+        for name, west in (("near", 5.0), ("far", 25.0))
+    )
+    ground = np.array([[5.2, 44.6, 0], [5.3, 44.5, 0], [5.6, 44.7, 0], [25.5, 44.5, 0], [25.4, np.nan, 0], [9, 44, 0]])
+    egm96 = HeightGrid.open(geoid_file("egm96"))
+    with pytest.warns(BarpcWarning):
+        both = Dem.open([near, far])
+    found = both.datums(ground)
+    assert [(one.source, one.name, one.provenance, one.converted) for one in found] == [
+        ("heights", f"the DEM {name}.tif", DEFAULT, False) for name in ("near", "far")
+    ]
+    undulations = egm96.sample([5.3, 25.5], [44.6, 44.5])
+    assert [one.otherwise for one in found] == pytest.approx(undulations)
+    (one,) = both.datums(ground[3:])  # none of the other lies there
+    assert one.name == "the DEM far.tif"
+    assert Dem.open(near, None, "egm96").datums(ground) == ()  # a person said it
+    (one,) = datum_of(Vertical("EGM96", geoid="egm96", provenance=STATED), ground[:3], "gcps", "them")
+    assert (one.otherwise, one.converted) == (pytest.approx(-undulations[0]), True)
 
 
 def test_points_that_spread_over_too_many_cells_are_refused_at_once(tmp_path, sized):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +28,14 @@ def nowhere(monkeypatch, tmp_path):
     return monkeypatch
 
 
+@pytest.fixture
+def packages(nowhere):
+    """Python packages by name, none but those that a test puts in."""
+    found = {}
+    nowhere.setattr(geoids, "find_spec", found.get)
+    return found
+
+
 @pytest.mark.parametrize(
     ("lat", "lon", "undulation"),  # of NGA's own test of its program F477: within what 15' and bilinear leave
     [(38.628155, 269.779155, -31.628), (-14.621217, 305.021114, -2.969), (46.874319, 102.448729, -43.575),
@@ -47,11 +56,17 @@ def test_egm96_is_named_by_its_makers_and_is_small():
 
 @pytest.mark.parametrize("file", ["us_nga_egm08_25.tif", "egm08_25.gtx"])
 @pytest.mark.parametrize("variable", ["PROJ_DATA", "PROJ_LIB"])
-def test_egm2008_is_found_where_proj_keeps_it(nowhere, tmp_path, variable, file):
+def test_egm2008_is_found_where_proj_keeps_it(nowhere, packages, tmp_path, variable, file):
     (tmp_path / "grids").mkdir()
     path = Path(shutil.copy(geoid_file("egm96"), tmp_path / "grids" / file))
     nowhere.setenv(variable, f"/no/such/folder:{tmp_path / 'grids'}")
     assert geoid_file("egm2008") == str(path)
+    nowhere.delenv(variable)
+    package = {"PROJ_DATA": ("rasterio", "proj_data"), "PROJ_LIB": ("pyproj", "proj_dir/share/proj")}[variable]
+    packages[package[0]] = SimpleNamespace(origin=str(path))
+    own = tmp_path / "grids" / package[1]
+    own.mkdir(parents=True)
+    assert str(shutil.move(path, own)) == geoid_file("egm2008")
 
 
 def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere, tmp_path):

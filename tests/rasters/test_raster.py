@@ -12,7 +12,7 @@ import rasterio
 from barpc.base import identity
 from barpc.base.errors import ImageError, InputError
 from barpc.rasters import raster
-from barpc.rasters.raster import hashed, open_raster
+from barpc.rasters.raster import hashed, map_crs, open_raster
 
 
 @pytest.fixture
@@ -113,3 +113,18 @@ def test_an_error_while_reading_names_the_file(image: Path) -> None:
     cut.write_bytes(image.read_bytes()[:-40])
     with pytest.raises(ImageError, match=r"cut\.tif"), open_raster(cut) as dataset:
         dataset.read(1)
+
+
+@pytest.mark.parametrize(
+    ("given", "code"),
+    [(None, 32731), ("EPSG:2154", 2154), ("epsg:3413", 3413), ("EPSG:4326", 0), ("EPSG:4978", 0), ("EPSG:2263", 0),
+     ("EPSG:32631x", 0), ("nonsense", 0)],
+)  # fmt: skip
+def test_cells_are_in_metres_of_a_map_and_of_the_utm_zone_where_none_is_given(given: str | None, code: int) -> None:
+    """Not in degrees, of the Earth's centre, or in feet."""
+    middle = np.array([5.0, -44.0, 0.0])
+    if code:
+        assert map_crs(given, middle).to_epsg() == code
+    else:
+        with pytest.raises(InputError, match=f"--crs {given}: "):
+            map_crs(given, middle)

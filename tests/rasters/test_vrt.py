@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -292,6 +293,14 @@ def test_what_is_outside_the_grammar_is_refused_in_one_line(tmp_path: Path, name
     assert message in str(caught.value)
     assert str(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("side", ["rasterXSize", "rasterYSize"])
+def test_a_vrt_says_both_of_its_sides(tmp_path: Path, side: str) -> None:
+    path = vrt(tmp_path / "x.vrt", SIMPLE)
+    path.write_text(re.sub(f'{side}="[0-9]+"', "", path.read_text()))
+    with pytest.raises(ImageError, match="a VRT without rasterXSize and rasterYSize"), open_raster(path):
+        pass
 
 
 def test_a_source_in_two_formats_is_opened_as_its_first_bytes_say(tmp_path: Path) -> None:

@@ -132,11 +132,13 @@ def test_rows_of_two_images_over_the_same_ground_are_said_to_move(block_run) -> 
 @pytest.mark.parametrize(("rate", "end"), [(0.01, "beginning"), (-0.01, "end")])
 def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     places = (1, -6000.0, 12000.0, 0.0, rate), (1, -3000.0, 6000.0, 0.0, rate)
-    sizes = np.array([3.0, 4.0]), np.array([0.0, 1.0])
+    sizes = np.array([0.0, 1.0]), np.array([3.0, 4.0])
     each = [Finding("transient", v, places[v], sizes[v], 90.0, 40.0, "moving_objects", sizes[v]) for v in (0, 1)]
     (entry,) = explanations(adjustment(findings=each))
     assert entry.sentence == (f"rows at the {end} of all images are displaced by up to 5.00 px, decaying in 100 rows")
     assert (entry.image, entry.gain, entry.runner_up, entry.size_px) == (None, 90.0, "moving_objects", 5.0)
+    steps = [replace(one, kind="step") for one in each]  # each image by itself
+    assert [one.size_px for one in explanations(adjustment(findings=steps))] == [1.0, 5.0]
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import shapely
 
-from barpc.report.geopackage import Layer, geopackage, point_shapes
+from barpc.report.geopackage import STYLES, Layer, geopackage, point_shapes
 from barpc.report.runfiles import read_tables
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.words import STATUS_WORDS
@@ -108,6 +108,18 @@ def test_qgis_finds_a_style_of_every_layer_that_draws_each_status_as_the_report_
             props = {one.get("k"): one.get("v") for one in symbol.iter("prop")}
             colour = props["outline_color" if name == "footprints" else "color"].split(",")
             assert "#{:02x}{:02x}{:02x}".format(*map(int, colour)) in css, (name, value)
+
+
+def test_ties_are_small_and_check_points_are_gcps_upside_down():
+    drawn = {
+        name: {one.get("k"): one.get("v") for one in ElementTree.fromstring(style.qml()).iter("prop")}
+        for name, style in STYLES.items()
+    }
+    assert drawn["footprints"]["outline_width"] == "0.5"
+    assert drawn["tie_points"]["size"] == "0.8"
+    (gcps, checks), shape = (drawn["gcps"], drawn["check_points"]), ("name", "size", "outline_style")
+    assert [gcps[key] for key in shape] == [checks[key] for key in shape] == ["triangle", "3.5", "no"]
+    assert (int(checks["angle"]) - int(gcps["angle"])) % 360 == 180
 
 
 def test_numbers_that_are_not_known_are_null():

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from barpc.ba.evidence.scan import Unused, met_worse
+from barpc.base.statistics import CRITICAL
 from barpc.report import Run, summarize
+from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT
 
 from .conftest import run_of_block
 
@@ -91,3 +94,17 @@ def test_of_a_view_whose_rpc_is_not_its_own_and_of_plain_least_squares_it_is_not
     assert replace(changed, adjustment=few).met_worse == []
     none = replace(changed.adjustment, held_out=np.zeros_like(changed.adjustment.held_out))
     assert replace(changed, adjustment=none).met_worse == []
+
+
+def test_residuals_are_compared_in_standard_deviations_of_what_their_tracks_leave(run: Run) -> None:
+    """Of the 2 n coordinates of a track three go into its point: of two images a quarter is left, of three a half."""
+    changed = moved(run, 1, (0.0, 0.25), (0.5, 0.0))
+    found, tracks = changed.adjustment, changed.tracks
+    assert found is not None
+    rows = found.held_out & np.isfinite(found.residuals).all(axis=1)
+    seen = np.bincount(tracks.point[found.held_out])[tracks.point[rows]]
+    assert set(seen) == {2, 3}
+    view, size = tracks.view[rows], np.array([one.size for one in run.views], dtype=np.float64).T
+    sigma = found.held_out_noise[view] * tracks.sigma[rows] * np.where(seen == 2, 0.5, 1.0) ** 0.5
+    unused = Unused(view, tracks.xy[rows].T, found.residuals[rows].T, sigma)
+    assert changed.met_worse == met_worse(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)

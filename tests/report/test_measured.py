@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from barpc.ba.interior import Calibration
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
@@ -27,7 +28,7 @@ from barpc.report.summary.pairs import MAX_PER_PAIR
 from barpc.report.summary.views import _image_correction_entry, ce90, cell_numbers, measure_views, rmse_by_view
 from barpc.scene import Tracks
 from barpc.sensor.geometry import epipolar_offset
-from barpc.sensor.image_corrections import RowSpline
+from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline
 from barpc.tie.detail import Gap
 from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm
@@ -388,3 +389,34 @@ def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps():
     assert both["detectors"] == (100.0, 200.0)
     alone = _image_correction_entry(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
     assert set(alone) == {"detector_px", "detectors"}
+    strips = {"strips": np.zeros((2, 5)), "moved": np.array([[3.0, 4.0], [0.0, 1.0]])}
+    swings = {
+        "periods": np.array([90.0, 70.0]),
+        "swings": np.array([[[0.3, 0.0], [0.0, 0.4]], [[0.0, 0.0], [1.2, 0.0]]]),
+    }
+    found = _image_correction_entry(RowSpline(np.zeros((0, 2)), **strips, **swings))
+    assert found["step_px"] == pytest.approx(np.sqrt(26.0 / 2.0))
+    assert (found["sinusoid_px"], found["sinusoid_rows"]) == (pytest.approx(1.3), (90.0, 70.0))
+
+
+def test_places_are_brought_back_to_where_cameras_without_a_calibration_see_them(block_run):
+    run = block_run.run
+    spline = ColumnSpline(20_000, np.random.default_rng(1).normal(0, 2.0, (28, 2)))
+    used = replace(run, calibrated={run.views[1].name: replace(Calibration.prior("A", 20_000), spline=spline)})
+    xy = np.array([[100.0, 5.0], [7000.0, 9.0], [300.0, 3.0], [19_000.0, 7.0]])
+    found = used.undistorted(np.array([0, 1, 2, 1]), xy)
+    np.testing.assert_allclose(xy - found, np.where([[0], [1], [0], [1]], spline.at(xy[:, 0]), 0.0), atol=1e-12)
+    np.testing.assert_array_equal(run.undistorted(np.array([0, 1, 2, 1]), xy), xy)
+    assert isinstance(used.cameras[1], Calibrated)
+    assert used.cameras[0] is run.cameras[0]
+
+
+def test_parts_without_ties_are_those_of_the_image_that_has_detail_there(block_run):
+    run = block_run.run
+    size = run.views[1].size
+    lost = (run.tracks.view == 1) & (run.tracks.xy[:, 1] < 0.3 * size[1])
+    bare = replace(run, tracks=run.tracks.select(~lost), detail=tuple(np.full((2, 64), 300) for _ in run.views))
+    ((view, one),) = bare.gaps.items()
+    assert (view, one.axis) == (1, 1)
+    assert (one.first, one.last) == pytest.approx((0.0, 0.3 * size[1]), abs=0.06 * size[1])
+    assert replace(bare, detail=()).gaps == {}

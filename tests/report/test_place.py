@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
 from barpc.report.runfiles import read_tables
-from barpc.report.summary.views import ce90, moved_by_clocks, moved_in_space, stated_ce90
+from barpc.report.summary.views import ce90, measure_views, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed, Timing
+from barpc.simulate import simulate_block
 from tests.lanes import rest_slow
 from tests.sensor.s1_product import Product
 
@@ -55,6 +57,14 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     in_image = np.array(by_image).T @ root
     assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=2e-3)
     assert shift == pytest.approx(pixel - sensor.sensor.project(middle), abs=1e-5)
+    # an error that images have in common moves the unknowns, and the image besides: what is left of it counts
+    response = root @ np.random.default_rng(5).normal(0.0, 0.3, (6, 2))
+    beside = np.random.default_rng(6).normal(size=(2, 2)) * in_image.std()
+    padded = np.vstack([response, np.ones((3, 2))])
+    left = np.array(by_image).T @ response - beside
+    alone = np.array(by_image).T @ (root @ root.T - response @ response.T) @ np.array(by_image)
+    _, shared, _ = moved_in_space(sensor, covariance, model, middle, None, (padded, beside))
+    assert shared**2 == pytest.approx(np.diag(alone + left @ left.T), rel=5e-3)
     _, _, found = moved_in_space(sensor, covariance, model, middle)
     values, axes = np.linalg.eigh(np.array(by_ground).T @ root @ root.T @ np.array(by_ground))
     assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=2e-3)
@@ -90,6 +100,29 @@ def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, mod
     if found.major_m > 1.2 * found.minor_m:
         azimuth = np.degrees(np.arctan2(*axes[:, 1]))
         assert abs((found.azimuth_deg - azimuth + 90) % 180 - 90) < 12
+
+
+def test_errors_that_images_share_are_in_the_ellipse_of_each():
+    """Of a sensor whose columns are known to some pixels: what its cameras follow of it is none."""
+    block = simulate_block(3, 250, seed=3, size=(2000, 1200))
+    prior = Calibration.prior("A", 2000)
+    wide = replace(prior, covariance=1e4 * prior.covariance)
+    common, options = CommonErrors((wide, None, wide)), AdjustOptions(jitter="off")
+    found = adjust_tracks(block.views, block.tracks, options, common=common, hold_out=False)
+    run = Run("adjust", block.views, (), block.tracks, adjustment=found)
+    for i, one in enumerate(measure_views(run)):
+        sensor, middle = (
+            found.sensors[i],
+            block.views[i].sensor.localize(np.array([999.5, 599.5]), np.array(run.altitude)),
+        )
+        off = common.moved(np.array([i]), sensor.project(middle)[None, 0])[:, 0].T
+        shared = found.covariance.shared.by_unknown.reshape(3, -1, off.shape[1])[i], off
+        given = sensor, found.covariance.view(i), found.cameras.unknowns.model, middle
+        _, sigma, ellipse = moved_in_space(*given, None, shared)
+        assert one.correction.ellipse.major_m == pytest.approx(ellipse.major_m, rel=1e-3)
+        assert one.correction.center_sigma_px == pytest.approx(sigma, rel=1e-3)
+        alone = moved_in_space(*given)[1]
+        assert (np.abs(sigma / alone - 1.0) > 1e-3).any() == off.any()
 
 
 def test_that_of_a_radar_is_what_its_clocks_do_to_a_place():

@@ -15,8 +15,8 @@ from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
-from barpc.report.outcome import Run
-from barpc.report.quality_checks import control_reasons, enu
+from barpc.report.outcome import Added, Run
+from barpc.report.quality_checks import control_reasons, enu, held_lines
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import metres
 from barpc.report.verdict import block_verdict, view_status
@@ -706,3 +706,43 @@ def test_matches_at_whole_pixels_are_told_unless_as_many_are_sharper(whole, shar
         assert "an error of 0.3 px may be common to all" in str(told["advice"])
         assert view_status(a_view("A", num_gcps=3), run_of(whole_pixels=run.whole_pixels))["cause"] is None
         assert view_status(a_view("A"), run_of(kind="match", whole_pixels=run.whole_pixels))["cause"] is None
+
+
+@pytest.mark.parametrize(
+    ("beyond", "updated", "said_of_them"),
+    [
+        ((), False, "Their cameras stay valid: the largest change, of C, is 0.012 px (limit: 0.02 px)."),
+        ((("C", 1.234),), False, "The cameras of 1 image of first change by more than 0.02 px: C (1.23 px); --update "
+         "writes their new cameras."),
+        ((("C", 1.234), ("B", 0.5)), True, "The cameras of 2 images of first change by more than 0.02 px: C (1.23 px), "
+         "B (0.50 px); their new cameras are written here."),
+    ],
+)  # fmt: skip
+def test_added_images_leave_the_cameras_of_a_run_or_ask_them_to_move(beyond, updated, said_of_them):
+    lines = said(run_of(added=Added("first", 11, 2, beyond, ("C", 0.0123), 0.02, updated)))
+    at = lines.index("1 image added to the 11 images of first; 2 of these have new tie points.")
+    assert lines[at + 1] == said_of_them
+
+
+@pytest.mark.parametrize(("as_stated", "error"), [(True, "wrong tie points or an RPC"), (False, "an RPC")])
+def test_of_images_that_cannot_be_told_apart_each_is_named(as_stated, error):
+    found = SimpleNamespace(
+        clear=False, views=(0, 2), look=SimpleNamespace(as_stated=as_stated), is_view=lambda _: False
+    )
+    reasons = block_verdict(run_of(adjusted(apart=found)), views())["reasons"]
+    assert any(f"One of the images A, C has {error} that does not match it: without any one" in one for one in reasons)
+
+
+@pytest.mark.parametrize(
+    ("agrees", "used", "scale", "words"),
+    [
+        (True, 3, 1.0, "With 3 GCPs, it is known to a metre."),
+        (False, 0, 1.0, "Without consistent ground control, it is known to a metre."),
+        (False, 2, 4.4, "With 2 GCPs, 4 times less accurate than stated, it is known to a metre."),
+        (False, 1, 1.0, "The 1 GCP in use do not agree: the uncertainty of the scene's position is unknown."),
+    ],
+)
+def test_what_control_holds_is_said_with_how_far_it_agrees(agrees, used, scale, words):
+    tested = SimpleNamespace(agrees=agrees, used=np.arange(4) < used, agreed=SimpleNamespace(scale=scale), checked=True)
+    points = SimpleNamespace(names="PQRS", point=np.array([0, 1, 2, 2]), view=np.array([0, 1, 1, 0]))
+    assert next(held_lines(tested, points, views(), "it is known to a metre")) == words

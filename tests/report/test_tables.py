@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import struct
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from barpc.report.runfiles import (
     TABLES,
     gcps_geojson,
     map_layers,
+    ply,
     read_tables,
     run_key,
 )
@@ -330,12 +332,44 @@ def test_a_surface_is_shown_beside_the_results_that_it_was_made_of_alone(block_r
     path = tmp_path / "tables/surface.json"
     path.write_text(json.dumps({"run": run_key(summary), "shown": shown}))
     assert [one.cameras for one in read_tables(summary, tmp_path).reliefs] == ["delivered", "corrected"]
+    images = [{"image": name, **{key: RELIEF[key] for key in ("size", "picture")}} for name in "ab"]
+    path.write_text(json.dumps({"run": run_key(summary), "shown": shown + images}))
+    found = read_tables(summary, tmp_path)
+    assert ([one.cameras for one in found.reliefs], [one.image for one in found.draped]) == (
+        ["delivered", "corrected"], ["a", "b"]
+    )  # fmt: skip
     first, *others = summary.outputs
     later = replace(summary, outputs=(replace(first, sha256="0" * 64), *others))
     assert read_tables(later, tmp_path).reliefs == ()  # of an earlier run in the same folder
     path.write_text("[]")
     assert read_tables(replace(summary, outputs=()), tmp_path).reliefs == ()  # a run at work looks at none
-    for text in ("[]", "{}", json.dumps({"run": run_key(summary), "shown": shown[:1]})):
+    wrong = (shown[:1], shown[::-1], shown + images[:1], shown + images + images[:1])
+    for text in ("[]", "{}", *(json.dumps({"run": run_key(summary), "shown": rows}) for rows in wrong)):
         path.write_text(text)
         with pytest.raises(InputError, match=r"surface\.json: damaged"):
             read_tables(summary, tmp_path)
+
+
+def test_small_pictures_are_those_of_images_and_pairs(block_run, tmp_path):
+    shutil.copytree(block_run.folder / "tables", tmp_path / "tables")
+    image = {"image": "a", "size": [2, 2], "picture": "QUJD"}
+    strip = {**image, "rows": ["before"], "tiles": 3, "half_px": 8.0}
+    path = tmp_path / "tables/pictures.json"
+    path.write_text(json.dumps({"images": [image, image], "pairs": [strip]}))
+    found = read_tables(block_run.record, tmp_path)
+    assert ([one.image for one in found.thumbnails], [one.tiles for one in found.strips]) == (["a", "a"], [3])
+    for wrong in ([], {"images": [image]}, {"images": [], "pairs": {}}, {"images": [{"image": "a"}], "pairs": []}):
+        path.write_text(json.dumps(wrong))
+        with pytest.raises(InputError, match=r"pictures\.json: damaged"):
+            read_tables(block_run.record, tmp_path)
+
+
+def test_points_in_a_ply_are_read_as_its_head_says():
+    columns = {"x": np.array([1.5, -2.0]), "s": np.array([0.5, 4.0], np.float32), "n": np.array([7, -9], np.int32),
+               "red": np.array([255, 3], np.uint8)}  # fmt: skip
+    head, rows = ply(columns, "one", "two").split(b"end_header\n")
+    assert head.decode().splitlines() == [
+        "ply", "format binary_little_endian 1.0", "comment one", "comment two", "element vertex 2",
+        "property double x", "property float s", "property int n", "property uchar red",
+    ]  # fmt: skip
+    assert [*struct.iter_unpack("<dfiB", rows)] == [(1.5, 0.5, 7, 255), (-2.0, 4.0, -9, 3)]

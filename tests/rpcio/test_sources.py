@@ -23,7 +23,7 @@ from barpc.rpcio import (
     write_rpc_copy,
     write_rpc_vrt,
 )
-from barpc.rpcio.sources import described, only_physical
+from barpc.rpcio.sources import described, only_physical, sensor_of
 from barpc.rpcio.xml import rpc_domain
 from tests.rpcio.conftest import dimap_v2, grid, write_image
 
@@ -233,3 +233,19 @@ def test_an_xml_without_an_rpc_may_hold_a_physical_camera(tmp_path, rpc):
     (tmp_path / "b.xml").write_text(dimap_v2(rpc))
     assert [only_physical(tmp_path / name) for name in ("a.xml", "b.xml", "c.xml")] == [True, False, False]
     assert described(tmp_path / "a.xml") == (None, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sensor"),
+    [
+        ("a.IMD", 'bandId = "P";\nsatId = "WV02";\n', "WV02_P"),
+        ("a.IMD", 'satId = "QB02";\n', "QB02"),
+        ("DIM_a.XML", "<MISSION>PHR</MISSION><MISSION_INDEX>1B</MISSION_INDEX><BANDID>PAN</BANDID>", "PHR1B_PAN"),
+        ("DIM_a.XML", "<MISSION>SPOT 6/7</MISSION>", ""),
+        ("DIM_a.XML", "<MISSION>SPOT 6.7</MISSION><BAND_ID>P</BAND_ID>", "SPOT-6-7_P"),
+        ("a.IMD", 'bandId = "P";\nresatId = "WV02";\n', ""),
+    ],
+)  # fmt: skip
+def test_a_sensor_is_named_by_its_satellite_and_band(name, text, sensor, tmp_path) -> None:
+    (tmp_path / name).write_text(text)
+    assert sensor_of(tmp_path / "a.tif", tmp_path / name) == sensor

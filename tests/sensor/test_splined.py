@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from barpc.base.errors import RpcError
-from barpc.sensor.image_corrections import RowSpline, Splined, sine_and_cosine
+from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline, Splined, bsplines, sine_and_cosine
 
 from .conftest import make_rpc
 
@@ -52,6 +52,29 @@ def test_a_detector_begins_at_its_edge() -> None:
     found = spline.at(np.array([[99.9, 7.0], [100.0, 7.0], [np.nan, 7.0]]))
     np.testing.assert_array_equal(found, [[0.0, 0.0], [0.5, -0.5], [np.nan, np.nan]])
     assert np.isnan(spline.spacing)
+
+
+def test_a_spline_over_columns_is_scipys_and_its_steps_add_up() -> None:
+    """From the left edge of the first pixel to the right edge of the last; beyond, the value of the edge."""
+    spline = ColumnSpline(4000, COEFFS, [1000.0, 2500.0], [[0.1, -0.2], [0.3, 0.4]])
+    col = np.array([-0.5, 3.0, 999.9, 1000.0, 2499.9, 2500.0, 3000.0, 3999.5])
+    scipy = BSpline(500.0 * (np.arange(15) - 3) - 0.5, COEFFS, 3)
+    steps = np.array([[0.0, 0.0], [0.1, -0.2], [0.4, 0.2]])[[0, 0, 0, 1, 1, 2, 2, 2]]
+    np.testing.assert_allclose(spline.at(col), scipy(col) + steps, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(spline.rate(col[1:-1]), scipy.derivative()(col[1:-1]), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(spline.at(np.array([-90.0, 5000.0])), spline.at(col[[0, -1]]), rtol=0, atol=1e-13)
+    assert np.isnan(spline.at(np.array([np.nan]))).all()
+    u = np.linspace(-1.0, 1.0, 41)
+    np.testing.assert_allclose(COEFFS.T @ bsplines(u, len(COEFFS)), scipy(2000.0 * (u + 1.0) - 0.5).T, atol=1e-13)
+    rpc, image = make_rpc(), np.array([[700.0, 4000.0], [1200.0, 800.0], [3100.0, 17000.0]])
+    model = Calibrated(rpc, spline)
+    ground = model.localize(image, np.full(3, 300.0))
+    np.testing.assert_allclose(image - rpc.project(ground), spline.at(image[:, 0]), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
+    for wrong in ((1, COEFFS), (4000, COEFFS[:3]), (4000, COEFFS, [9.0, 9.0], np.zeros((2, 2)))):
+        with pytest.raises(RpcError, match="two of them and four coefficients are needed at least, and edges ascend"):
+            ColumnSpline(*wrong)
+    assert ColumnSpline(2, COEFFS[:4]).at(np.zeros(1)).shape == (1, 2)
 
 
 STRIPS = [[1.0, 4000.0, 9000.0, 0.0, 0.0], [0.0, -500.0, 700.0, 0.0, 0.0], [1.0, -20.0, 19100.0, 300.0, 1e-3]]

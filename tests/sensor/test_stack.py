@@ -7,9 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from barpc.base.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, camera_centers
+from barpc.sensor.geometry import GRID_NODES, Several, camera_center, camera_centers, ground_grids, image_grid
 from barpc.sensor.rpc import RPC, RpcStack, localize_stack
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
@@ -81,6 +82,35 @@ def test_a_camera_whose_points_are_certain_is_not_asked_alone(sensors, monkeypat
     ]
     monkeypatch.setattr(RPC, "localize", None)
     np.testing.assert_allclose(localize_stack(some, image, alt, bounds), np.concatenate(alone), rtol=0, atol=2e-12)
+
+
+@pytest.mark.parametrize("drifts", [(1, 1, 1), (0, 1, 1)])
+def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
+    """One behind many corrections, or, where their drifts are of several degrees, each by itself; in any order."""
+    rng, rpcs = np.random.default_rng(2), [view.sensor for view in simulate_block(3, 0, num_checks=0).views]
+    center = ecef_from_ground(rpcs[0].ground_offset) * 1.1
+    some = []
+    for k, (rpc, degree) in enumerate(zip(rpcs, drifts, strict=True)):
+        turn, move, drift = (rng.normal(0, size, shape) for size, shape in ((2e-5, 3), (3.0, 3), (1e-5, (degree, 3))))
+        some.append(Corrected(rpc, Correction(turn, move, center + 9.0 * k, drift, 9e3, 8e3, 1.0 + 1e-6 * k)))
+    view = rng.integers(0, 3, 60)
+    image, alt = rng.uniform(0, 20_000, (60, 2)), rng.uniform(0, 600, 60)
+    many, alone = Several(some, view), [some[v] for v in view]
+    ground = many.localize(image, alt)
+    np.testing.assert_allclose(ground, [s.localize(*at) for s, *at in zip(alone, image, alt, strict=True)], atol=1e-10)
+    np.testing.assert_allclose(many.project(ground), image, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(many.project(ground, image), image, rtol=0, atol=1e-5)
+    seen, jacobian = many.project_jacobian(ground)
+    expected = [one.project_jacobian(point) for one, point in zip(alone, ground, strict=True)]
+    np.testing.assert_allclose(seen, [one for one, _ in expected], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(jacobian, [one for _, one in expected], rtol=1e-8, atol=1e-9)
+    asked = many.each(lambda sensor, points: points + some.index(sensor), ground)
+    np.testing.assert_array_equal(asked, ground + view[:, None])
+    sizes = [(20_000, 19_000), (9_000, 8_000), (5_000, 20_000)]
+    cameras = [(sensor, size, (0.0, 0.01 * size[0])) for sensor, size in zip(some, sizes, strict=True)]
+    for (sensor, size, alts), found in zip(cameras, ground_grids(cameras), strict=True):
+        at, level = image_grid(size, alts, GRID_NODES)
+        np.testing.assert_allclose(found, np.column_stack([sensor.localize(at, level), at]), rtol=0, atol=1e-5)
 
 
 def test_nothing_is_asked_of_no_camera():

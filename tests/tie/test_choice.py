@@ -176,6 +176,9 @@ def test_half_of_the_partners_are_left_for_other_dates() -> None:
     assert len(across) >= 10
     assert len(found) - len(across) >= 10
     assert len(found) < 12 * 4
+    for neighbours, own in ((2, 5), (3, 5 + 4), (4, 5 + 4), (5, 5 + 4 + 3)):  # each has the first, and the second, ...
+        found = best_pairs(pairs, 12, neighbours)
+        assert sum((one.views[0] < 6) == (one.views[1] < 6) for one in found) == 2 * own
 
 
 def test_what_is_given_is_kept_and_takes_no_place() -> None:

@@ -13,6 +13,7 @@ import pytest
 from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.rasters.raster import open_raster
 from barpc.scene import View
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.tie import TieOptions, find_tracks
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import Sift
@@ -20,6 +21,7 @@ from barpc.tie.matchers.placings import Placing, _mirrored, misplaced, stretched
 from tests.lanes import rest_slow
 
 from .conftest import write_image
+from .test_pairs import camera
 
 
 def _mean(pixels: np.ndarray, side: int) -> np.ndarray:
@@ -171,6 +173,24 @@ def test_scale_is_asked_across_the_lines_where_relief_has_no_say(render, scale: 
     line = np.abs(where.across - np.median(where.across)) < 0.3  # on one line nothing tells
     assert not stretched((scene.views[0], scene.views[1]), first[line], second[line])
     assert not stretched((scene.views[0], scene.views[1]), first[:0], second[:0])
+
+
+@pytest.mark.parametrize(
+    ("size", "turns", "wide", "off", "fills"),
+    [(2.0, 0, 0, 0.0, True), (2.0, 0, 2, 0.0, True), (2.0, 0, 3, 0.0, False), (2.0, 0, -3, 0.0, False),
+     (0.5, 0, 1, 0.0, True), (0.5, 0, -2, 0.0, False), (2.0, 1, 0, 0.0, True), (2.0, 1, 0, 0.9, True),
+     (2.0, 1, 0, 1.1, False), (2.0, 1, 0, -0.9, True), (2.0, 1, 0, -1.1, False), (1.0, 0, 0, 0.0, False)],
+)  # fmt: skip
+def test_an_rpc_of_a_whole_image_of_another_size_fills_its_file(size, turns, wide, off, fills) -> None:
+    """To a pixel of the larger of both on any side; `off`, where it begins."""
+    whole, end = np.array([1000.0, 800.0]), off + 0.5
+    rpc = replace(camera(0.0), image_offset=0.5 * (whole - 1.0) + [end, 0.0], image_scale=0.5 * (whole - 1.0))
+    width, height = np.rint(size * (whole[::-1] if turns else whole)).astype(int)
+    view = View("v", "", (int(width) + wide, int(height)), rpc, (0.0, 200.0))
+    assert Placing(False, turns, size).fills(view) == fills
+    assert not Placing(False, turns, size).fills(
+        replace(view, sensor=Corrected(rpc, Correction(*np.zeros((2, 3)), np.full(3, 6e6))))
+    )
 
 
 def test_who_is_wrong_is_who_the_others_are_not_tied_to(render) -> None:

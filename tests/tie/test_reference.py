@@ -18,6 +18,7 @@ from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
+from barpc.tie.patches.channels import INVALID_MARGIN, Patch, of_image, of_reference
 from barpc.tie.reference import (
     PEAK,
     Accuracy,
@@ -27,6 +28,7 @@ from barpc.tie.reference import (
     affine_of_shifts,
     peak,
     register_views,
+    vote,
 )
 from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow
@@ -257,6 +259,33 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
         assert stated == pytest.approx(np.full_like(stated, found.views[k].scatter / 2.08), rel=0.02)
 
 
+def test_a_block_votes_by_its_correlation_where_it_and_the_reference_show_enough(plains, tmp_path):
+    """Of half of a block, and of 0.3 of what lies around it, the edge of which is not used."""
+    (view, _), grey, reference, _ = plains
+    side, reach = 60, 8
+    wide, metres = side + 2 * reach, 111_000.0
+
+    def block(east: float = 0.0, moved: tuple[float, float] = (0.0, 0.0)) -> Patch:
+        corner = np.array([east - wide, wide]) / metres
+        return Patch.on(flat, corner, 2.0, (wide, wide), np.array(moved))
+
+    found = vote(view, 1, (reference,), block(moved=(6.0, -4.0)), reach)
+    assert found.shape == (2 * reach + 1,) * 2
+    assert np.subtract(np.unravel_index(found.argmax(), found.shape), reach).tolist() == [2, 3]  # south, east
+    mine, area = of_image(view, 1, block())[:, reach:-reach, reach:-reach], of_reference([reference], block())
+    part = area[:, 5 : 5 + side, 12 : 12 + side]
+    expected = (mine * part).sum() / np.sqrt((mine**2).sum() * (part**2).sum())
+    assert vote(view, 1, (reference,), block(), reach)[5, 12] == pytest.approx(expected, abs=1e-4)
+    for share, shown in ((0.57, True), (0.43, False)):  # east of the middle the image ends
+        end = view.sensor.localize(np.array([SIDE - 1.0, SIDE / 2]), np.array(LEVEL))[0] * metres
+        east = end + side - 2.0 * (side * share + INVALID_MARGIN)
+        assert (vote(view, 1, (reference,), block(east), reach) is not None) == shown
+    for share, shown in ((0.37, True), (0.23, False)):
+        columns = WIDE // 2 - wide // 2 + round(wide * share + INVALID_MARGIN)
+        cut = plain(tmp_path / "cut.tif", (3000 - grey)[:, :columns])
+        assert (vote(view, 1, (cut,), block(), reach) is not None) == shown
+
+
 @pytest.mark.slow
 def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(plains):
     seen, grey, _, folder = plains
@@ -319,8 +348,8 @@ def test_in_the_north_points_are_looked_for_where_the_vote_says_that_they_are_se
 def test_the_peak_of_all_votes_is_told_in_robust_standard_deviations_from_the_middle():
     rng = np.random.default_rng(0)
     votes = [rng.normal(0, 0.1, (9, 9)).astype(np.float32) for _ in range(3)]
-    for vote in votes:
-        vote[2, 7] += 1.0
+    for one in votes:
+        one[2, 7] += 1.0
     z, at = peak([votes[0], None, *votes[1:]])
     total = np.sum(votes, axis=0)
     away = np.abs(total - np.median(total))

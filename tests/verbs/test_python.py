@@ -137,6 +137,7 @@ def test_a_path_a_dataset_a_view_and_a_camera_are_one_image():
         assert barpc.info(dataset, alt=120.0) == barpc.info(str(VIEWS[0]), alt=120.0)
     np.testing.assert_array_equal(found, np.tile(camera.model.project(GROUND), (len(images), 1)))
     assert every(f"{SAMPLES}/view_0[02].tif") == [str(VIEWS[0]), str(VIEWS[2])]
+    assert len(barpc.info(f"{SAMPLES}/view_0[02].tif", alt=120.0)) == 2
     assert every(path for path in VIEWS) == list(map(str, VIEWS))
     with pytest.raises(InputError, match="3 is no image: give a path"):
         camera_of(3)

@@ -114,11 +114,10 @@ class _GridSearch:
     def matches(self) -> Matches:
         """Return the best place of every point on whole bands, refined in finer pictures."""
         where = self._prediction.where(self._points)
-        middle = 0.5 * (where.before + where.after)
         ends = np.stack([where.place(where.before), where.place(where.after)])
         with np.errstate(invalid="ignore"):
             seen = (ends.max(axis=0) > 0).all(axis=1) & (ends.min(axis=0) < np.array(self._views[1].size)).all(axis=1)
-        rows = np.flatnonzero(seen & np.isfinite(where.along + where.across + middle))
+        rows = np.flatnonzero(seen)
         parts = [
             self._tile(where, rows[group])
             for group in grouped(*np.floor(self._points[rows][:, ::-1] / (self._step * SPAN)).T)
