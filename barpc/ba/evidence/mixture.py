@@ -312,7 +312,7 @@ class Mixture:
         given = self.linear, warm, old, new, precision
         guesses = [first_guess(*given)]
         if guesses[0][1] > np.sqrt(2.0 * self.linear.views) * self.noise:  # else most tracks are met as well as may be
-            touched, view = new.any(axis=(0, 1)), self.linear.view
+            touched, view = np.asarray(new.any(axis=(0, 1))), self.linear.view
             tied = [view[tracks.rows[touched[tracks.rows].any(axis=1)]].ravel() for tracks in self.linear.tracks]
             beside = np.setdiff1d(np.concatenate(tied), view[touched])
             guesses += [first_guess(*given, one) for one in beside.tolist()]
