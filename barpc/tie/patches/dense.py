@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, IntArray
 from barpc.scene import BoolArray
 from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
 
@@ -58,16 +58,35 @@ class EpipolarFrame:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Dense matches: places (n, 2) in both images [px], start altitudes [m], standard deviations along lines [px].
+    """Dense matches: their `place` (3, n): col, row in the frame, disparity; standard deviations along lines [px].
 
     `share`: of the pixels that both images show so many were matched.
     """
 
-    a: Array
-    b: Array
-    alt: Array
+    frame: EpipolarFrame
+    place: Array
     sigma: Array
     share: float
+
+    def some(self, of: slice | IntArray) -> DenseMatches:
+        """Return some of the matches."""
+        return replace(self, place=self.place[:, of], sigma=self.sigma[of])
+
+    @property
+    def a(self) -> Array:
+        """Places (n, 2) in the first image [px]."""
+        return _back(self.frame.maps[0], self.place[:2].T)
+
+    @property
+    def b(self) -> Array:
+        """Places (n, 2) in the second image [px]."""
+        col, row, disparity = self.place
+        return _back(self.frame.maps[1], np.column_stack([col - disparity, row]))
+
+    @property
+    def alt(self) -> Array:
+        """Start altitudes (n,) [m]."""
+        return np.asarray(self.frame.altitude[:3] @ self.place + self.frame.altitude[3])
 
 
 def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
@@ -148,18 +167,11 @@ def dense_matches(
     level = cv2.bilateralFilter(single, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
     row, col = np.nonzero((good & _part_mask(shape, low, frame))[:, ::COLUMNS_PER_PIXEL])
     moves = level[row, col].astype(np.float64)
-    place = np.column_stack([COLUMNS_PER_PIXEL * col, row]) + low
-    moved = place - np.column_stack([moves, np.zeros(len(row))])
-    known = np.column_stack([place, moves, np.ones(len(row))])
     middle = frame.num // 2  # disparity at which both are taken to show the same
     both = int(np.count_nonzero(shown_left[:, middle:] & shown_right[:, : shape[0] - middle]))
-    return DenseMatches(
-        _back(frame.maps[0], place),
-        _back(frame.maps[1], moved),
-        known @ frame.altitude,
-        sigma[row, COLUMNS_PER_PIXEL * col].astype(np.float64),
-        np.count_nonzero(good) / max(both, 1),
-    )
+    place = np.stack([COLUMNS_PER_PIXEL * col + low[0], row + low[1], moves])
+    share = np.count_nonzero(good) / max(both, 1)
+    return DenseMatches(frame, place, sigma[row, COLUMNS_PER_PIXEL * col].astype(np.float64), share)
 
 
 def _frame_window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
