@@ -148,35 +148,33 @@ def dense_matches(
     if window is None:
         return None
     low, shape = window
+    beside = frame.num // 2  # columns that the right picture begins before the left one: disparities are about zero
     pictures = [
-        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low]), shape, band)
-        for path, size, one in zip(images, sizes, frame.maps, strict=True)
+        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low + [more, 0.0]]), shape, band)
+        for path, size, one, more in zip(images, sizes, frame.maps, (0, beside), strict=True)
     ]
     if any(one is None for one in pictures):
         return None
     (left, shown_left), (right, shown_right) = pictures  # type: ignore[misc]
-    middle = frame.num // 2  # disparity at which both are taken to show the same
-    both = shown_left[:, middle:] & shown_right[:, : shape[0] - middle]
+    both = shown_left & shown_right
     about = None if coarse is None else _coarse_disparity(coarse, frame, low, shape)
-    edge = 0  # columns at either side that a narrower search does without
     if about is None or about[2] >= frame.num:
-        disparity, good = _both_ways(left, right, 0, frame.num)
+        disparity, good = _both_ways(left, right, -beside, frame.num)
     else:
         level, first, num = about
-        edge = max(0, frame.num - max(first + num, -first))
-        inner = slice(edge, shape[0] - edge)
-        left, shown_left, level = np.ascontiguousarray(left[:, inner]), shown_left[:, inner], level[:, inner] - edge
-        both = both[:, max(0, edge - middle) : both.shape[1] - edge]
-        disparity, good = _about_coarse(left, right, level, first, num)
+        edge = max(0, beside - max(first + num, -first))  # at either side, which a narrower search does without
+        inner, beside = slice(edge, shape[0] - edge), beside + edge
+        left, shown_left, both = np.ascontiguousarray(left[:, inner]), shown_left[:, inner], both[:, inner]
+        disparity, good = _about_coarse(left, right, level[:, inner] - beside, first, num)
+        low[0] += edge
     good &= shown_left & (_warped(shown_right.astype(np.uint8), _places(disparity), cv2.INTER_NEAREST) > 0)
-    low[0] += edge
     matched = (good & _part_mask((left.shape[1], shape[1]), low, frame))[:, ::COLUMNS_PER_PIXEL]  # a match a pixel
     moves, sigma = refined_disparity(left, right, disparity, good)
     # the mean of those about it that differ by less than a pixel or so, which is one surface
-    moves = np.where(good[:, ::COLUMNS_PER_PIXEL], moves, np.float32(-frame.num))
+    moves = np.where(good[:, ::COLUMNS_PER_PIXEL], moves, np.float32(-2 * frame.num))
     moves = cv2.bilateralFilter(moves, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
     row, col = np.nonzero(matched)
-    place = np.stack([COLUMNS_PER_PIXEL * col + low[0], row + low[1], moves[row, col] + np.float64(edge)])
+    place = np.stack([COLUMNS_PER_PIXEL * col + low[0], row + low[1], moves[row, col] + np.float64(beside)])
     share = np.count_nonzero(good) / max(int(np.count_nonzero(both)), 1)
     return DenseMatches(frame, place, sigma[row, col].astype(np.float64), share)
 
@@ -191,8 +189,8 @@ def _frame_window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tup
         low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
     if (high - low < 2 * margin).any():
         return None
-    low, high = np.floor(low - reach), np.ceil(high + reach)
-    return low, (int(high[0] - low[0]), int(high[1] - low[1]))
+    low, high = np.floor(low - reach / 2), np.ceil(high + reach / 2)
+    return low, (int(high[0] - low[0]) + margin, int(high[1] - low[1]))  # SGBM leaves the last ones out
 
 
 def _part_mask(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
