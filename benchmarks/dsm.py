@@ -123,7 +123,7 @@ class Ground:
             place = np.column_stack([col, row]) + low.astype(np.float64)
             ground.append(shot.exact.localize(place, part[row, col].astype(np.float64)))
         every = np.concatenate(ground)
-        return gathered(tile, every, np.ones(len(every)))[0]
+        return gathered(tile, tile.on_map(every), np.ones(len(every)))[0]
 
 
 def rendered(side: int, kind: str = "usual") -> dict[str, object]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 from pyproj import Transformer
-from rasterio.warp import transform
 from scipy.ndimage import maximum_filter
 
 from barpc.ba import BlockPrior
@@ -26,7 +25,7 @@ from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import height_by_unknowns
 from barpc.ba.solving.structure import counting_sort
 from barpc.base.errors import BarpcError, InputError
-from barpc.base.geodesy import Array, ecef_from_ground, parts
+from barpc.base.geodesy import CHUNK, Array, IntArray, ecef_from_ground, parts
 from barpc.base.options import TieOptions
 from barpc.base.remote import is_url
 from barpc.base.statistics import MAD
@@ -39,6 +38,7 @@ from barpc.report.summary import Summary
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
+from barpc.sensor.rational import monomials
 from barpc.sensor.timing import Clocked
 from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import (
@@ -66,10 +66,12 @@ _MAX_DISPARITY_SPAN = (
 )
 _COARSE = 8  # times a pixel at most of the coarser picture
 _SPLIT = 3  # times that a part is halved at most
+_TRIED = 400  # matches that make a cubic, and as many that test it
+_EXACT = 1e-3  # m: errors of a cubic in place of intersections; of Pleiades' 2e-6
 
 TilePoints = tuple[Array, Array, float, float]
-"""Ground points (n, 3), their standard deviations in height (n,) [m], the share of the pixels matched, and the height
-that a pixel of disparity stands for [m].
+"""Points (n, 3) on the tile's map: east, north, altitude [m]; their standard deviations in height (n,) [m], the share
+of the pixels matched, and the height that a pixel of disparity stands for [m].
 """
 CONVERGENCE_RANGE = 2.0, 45.0
 """Convergence angles [deg] of pairs that are matched: below, a pixel is 30 of height; above, SGBM finds decoys."""
@@ -108,11 +110,22 @@ class Tile:
         """Return the longitude, latitude (rows cols, 2) [deg] of a grid, `edge` cells inside, the north first."""
         col, row = np.meshgrid(*(np.linspace(edge, side - edge, n) for side, n in zip(self.size, count, strict=True)))
         east, north = self.west + self.step * col.ravel(), self.north - self.step * row.ravel()
-        return np.column_stack(transform(self.crs, "EPSG:4326", east, north))
+        return np.column_stack(_map_transform(self.crs).transform(east, north, direction="INVERSE"))
+
+    def on_map(self, ground: Array) -> Array:
+        """Return the east, north, altitude (n, 3) [m] of ground points (n, 3)."""
+        east, north = _map_transform(self.crs).transform(*ground[:, :2].T)
+        return np.column_stack([east, north, ground[:, 2]])
 
     def ground(self) -> Array:
         """Return the ground points (NODES NODES, 3) of the nodes at the middle altitude."""
         return np.column_stack([self.nodes(), np.full(TILE_NODES**2, sum(self.alts) / 2)])
+
+
+@lru_cache
+def _map_transform(crs: str) -> Transformer:
+    """Return the transform from longitude, latitude to a map."""
+    return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
 
 
 def surface_tile(pairs: Sequence[tuple[View, View]], tile: Tile, band: int) -> tuple[F32, ...]:
@@ -162,40 +175,63 @@ def _tile_points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0
         found = dense_matches([view.path for view in pair], sizes, frame, band, near)
         if found is None:
             return []
-        if zoom == 1 or found.share < MATCHED or not len(found.alt):
-            ground = _intersected(pair, found, zoom)
-            known = np.isfinite(ground[:, 2])
-            return [(ground[known], found.sigma[known] * frame.metres, found.share, frame.metres)]
+        if zoom == 1:
+            return [(_intersected(pair, tile, found), found.sigma * frame.metres, found.share, frame.metres)]
+        if found.share < MATCHED or not len(found.sigma):
+            return [(np.empty((0, 3)), np.empty(0), found.share, frame.metres)]
         low, high = np.percentile(found.alt, [1.0, 99.0]) + np.array([-1.0, 1.0]) * ALLOWANCE * frame.metres
         tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
         coarse = (found.a + 0.5) * zoom - 0.5, (found.b + 0.5) * zoom - 0.5, zoom
         zoom //= 2
 
 
-def _intersected(pair: tuple[View, View], found: DenseMatches, zoom: int) -> Array:
-    """Return the ground points (n, 3) of matches; NaN where the rays do not meet."""
-    a, b, ground = (found.a + 0.5) * zoom - 0.5, (found.b + 0.5) * zoom - 0.5, np.empty((len(found.a), 3))
-    for part in parts(len(ground)):
-        ground[part] = intersect_pair([view.sensor for view in pair], (a[part], b[part]), found.alt[part])
-    return ground
+def _intersected(pair: tuple[View, View], tile: Tile, found: DenseMatches) -> Array:
+    """Return the points (n, 3) of matches on the tile's map; NaN or infinite where the rays do not meet.
+
+    They are those of a cubic in col, row and disparity through some matches, if it meets others within `_EXACT`.
+    """
+    sensors, points = [view.sensor for view in pair], np.empty((found.place.shape[1], 3))
+
+    def intersected(of: slice | IntArray) -> Array:
+        some = found.some(of)
+        return tile.on_map(intersect_pair(sensors, (some.a, some.b), some.alt))
+
+    def basis(of: slice | IntArray) -> Array:
+        return monomials((found.place[:, of] - middle) / size)
+
+    if len(points) > CHUNK:
+        middle, size = found.place.mean(axis=1, keepdims=True), np.ptp(found.place, axis=1, keepdims=True) + 1.0
+        ends = np.concatenate([found.place.argmin(axis=1), found.place.argmax(axis=1)])
+        tried = np.append(np.random.default_rng(0).choice(len(points), 2 * _TRIED, replace=False), ends)
+        exact, terms = intersected(tried), basis(tried).T
+        if np.isfinite(exact).all():
+            coeffs = np.linalg.lstsq(terms[:_TRIED], exact[:_TRIED] - exact[0], rcond=None)[0]
+            if np.abs(terms @ coeffs + exact[0] - exact).max() < _EXACT:
+                for part in parts(len(points)):
+                    points[part] = basis(part).T @ coeffs + exact[0]
+                return points
+    for part in parts(len(points)):
+        points[part] = intersected(part)
+    return points
 
 
-def gathered(tile: Tile, ground: Array, sigma: Array) -> F32:
-    """Return the median height of the points in each cell and its sigma (2, rows, cols); NaN where there is none."""
-    width, height = tile.size
-    east, north = Transformer.from_crs("EPSG:4326", tile.crs, always_xy=True).transform(*ground[:, :2].T)
+def gathered(tile: Tile, points: Array, sigma: Array) -> F32:
+    """Return the median height of the points (n, 3) on the map in each cell and its sigma (2, rows, cols); NaN where
+    there is none.
+    """
+    (width, height), (east, north, heights) = tile.size, points.T
     col, row = (np.floor(one / tile.step) for one in (east - tile.west, tile.north - north))
     inside = np.flatnonzero((col >= 0) & (col < width) & (row >= 0) & (row < height))  # none that has no place
-    cell, alt = (row * width + col)[inside].astype(np.int64), ground[inside, 2]
-    order = np.argsort(alt, kind="stable")
+    cell, alt = (row[inside] * width + col[inside]).astype(np.int64), heights[inside]
+    variance = np.bincount(cell, sigma[inside] ** 2, height * width)
+    order = np.argsort(alt)
     order = order[counting_sort(cell[order], width * height)[0]]
     cell, alt = cell[order], alt[order]
     start = np.flatnonzero(np.diff(cell, prepend=-1))
     of, count = cell[start], np.diff(start, append=len(cell))
     cells = np.full((2, height * width), np.nan, np.float32)
     cells[0, of] = (alt[start + (count - 1) // 2] + alt[start + count // 2]) / 2
-    total = np.bincount(cell, sigma[inside[order]] ** 2, height * width)[of]
-    cells[1, of] = np.sqrt(total / count) * noise_of_mean(np.sqrt(count))
+    cells[1, of] = np.sqrt(variance[of] / count) * noise_of_mean(np.sqrt(count))
     return cells.reshape(2, height, width)
 
 

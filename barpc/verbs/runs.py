@@ -177,7 +177,7 @@ def dsm(
 
     Examples
     --------
-    >>> _ = barpc.adjust("data_samples/*.tif", "run", points_per_image=500)
+    >>> _ = barpc.adjust("data_samples/view_0[01].tif", "run", points_per_image=500)
     >>> surface = barpc.dsm("run", "dsm.tif", gsd=2)
     >>> surface.gsd, surface.known > 1000
     (2.0, True)

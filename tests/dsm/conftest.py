@@ -49,7 +49,7 @@ class Rendered:
             at = np.column_stack([col, row]).astype(np.float64)
             ground.append(shot.exact.localize(at, picture.altitude[row, col].astype(np.float64)))
         every = np.concatenate(ground)
-        return gathered(tile, every, np.ones(len(every)))[0]
+        return gathered(tile, tile.on_map(every), np.ones(len(every)))[0]
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,8 @@ def test_places_among_cells_are_those_of_the_map(code: int, west: float) -> None
         at = picked + inside
         lon, lat = to_lonlat.transform(west + 2.0 * at[:, 0], 4_900_000.0 - 2.0 * at[:, 1])
         for turn in (0.0, 360.0, -360.0):
-            found = gathered(tile, np.column_stack([lon + turn, lat, np.full(50, 7.0)]), np.ones(50))
+            points = tile.on_map(np.column_stack([lon + turn, lat, np.full(50, 7.0)]))
+            found = gathered(tile, points, np.ones(50))
             assert set(map(tuple, np.argwhere(found[0] == 7.0)[:, ::-1])) == set(map(tuple, picked))
             assert np.isfinite(found[1]).sum() == len(set(map(tuple, picked)))
     x, y = west + 2.0 * (np.arange(500) + 0.5), 4_900_000.0 - 2.0 * (np.arange(400) + 0.5)

@@ -261,7 +261,7 @@ def test_few_cells_are_grossly_wrong_and_hardly_any_is_lost(kind, tmp_path, monk
         at = np.column_stack([col, row]).astype(np.float64)
         ground.append(shot.exact.localize(at, picture.altitude[row, col].astype(np.float64)))
     every = np.concatenate(ground)
-    truth = gathered(tile, every, np.ones(len(every)))[0]
+    truth = gathered(tile, tile.on_map(every), np.ones(len(every)))[0]
     low = minimum_filter(np.where(np.isfinite(truth), truth, np.inf), 3)
     high = maximum_filter(np.where(np.isfinite(truth), truth, -np.inf), 3)
     pairs = [(block.views[i], block.views[j]) for i, j in group]

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pytest
+from pyproj import CRS
 
 from barpc.ba import BlockPrior
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.dsm.stereo import CameraErrors, noise_of_mean
+from barpc.dsm import stereo
+from barpc.dsm.stereo import CameraErrors, Tile, noise_of_mean
 from barpc.dsm.surface import shaded
 from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, triangulate
-from barpc.tie.patches.dense import WINDOW, epipolar_frame
+from barpc.sensor.geometry import camera_center, intersect_pair, triangulate
+from barpc.sensor.rpc import RPC
+from barpc.tie.patches.dense import WINDOW, DenseMatches, epipolar_frame
 from tests.dsm.conftest import ALTS
 
 
@@ -97,6 +102,47 @@ def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
         scale = np.linalg.norm(one[:, :2], axis=1)
         np.testing.assert_allclose(scale, [2.0, 1.0], rtol=0.1)  # two columns and one row a pixel
         assert len(points) == 75
+
+
+@dataclass(frozen=True)
+class Wobbly:
+    """A camera whose attitude swings along its rows, by so many pixels."""
+
+    still: RPC
+    amplitude: float
+
+    def project(self, ground):
+        at = self.still.project(ground)
+        return at + np.stack([self.amplitude * np.sin(at[..., 1]), np.zeros(at.shape[:-1])], axis=-1)
+
+    def project_jacobian(self, ground):
+        at, jacobian = self.still.project_jacobian(ground)
+        jacobian[..., 0, :] += self.amplitude * np.cos(at[..., 1:]) * jacobian[..., 1, :]
+        return self.project(ground), jacobian
+
+    def localize(self, image, alt):
+        back = np.stack([self.amplitude * np.sin(image[..., 1]), np.zeros(image.shape[:-1])], axis=-1)
+        return self.still.localize(image - back, alt)
+
+
+@pytest.mark.parametrize(("amplitude", "few"), [(0.0, True), (0.1, False)])
+def test_matches_are_intersected_to_a_millimetre_and_one_by_one_where_a_camera_swings(
+    amplitude, few, views, monkeypatch
+):
+    lon, lat = np.meshgrid(np.linspace(5.3995, 5.4005, 5), np.linspace(43.2997, 43.3003, 5))
+    alt = np.repeat(np.linspace(*ALTS, 3), lon.size)
+    ground = np.column_stack([np.tile(lon.ravel(), 3), np.tile(lat.ravel(), 3), alt])
+    frame = epipolar_frame(*(view.sensor.project(ground) for view in views[:2]), alt)
+    col, row = (part.ravel() for part in np.meshgrid(np.arange(-100.0, 100.0), np.arange(-60.0, 60.0)))
+    disparity = frame.num / 2 + np.random.default_rng(3).normal(0.0, frame.num / 8, len(col))
+    found = DenseMatches(frame, np.stack([col, row, disparity]), np.ones(len(col)), 1.0)
+    sensors = [Wobbly(view.sensor, amplitude) for view in views[:2]]
+    tile = Tile(CRS.from_epsg(32631).to_wkt(), 694_000.0, 4_797_000.0, 1.0, (200, 120), ALTS)
+    expected, asked = tile.on_map(intersect_pair(sensors, (found.a, found.b), found.alt)), []
+    monkeypatch.setattr(stereo, "intersect_pair", lambda *given: (asked.extend(given[2]), intersect_pair(*given))[1])
+    pair = [replace(view, sensor=sensor) for view, sensor in zip(views, sensors, strict=False)]
+    np.testing.assert_allclose(stereo._intersected(pair, tile, found), expected, atol=1e-3)
+    assert (len(asked) < 1000) == few
 
 
 def test_a_slope_to_the_light_is_bright_and_one_away_from_it_dark_and_the_unknown_black():

@@ -42,7 +42,7 @@ from benchmarks.calibrate import Scene, Sensor, any_looks, scene
 from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
-RUNS = 7
+RUNS = 5
 pytestmark = pytest.mark.filterwarnings("ignore")
 
 
@@ -83,7 +83,7 @@ def archive(line: Sensor, tmp_path_factory: pytest.TempPathFactory) -> list[Path
     """The folders of finished runs of one sensor."""
     place, rng, found = tmp_path_factory.mktemp("archive"), np.random.default_rng(5), []
     for i in range(RUNS):
-        paths = files(scene(any_looks(3, rng), line, rng, 500, size=SIZE), place / f"scene{i}")
+        paths = files(scene(any_looks(3, rng), line, rng, 300, size=SIZE), place / f"scene{i}")
         run(paths)
         found.append(paths[0].parent / "adjusted")
     return found

@@ -96,11 +96,24 @@ def test_a_step_of_least_squares_moves_no_match_by_more_than_a_column(off):
     left = cv2.normalize(left, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
     given = np.full(left.shape, 5.0 + off, np.float32)
-    found = refined_disparity(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20] - 5.0
+    found = refined_disparity(left, right, given, np.ones(left.shape, dtype=bool))[0][10:-10, 10:-10] - 5.0
     assert np.abs(found - off).max() <= 1.0
     assert np.median(found) == pytest.approx(0.5 * off)  # towards the right place, as far as it may
-    exact = refined_disparity(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 20:-20]
+    exact = refined_disparity(left, right, given - off, np.ones(left.shape, dtype=bool))[0][10:-10, 10:-10]
     assert np.abs(exact - 5.0).max() < 0.1
+
+
+def test_rows_are_refined_alike_however_many_are_worked_on_together(monkeypatch):
+    rng = np.random.default_rng(6)
+    left = cv2.GaussianBlur(rng.uniform(0, 255, (70, 91)).astype(np.float32), (0, 0), 1.0).astype(np.uint8)
+    good, disparity = rng.random(left.shape) < 0.8, rng.normal(5.0, 0.3, left.shape).astype(np.float32)
+    found = []
+    for rows in (70, 64, 8):
+        monkeypatch.setattr(dense, "_STRIP", rows)
+        found.append(refined_disparity(left, np.roll(left, -5, axis=1), disparity, good))
+    assert found[0].shape == (2, 70, 46)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=1e-4, atol=1e-4)
 
 
 def test_what_resampling_leaves_of_noise_is_what_sigma_takes_for_it():
@@ -127,7 +140,7 @@ def test_a_step_finds_the_place_between_columns_and_says_how_well_whatever_gain_
     noisy = [np.clip(np.rint(one + 2.0 * rng.standard_normal(one.shape)), 0, 255).astype(np.uint8) for one in pictures]
     good = rng.random(texture.shape) >= lost  # what is not matched is anywhere
     found, sigma = refined_disparity(*noisy, np.where(good, 5.0, 70.0).astype(np.float32), good)
-    inner = np.pad(good[15:-15, 40:-40], ((15, 15), (40, 40)))
+    inner = np.pad(good[15:-15, 40:-40], ((15, 15), (40, 40)))[:, ::COLUMNS_PER_PIXEL]
     off, said = found[inner] - 5.3, COLUMNS_PER_PIXEL * np.median(sigma[inner])
     assert abs(off.mean()) < 0.06
     assert off.std() < 0.12

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, IntArray, parts
 from barpc.scene import BoolArray
-from barpc.tie.pixels import Box, FloatImage, Stretch, levelled, read_pixels
+from barpc.tie.pixels import Box, ByteImage, FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame misses the epipolar lines by more [px] is too large for one."""
@@ -33,6 +33,7 @@ SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
+_STRIP = 64  # rows refined together, which stay in cache
 NOISE_VARIANCE, SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise of variance 1 and of its slope
 
 
@@ -58,16 +59,35 @@ class EpipolarFrame:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Dense matches: places (n, 2) in both images [px], start altitudes [m], standard deviations along lines [px].
+    """Dense matches: their `place` (3, n): col, row in the frame, disparity; standard deviations along lines [px].
 
     `share`: of the pixels that both images show so many were matched.
     """
 
-    a: Array
-    b: Array
-    alt: Array
+    frame: EpipolarFrame
+    place: Array
     sigma: Array
     share: float
+
+    def some(self, of: slice | IntArray) -> DenseMatches:
+        """Return some of the matches."""
+        return replace(self, place=self.place[:, of], sigma=self.sigma[of])
+
+    @property
+    def a(self) -> Array:
+        """Places (n, 2) in the first image [px]."""
+        return _back(self.frame.maps[0], self.place[:2].T)
+
+    @property
+    def b(self) -> Array:
+        """Places (n, 2) in the second image [px]."""
+        col, row, disparity = self.place
+        return _back(self.frame.maps[1], np.column_stack([col - disparity, row]))
+
+    @property
+    def alt(self) -> Array:
+        """Start altitudes (n,) [m]."""
+        return np.asarray(self.frame.altitude[:3] @ self.place + self.frame.altitude[3])
 
 
 def epipolar_frame(a: Array, b: Array, alt: Array) -> EpipolarFrame:
@@ -128,38 +148,35 @@ def dense_matches(
     if window is None:
         return None
     low, shape = window
-    parts = [
-        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low]), shape, band)
-        for path, size, one in zip(images, sizes, frame.maps, strict=True)
+    beside = frame.num // 2  # columns that the right picture begins before the left one: disparities are about zero
+    pictures = [
+        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low + [more, 0.0]]), shape, band)
+        for path, size, one, more in zip(images, sizes, frame.maps, (0, beside), strict=True)
     ]
-    if any(part is None for part in parts):
+    if any(one is None for one in pictures):
         return None
-    (left, shown_left), (right, shown_right) = parts  # type: ignore[misc]
+    (left, shown_left), (right, shown_right) = pictures  # type: ignore[misc]
+    both = shown_left & shown_right
     about = None if coarse is None else _coarse_disparity(coarse, frame, low, shape)
     if about is None or about[2] >= frame.num:
-        disparity, good = _both_ways(left, right, 0, frame.num)
+        disparity, good = _both_ways(left, right, -beside, frame.num)
     else:
-        disparity, good = _about_coarse(left, right, *about)
-    seen = shown_left & (_warped(shown_right.astype(np.uint8), disparity, cv2.INTER_NEAREST) > 0)
-    good &= seen
-    disparity, sigma = refined_disparity(left, right, disparity, good)
-    # a match a pixel: the mean of those about it that differ by less than a pixel or so, which is one surface
-    single = np.ascontiguousarray(np.where(good, disparity, -frame.num)[:, ::COLUMNS_PER_PIXEL], np.float32)
-    level = cv2.bilateralFilter(single, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
-    row, col = np.nonzero((good & _part_mask(shape, low, frame))[:, ::COLUMNS_PER_PIXEL])
-    moves = level[row, col].astype(np.float64)
-    place = np.column_stack([COLUMNS_PER_PIXEL * col, row]) + low
-    moved = place - np.column_stack([moves, np.zeros(len(row))])
-    known = np.column_stack([place, moves, np.ones(len(row))])
-    middle = frame.num // 2  # disparity at which both are taken to show the same
-    both = int(np.count_nonzero(shown_left[:, middle:] & shown_right[:, : shape[0] - middle]))
-    return DenseMatches(
-        _back(frame.maps[0], place),
-        _back(frame.maps[1], moved),
-        known @ frame.altitude,
-        sigma[row, COLUMNS_PER_PIXEL * col].astype(np.float64),
-        np.count_nonzero(good) / max(both, 1),
-    )
+        level, first, num = about
+        edge = max(0, beside - max(first + num, -first))  # at either side, which a narrower search does without
+        inner, beside = slice(edge, shape[0] - edge), beside + edge
+        left, shown_left, both = np.ascontiguousarray(left[:, inner]), shown_left[:, inner], both[:, inner]
+        disparity, good = _about_coarse(left, right, level[:, inner] - beside, first, num)
+        low[0] += edge
+    good &= shown_left & (_warped(shown_right.astype(np.uint8), _places(disparity), cv2.INTER_NEAREST) > 0)
+    matched = (good & _part_mask((left.shape[1], shape[1]), low, frame))[:, ::COLUMNS_PER_PIXEL]  # a match a pixel
+    moves, sigma = refined_disparity(left, right, disparity, good)
+    # the mean of those about it that differ by less than a pixel or so, which is one surface
+    moves = np.where(good[:, ::COLUMNS_PER_PIXEL], moves, np.float32(-2 * frame.num))
+    moves = cv2.bilateralFilter(moves, WINDOW, sigmaColor=COLUMNS_PER_PIXEL, sigmaSpace=np.inf)
+    row, col = np.nonzero(matched)
+    place = np.stack([COLUMNS_PER_PIXEL * col + low[0], row + low[1], moves[row, col] + np.float64(beside)])
+    share = np.count_nonzero(good) / max(int(np.count_nonzero(both)), 1)
+    return DenseMatches(frame, place, sigma[row, col].astype(np.float64), share)
 
 
 def _frame_window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tuple[Array, tuple[int, int]] | None:
@@ -172,8 +189,8 @@ def _frame_window(sizes: Sequence[tuple[int, int]], frame: EpipolarFrame) -> tup
         low, high = np.maximum(low, corners.min(axis=0)), np.minimum(high, corners.max(axis=0) + more)
     if (high - low < 2 * margin).any():
         return None
-    low, high = np.floor(low - reach), np.ceil(high + reach)
-    return low, (int(high[0] - low[0]), int(high[1] - low[1]))
+    low, high = np.floor(low - reach / 2), np.ceil(high + reach / 2)
+    return low, (int(high[0] - low[0]) + margin, int(high[1] - low[1]))  # SGBM leaves the last ones out
 
 
 def _part_mask(shape: tuple[int, int], low: Array, frame: EpipolarFrame) -> BoolArray:
@@ -190,7 +207,7 @@ def _back(one: Array, place: Array) -> Array:
 
 def _resampled(
     path: str, size: tuple[int, int], one: Array, shape: tuple[int, int], band: int
-) -> tuple[npt.NDArray[np.uint8], BoolArray] | None:
+) -> tuple[ByteImage, BoolArray] | None:
     """Return an image in the frame, in 8 bits, and where it is known; None without valid pixels there."""
     corners = _back(one, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * shape)
     low = np.clip(np.floor(corners.min(axis=0)).astype(int) - 2, 0, size)
@@ -231,63 +248,80 @@ def _coarse_disparity(
         near, of = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (known, total))
         level = cv2.resize(level, known.shape, interpolation=cv2.INTER_LINEAR)
         level += near / (near + 1.0) * (of / np.maximum(near, np.finfo(np.float64).tiny) - level)
-    level = cv2.resize(level, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)[: shape[1], : shape[0]]
+    level = cv2.resize(level.astype(np.float32), None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)
+    level = level[: shape[1], : shape[0]]
     place = np.clip(np.rint(a).astype(np.int64), 0, np.array(shape) - 1)
     beside = disparity - level[place[:, 1], place[:, 0]]
     first, last = np.percentile(beside, [1.0, 99.0]) + np.array([-1.0, 1.0]) * ALLOWANCE * coarse[2] * COLUMNS_PER_PIXEL
     first = int(np.floor(first))
-    return level.astype(np.float32), first, 16 * int(np.ceil((last - first) / 16))
+    return np.asarray(level, np.float32), first, 16 * int(np.ceil((last - first) / 16))
 
 
 def _about_coarse(
-    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], level: FloatImage, first: int, num: int
+    left: ByteImage, right: ByteImage, level: FloatImage, first: int, num: int
 ) -> tuple[FloatImage, BoolArray]:
     """Match as `_both_ways`, right where it is bent so that the coarse surface has no disparity."""
-    beside, good = _both_ways(left, np.asarray(_warped(right, level, cv2.INTER_CUBIC), np.uint8), first, num)
-    return np.asarray(beside + _warped(level, beside, cv2.INTER_LINEAR), np.float32), good
+    bent = np.asarray(_warped(right, _places(level), cv2.INTER_CUBIC), np.uint8)
+    beside, good = _both_ways(left, bent, first, num)
+    return np.asarray(beside + _warped(level, _places(beside), cv2.INTER_LINEAR), np.float32), good
 
 
-def _both_ways(
-    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], first: int, num: int
-) -> tuple[FloatImage, BoolArray]:
+def _both_ways(left: ByteImage, right: ByteImage, first: int, num: int) -> tuple[FloatImage, BoolArray]:
     """Match both ways: `num` disparities of `left` from the first on, kept where the way back from `right` ends at most
     a pixel beside.
     """
     matcher = cv2.StereoSGBM.create(minDisparity=first, numDisparities=num, **SGBM)
-    there = matcher.compute(left, right).astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
+    there = matcher.compute(left, right)
     turned = [np.ascontiguousarray(one[:, ::-1]) for one in (right, left)]
-    back = matcher.compute(*turned)[:, ::-1].astype(np.float32) / np.float32(cv2.StereoMatcher_DISP_SCALE)
-    rows, cols = np.ogrid[: left.shape[0], : left.shape[1]]
-    at = np.clip(np.rint(cols - there).astype(np.int64), 0, left.shape[1] - 1)
-    good: BoolArray = (there >= first) & (np.abs(there - back[rows, at]) <= COLUMNS_PER_PIXEL)
-    return there, good
+    back = np.ascontiguousarray(matcher.compute(*turned)[:, ::-1])
+    scale = cv2.StereoMatcher_DISP_SCALE
+    disparity = there * np.float32(1 / scale)
+    met = _warped(back, _places(disparity), cv2.INTER_NEAREST)
+    return disparity, (there >= first * scale) & (np.abs(there - met) <= COLUMNS_PER_PIXEL * scale)
 
 
-def refined_disparity(
-    left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8], disparity: FloatImage, good: BoolArray
-) -> tuple[FloatImage, FloatImage]:
-    """Refine SGBM's disparities [columns] by a step of least squares matching; return also sigmas [px].
+def refined_disparity(left: ByteImage, right: ByteImage, disparity: FloatImage, good: BoolArray) -> FloatImage:
+    """Refine SGBM's disparities [columns] by a step of least squares matching; return them and their sigmas [px]
+    (2, rows, pixels), of each pixel's first column.
 
     SGBM locks to whole columns and lags on slopes; the step does not. A window's grey values are a gain, an offset and
     a shift along the line of the other's; noise is what these leave. Noise is in the slopes, too, and is taken out of
     what they tell. The step counts by the variance of SGBM's word over the sum of both.
     """
-    side, weight = (COLUMNS_PER_PIXEL * WINDOW, WINDOW), good.astype(np.float32)
+    found, reach = [], WINDOW - 1  # of the windows about pixels that were moved by the means of theirs
+    for part in parts(len(left), _STRIP):
+        top = max(part.start - reach, 0)
+        near = slice(top, part.stop + reach)
+        strip = _least_squares_step(left[near], right[near], disparity[near], good[near])
+        found.append(strip[:, part.start - top : part.stop - top])
+    return np.concatenate(found, axis=1)
+
+
+def _least_squares_step(left: ByteImage, right: ByteImage, disparity: FloatImage, good: BoolArray) -> FloatImage:
+    """Return the refined disparities and sigmas of a strip of rows, with rows about it that its windows reach."""
+    weight = good.astype(np.float32)
+    side = COLUMNS_PER_PIXEL * WINDOW, WINDOW
     total = np.maximum(cv2.boxFilter(weight, cv2.CV_32F, side), 1e-3)
+    level = cv2.boxFilter(disparity * weight, cv2.CV_32F, side) / total
+    square = cv2.boxFilter(disparity * disparity * weight, cv2.CV_32F, side) / total
+    even = square - level**2 < 1.0  # a column: no edge of a roof in the window
+    start = np.where(good & even, level, disparity)
+    places = _places(start)
+    b = _warped(right.astype(np.float32), places, cv2.INTER_CUBIC)
+    slope = _slopes(left) + _warped(_slopes(right), places, cv2.INTER_LINEAR)
+    total = np.ascontiguousarray(total[:, ::COLUMNS_PER_PIXEL])
 
     def mean(values: FloatImage) -> FloatImage:
-        return np.asarray(cv2.boxFilter(values * weight, cv2.CV_32F, side) / total, np.float32)
+        """Return the means over the windows about each pixel's first column: of it and the column before together."""
+        pixels = values[:, ::2].copy()
+        pixels[:, 1:] += values[:, 1:-1:2]
+        pixels[:, 0] += values[:, 1]
+        return np.asarray(cv2.boxFilter(pixels, cv2.CV_32F, (WINDOW, WINDOW)) / (2 * total), np.float32)
 
-    level = mean(disparity)
-    even = mean(disparity * disparity) - level**2 < 1.0  # a column: no edge of a roof in the window
-    start = np.where(good & even, level, disparity).astype(np.float32)
-    a, other = left.astype(np.float32), right.astype(np.float32)
-    b = _warped(other, start, cv2.INTER_CUBIC)
-    slope = (np.gradient(a, axis=1) + _warped(np.gradient(other, axis=1), start, cv2.INTER_LINEAR)) / 2
-    level_a, level_b, level_s = mean(a), mean(b), mean(slope)
-    aa, bb, ss = mean(a * a) - level_a**2, mean(b * b) - level_b**2, mean(slope * slope) - level_s**2
-    ab, bs = mean(a * b) - level_a * level_b, mean(b * slope) - level_b * level_s
-    a_s = mean(a * slope) - level_a * level_s
+    a, b, s = (one * weight for one in (left, b, slope))
+    level_a, level_b, level_s = mean(a), mean(b), mean(s)
+    aa, bb, ss = mean(a * a) - level_a**2, mean(b * b) - level_b**2, mean(s * s) - level_s**2
+    ab, bs, a_s = mean(a * b) - level_a * level_b, mean(b * s) - level_b * level_s, mean(a * s) - level_a * level_s
     bb = np.maximum(bb, 1e-3)
     told = np.maximum(ss - bs**2 / bb, 1e-3)
     shift = (a_s - ab * bs / bb) / told
@@ -295,12 +329,21 @@ def refined_disparity(
     left_over = np.maximum(aa - ab**2 / bb - told * shift**2, 0.0)
     noise = np.maximum(left_over * pixels / np.maximum(pixels - 3, 1) / NOISE_VARIANCE, hat)  # 3: the unknowns
     variance = noise / pixels / np.maximum(told - noise * SLOPE_VARIANCE / 4, 0.1 * told)
-    found = start - shift * hat / (hat + variance)
-    kept = np.clip(found, disparity - 1.0, disparity + 1.0)
-    return np.asarray(kept, np.float32), np.asarray(np.sqrt(variance) / COLUMNS_PER_PIXEL, np.float32)
+    found, near = start[:, ::COLUMNS_PER_PIXEL] - shift * (hat / (hat + variance)), disparity[:, ::COLUMNS_PER_PIXEL]
+    return np.stack([np.clip(found, near - 1.0, near + 1.0), np.sqrt(variance) / COLUMNS_PER_PIXEL])
 
 
-def _warped(values: npt.NDArray[Any], disparity: FloatImage, how: int) -> npt.NDArray[Any]:
-    """Return the right picture resampled at the left one's pixels by their disparities."""
+def _slopes(picture: ByteImage) -> FloatImage:
+    """Return half the slopes of a picture along its rows, per column."""
+    return np.asarray(cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=1, scale=0.25), np.float32)
+
+
+def _places(disparity: FloatImage) -> tuple[FloatImage, FloatImage]:
+    """Return the col, row of the right picture that the left one's pixels are at by their disparities."""
     cols, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in disparity.shape[::-1]))
-    return np.asarray(cv2.remap(values, np.asarray(cols - disparity, np.float32), rows, how))
+    return cols - disparity, rows
+
+
+def _warped(values: npt.NDArray[Any], places: tuple[FloatImage, FloatImage], how: int) -> npt.NDArray[Any]:
+    """Return the right picture resampled at places in it."""
+    return np.asarray(cv2.remap(values, *places, how))
