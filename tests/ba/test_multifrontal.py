@@ -295,7 +295,8 @@ def test_a_block_is_adjusted_as_in_dense_form(monkeypatch, sized: Sized, options
     assert [f.covariance.factor.method for f in found] == ["multifrontal", "dense"]
     assert (one.covariance.reduced.common is not None) == bool(options)
     np.testing.assert_allclose(one.params, other.params, atol=1e-7)
-    assert one.cost_history[-1] == pytest.approx(other.cost_history[-1], rel=1e-9)
+    # not of costs, which rounding alone moves by a billionth
+    assert ((one.residuals - other.residuals) ** 2).sum() < 1e-10 * (other.residuals**2).sum()
     np.testing.assert_allclose(one.gauge.sigma, other.gauge.sigma, rtol=1e-7)
     views = np.arange(n)
     sigma = [np.sqrt(np.diag(f.covariance.view(4))) for f in found]

@@ -100,7 +100,8 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     tile = Tile(CRS.from_epsg(32631).to_wkt(), 450_000.0, 4_900_000.0, 2.0, (8, 6), (100.0, 300.0))
     asked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     sizes: list[Any] = []
-    coarse = SimpleNamespace(share=1.0, alt=np.linspace(140.0, 240.0, 101), a=np.array([7.0]), b=np.array([9.5]))
+    sight = {"a": np.array([7.0]), "b": np.array([9.5]), "sigma": np.array([0.1])}
+    coarse = SimpleNamespace(share=1.0, alt=np.linspace(140.0, 240.0, 101), **sight)
 
     def framed(a: np.ndarray, b: np.ndarray, alt: np.ndarray) -> Any:
         asked.append((a, b, alt))

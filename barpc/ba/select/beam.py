@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -105,7 +106,9 @@ class _SearchState:
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
         one, made, gain = min(same, key=lambda row: row[0].share(self.seen))  # of two as good, the smaller part
         others = [row for row in tried if row[0] is not one and row[0].differs(one)]
-        other = max(((row[0].NAME, row[2]) for row in others), default=("", 0.0), key=lambda row: row[1])
+        other = max(
+            ((row[0].NAME, _least_gain(row, one, gain)) for row in others), default=("", 0.0), key=itemgetter(1)
+        )
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if isinstance(row, Sinusoid) and isinstance(one, Sinusoid)}))
         logger.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.NAME, one.view, one.where, gain, *other)
@@ -172,6 +175,16 @@ class _SearchState:
             yield from row.term.findings(
                 self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=views
             )
+
+
+def _contains(one: Term, other: Term) -> bool:
+    """Return whether a term is another at its limit, as an endless decay is a step: of two of an image the dearer."""
+    return _of_one_image(one, other) and one.price > other.price
+
+
+def _least_gain(row: _Candidate, best: Term, gain: float) -> float:
+    """Return what a candidate gains, refined or not: one that contains the best at least as much, but for its price."""
+    return max(row[2], gain + best.price - row[0].price) if _contains(row[0], best) else row[2]
 
 
 def _of_one_image(one: Term, other: Term) -> bool:
@@ -303,7 +316,7 @@ class TermSearch:
     def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
         """Return the terms, best first, with ends, periods and lengths refined where these may gain most.
 
-        Where nothing is left beside the best, another kind of its image says the same by more.
+        Where nothing is left beside the best, what contains it says the same at a higher price.
         """
         kinds = [kind for kind in TERMS.values() if kind.LOCAL]
         local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
@@ -312,7 +325,7 @@ class TermSearch:
         out, enough = list[tuple[Term, MixtureFit]](), False
         for one, found, gain in made:
             asked = gain > least and (one in local or not (one.LOCAL or one.group))
-            same = enough and _of_one_image(one, made[0][0]) and one.NAME != made[0][0].NAME
+            same = enough and _contains(one, made[0][0])
             out.append(self._refine(one, found) if asked and not same else (one, found))
             enough = self._leaves_nothing(self._sorted(out)) if len(out) == 1 else enough
         return self._sorted(out)
