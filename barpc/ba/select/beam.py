@@ -183,7 +183,7 @@ def _contains(one: Term, other: Term) -> bool:
 
 
 def _least_gain(row: _Candidate, best: Term, gain: float) -> float:
-    """Return what a candidate gains, refined or not: one that contains the best at least as much, but for its price."""
+    """Return the gain of a candidate, refined or not: one that contains the best gains as much, but for its price."""
     return max(row[2], gain + best.price - row[0].price) if _contains(row[0], best) else row[2]
 
 
