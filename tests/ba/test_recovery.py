@@ -344,6 +344,9 @@ def test_contradictions_are_refused(block):
     )  # fmt: skip
     with pytest.raises(InputError, match="twice"):
         adjust_tracks(block.views, twice, centers=centers_of(block))
+    alike = replace(block.views[1], name=block.views[0].name)
+    with pytest.raises(InputError, match="two views have the same name"):
+        adjust_tracks((block.views[0], alike, *block.views[2:]), tracks, centers=centers_of(block))
     with pytest.raises(InputError, match="no view is named"):
         adjust_tracks(block.views, tracks, AdjustOptions(fixed=("nobody",)), centers=centers_of(block))
     with pytest.raises(InputError, match="not one of"):

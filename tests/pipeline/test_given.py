@@ -16,7 +16,7 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.base.statistics import robust_spread
 from barpc.pipeline import RunOptions, adjust, check
-from barpc.pipeline.inputs import given_matches, given_tracks
+from barpc.pipeline.inputs import given_matches, given_tracks, linked_names
 from barpc.pipeline.loading import load_views
 from barpc.tie.pairing.epipolar import coherent, epipolar_segments
 from tests.pointio.stages import read_matches
@@ -82,6 +82,15 @@ def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) 
     said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
     with pytest.raises(InputError, match=said):
         read([tmp_path / "m.csv"], views)
+
+
+def test_the_old_images_that_have_matches_with_new_ones_are_named(tmp_path) -> None:
+    """Matches among old images, or among new ones, link nobody."""
+    pairs = [("new_a", "old_b"), ("old_a", "old_c"), ("new_a", "new_b"), ("old_d", "new_b")]
+    rows = [f"{name},{5 + n},7,{n}\n" for n, pair in enumerate(pairs) for name in pair]
+    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
+    old = ["old_a", "old_b", "old_c", "old_d"]
+    assert linked_names([tmp_path / "m.csv"], ["new_a", "new_b"], old) == ["old_b", "old_d"]
 
 
 @pytest.mark.parametrize("read", [given_matches, given_tracks])
