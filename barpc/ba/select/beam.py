@@ -178,8 +178,14 @@ class _SearchState:
 
 
 def _contains(one: Term, other: Term) -> bool:
-    """Return whether a term is another at its limit, as an endless decay is a step: of two of an image the dearer."""
-    return _of_one_image(one, other) and one.price > other.price
+    """Return whether a term is another at its limit: an endless decay is a step to an end of its image, or the rest."""
+    if not _of_one_image(one, other) or one.price <= other.price:
+        return False
+    assert one.where is not None
+    assert other.where is not None
+    (axis, start, stop, _, rate), (axis2, *ends) = one.where, other.where[:3]
+    size = 0.5 * stop if rate > 0.0 else -start  # as `open_ended` has it, which a decay is
+    return axis == axis2 and (ends[0] == -size or ends[1] == 2.0 * size)
 
 
 def _least_gain(row: _Candidate, best: Term, gain: float) -> float:
