@@ -106,6 +106,27 @@ def test_long_and_accurate_tracks_are_kept_first() -> None:
     assert (np.bincount(tracks.point) == 3).sum() > 250
 
 
+def test_a_border_that_two_of_three_views_see_has_its_tracks() -> None:
+    """The third view begins at column 127 of the others, before it all tracks are short: each cell keeps half or more."""
+    both, three = many(20_000), many(20_000, 3)
+    three = three.select(np.repeat(three.xy[::3, 0] >= 127, 3))
+    joined = Tracks(
+        np.concatenate([both.view, three.view]),
+        np.concatenate([both.point, three.point + both.num_points]),
+        np.concatenate([both.xy, three.xy]),
+        np.concatenate([both.sigma, three.sigma]),
+    )
+    kept = thin(joined, [(1001, 1001)] * 3, 1000)
+    first = kept.xy[kept.view == 0]
+    assert 700 <= len(first) <= 1000
+    side = np.sqrt(4 * 1001**2 / 1000)
+    counts = np.zeros((2, 15), int)
+    col, row = ((first + 0.5) // side).astype(int).T
+    within = (col < 2) & (row < 15)
+    np.add.at(counts, (col[within], row[within]), 1)
+    assert counts.min() >= 2
+
+
 def test_accuracies_within_a_hundredth_of_a_pixel_are_alike() -> None:
     """Else the images' part that is better by nothing would be filled first."""
     alike = many(3000)
