@@ -27,6 +27,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.worlds import DEM_AS_STATED, judge
 from benchmarks.worlds_families import make
+from tests.ba.residuals import residuals_at
 from tests.lanes import known, rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
@@ -106,7 +107,7 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     block, problem, state = started(made, tracks)
     linear = linearise(problem, state, block.use, block.sigma, 800.0)
     ground, moves = GroundMotion.of(problem, state), moves[block.order]
-    by_move = ground.by_moves(block.view, 3)
+    by_move, none = ground.by_moves(block.view, 3), np.zeros((2, 0, len(block.view)))
     start = np.where(corner(made, 0.15)[block.point], 0.95, 0.3)
     group = Group(by_move, np.full(4, 30.0), ground.cells(GROUND_CELLS), start)
     base, found = fit_mixture(linear), fit_mixture(linear, group=group)
@@ -115,13 +116,19 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     assert (one.member == moves).mean() > 0.98
     assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
     assert one.between == (0, 2)
+    term, residuals = MovingObjects(-1, none, np.zeros(0), 0.0, group=group), residuals_at(block)
+    assert term.amplitude(residuals, found) == pytest.approx(3.0 * GSD / ground.pixel, rel=0.1)
+    up = [ground.by_ground[..., block.view == v].mean(axis=2) for v in range(3)]
+    leans = [-np.linalg.solve(one[:, :2], one[:, 2]) for one in up]  # how far east and north a metre of height looks
+    higher = np.ravel([lean - leans[0] for lean in leans[1:]])  # two pixels, and nobody can tell
+    assert term.amplitude(residuals, replace(found, move=2.0 * higher / np.abs(higher).max())) < 0.02
+    assert term.amplitude(residuals, replace(found, moving=np.minimum(found.moving, 0.5))) == np.inf
     assert found.noise == pytest.approx(1.0, abs=0.1)
     held_out = block.without(np.isin(block.point % 5, [1, 2, 3]))
     mine = members(problem, state.params, one, held_out)
     assert (mine == moves[~np.isin(block.point % 5, [1, 2, 3])]).mean() > 0.95
     assert not len(members(problem, state.params, one, block.without(block.point >= 0)))
     taking_part = np.concatenate([part.rows.ravel() for part in linear.tracks])
-    none = np.zeros((2, 0, len(block.view)))
     again = moving_of(linear, none, replace(group, share=one.shares[group.cell]), found)[taking_part]
     np.testing.assert_allclose(again, found.moving[taking_part], atol=0.02)  # the shares are a step farther
     few = linear.thinned(300)

@@ -12,7 +12,7 @@ import pytest
 from barpc.ba.evidence.mixture import MixtureFit, fit_mixture, log_likelihoods
 from barpc.ba.evidence.periods import Period
 from barpc.ba.evidence.scan import BINS, Interval, price
-from barpc.ba.terms import LowFrequency, MovingObjects, Sinusoid, Transient, proposed
+from barpc.ba.terms import LowFrequency, Sinusoid, Transient, proposed
 from barpc.ba.terms.decay import Decay
 from barpc.ba.terms.step import Step, largest_part, open_ended
 from barpc.ba.terms.term import SIZE_PRICE, Residuals, Term
@@ -404,16 +404,7 @@ def test_a_part_is_counted_in_observations_of_its_image_or_of_all() -> None:
     assert Transient.at_rate(s, 0.01, 1.0).share(s) == 1.0
 
 
-def test_floors_are_those_of_an_amplitude_and_of_a_mean_motion() -> None:
+def test_an_amplitude_is_asked_of_sinusoids_alone() -> None:
     swing = Sinusoid.of(seen(), Period(1, 300.0, 9.0))
-    assert swing.amplitude(fitted(60, [7.0, 0.36, 0.48, 0.48, 0.64])) == pytest.approx(1.0)
-    by_move = np.zeros((2, 1, 6))
-    by_move[0, 0, [0, 1]], by_move[1, 0, 2] = [1.0, 50.0], 7.0  # a mean square of 25, of those that move
-    group: Any = SimpleNamespace(by_move=by_move)
-    one = MovingObjects(-1, np.zeros((2, 0, 6)), np.zeros(0), 0.0, group=group)
-    moving = np.array([0.6, 0.4, 0.9, 0.0, 0.0, 0.0])
-    found: Any = SimpleNamespace(moving=moving, move=np.array([0.05]))
-    assert one.amplitude(found) == pytest.approx(0.25)
-    found.moving = 0.5 * np.ones(6)
-    assert one.amplitude(found) == np.inf
-    assert Step.at(seen(), 1, (1, 0.0, 9.0, 0.0, 0.0)).amplitude(fitted(60, [0.0, 0.0])) == np.inf
+    assert swing.amplitude(seen(), fitted(60, [7.0, 0.36, 0.48, 0.48, 0.64])) == pytest.approx(1.0)
+    assert Step.at(seen(), 1, (1, 0.0, 9.0, 0.0, 0.0)).amplitude(seen(), fitted(60, [0.0, 0.0])) == np.inf

@@ -107,7 +107,7 @@ def test_long_and_accurate_tracks_are_kept_first() -> None:
 
 
 def test_a_border_that_two_of_three_views_see_has_its_tracks() -> None:
-    """The third view begins at column 127 of the others, before it all tracks are short: each cell keeps half or more."""
+    """The third view begins at column 127 of the others, where all tracks are short before: cells keep half."""
     both, three = many(20_000), many(20_000, 3)
     three = three.select(np.repeat(three.xy[::3, 0] >= 127, 3))
     joined = Tracks(

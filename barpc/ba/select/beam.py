@@ -290,7 +290,7 @@ class TermSearch:
         if moves and not self._leaves_nothing(made):
             made = self._sorted([row[:2] for row in (*made, *self._moving())])
         least = self.floor * _LEAST_FLOORS
-        return self._sorted(row[:2] for row in made if row[0].amplitude(row[1]) >= least)
+        return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
 
     def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K)."""

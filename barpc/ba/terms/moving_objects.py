@@ -39,13 +39,12 @@ class MovingObjects(Term):
         none, cost = np.zeros((2, 0, len(linear.view))), moving_ground.price_of_group(linear, one.cell)
         return [cls(-1, none, np.zeros(0), cost, group=one)]
 
-    def amplitude(self, found: MixtureFit) -> float:
-        """Return the root mean square displacement of the group [px]; infinite where nothing is of it."""
-        gone = found.moving > 0.5
-        if self.group is None or not gone.any():
+    def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
+        """Return the displacement between two views [px], beside an effect of height; infinite where nothing moves."""
+        if self.group is None or not (found.moving > 0.5).any():
             return np.inf
-        away = np.einsum("cmk,m->ck", self.group.by_move[:, :, gone], found.move)
-        return float(np.sqrt((away**2).sum(axis=0).mean()))
+        ground = residuals.ground
+        return moving_ground.group_of(residuals.linear, ground, self.group, found).metres / ground.pixel
 
     def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
         """Yield its record, with the members of the group."""

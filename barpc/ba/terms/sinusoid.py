@@ -34,7 +34,7 @@ class Sinusoid(Term):
         cost = price_of_period(float(residuals.size[1, found.view]), residuals.linear.choices) + SIZE_PRICE
         return cls(found.view, columns, np.full(columns.shape[1], FIRST_SIGMA), cost, period=found.period)
 
-    def amplitude(self, found: MixtureFit) -> float:
+    def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
         """Return its amplitude [px]."""
         return float(np.hypot(*_amplitude(found.extra[-len(self.sigma) :])))
 

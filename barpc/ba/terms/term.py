@@ -83,7 +83,7 @@ class Term:
         moved = found.extra[-len(self.sigma) :]
         return float(np.clip(np.sqrt((moved**2).mean()), FIRST_SIGMA / TIMES, FIRST_SIGMA * TIMES))
 
-    def amplitude(self, found: MixtureFit) -> float:
+    def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
         """Return its amplitude [px] where a minimum applies to it; else infinity."""
         return np.inf
 
