@@ -16,6 +16,7 @@ from barpc.ba.select import foreign_camera, models
 from barpc.ba.select.foreign_camera import find_foreign_camera
 from barpc.ba.select.parts import Parts
 from barpc.base.errors import AdjustError
+from barpc.base.statistics import FEW
 from barpc.scene import Tracks, View
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
@@ -150,10 +151,24 @@ def test_of_few_tie_points_those_of_one_view_may_all_be_wrong(views: int, num: i
         found = adjust_tracks(made.views, replace(made.tracks, xy=xy), AdjustOptions(min_convergence=0.01))
         assert (found.apart is None) == (views == 5)
         assert found.apart is None or found.apart.views == (bad,)
+        assert found.apart is None or np.isnan(found.apart.contradicted)  # too few to place it, and so to say
         assert found.inlier[of_it].sum() <= 2
         assert found.inlier[~of_it & ~found.held_out].mean() > 0.9
         assert np.abs(found.residuals[found.inlier]).max() < 0.5
         np.testing.assert_allclose(found.params[bad], 0.0, atol=1e-9 if views == 3 else 30.0)
+
+
+@pytest.mark.parametrize("seed", [2, 4])
+def test_no_view_is_left_out_for_a_drift_where_few_tracks_are_of_three_views(seed: int) -> None:
+    """Small images that drift by 0.4 % of their side, all ties right; a pair of any two of the views agrees."""
+    made = simulate_block(
+        3, 90, seed=seed, size=(750, 750), gsd=0.5, per_site=3, drift=4e-6, noise=0.06, visible=0.5,
+        alt_range=(100.0, 400.0), attitude=10e-6, position=3.0,
+    )  # fmt: skip
+    assert (np.bincount(made.tracks.point) == 3).sum() < FEW
+    found = adjust_tracks(made.views, made.tracks)
+    assert found.apart is None
+    assert made.held_out_rms(list(found.sensors)) < 0.03
 
 
 @pytest.mark.parametrize("num", [20, 30])

@@ -244,6 +244,7 @@ def apart_of(look: RpcDiagnosis, **given: Any) -> ForeignCamera:
         (RpcDiagnosis(), 0.987, "more than 98 % of its tie points contradict"),
         (RpcDiagnosis(), 1.0, "all of its tie points contradict"),
         (RpcDiagnosis(as_stated=True), 0.61, "more than 61 % of its tie points contradict"),
+        (RpcDiagnosis(as_stated=True), np.nan, "as delivered its tie points contradict"),
     ],
 )  # fmt: skip
 def test_a_strange_rpc_is_said_with_what_it_looks_like(look, share, said) -> None:

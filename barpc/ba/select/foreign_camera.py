@@ -28,7 +28,7 @@ from barpc.ba.solution import Solution
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import GEOMETRIC, AdjustOptions
-from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SMALL, SURE, TRIED
+from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, OUTLIER, SMALL, SURE, TRIED
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class ForeignCamera:
     gain: float
     gap: float
     runner_up: int | None
-    contradicted: float  # share of its tie points that contradict the others', wherever its camera is
+    contradicted: float  # share of its tie points that contradict the others', wherever its camera is; NaN: unknown
     look: RpcDiagnosis
     placed: Placed | None  # where it was found alone; None: it is left as delivered
     scale: float = 1.0  # by how much its prior had to be widened, where that told
@@ -166,13 +166,14 @@ def find_foreign_camera(
     chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
     if chosen:
         return _likeliest(chosen, left, lost, block)
-    asks = first is None or (len(too_few) == 1 and not agrees(first))
+    # a camera that drifts more than it is let makes ties scatter by some of their sigmas: no ground to leave it out
+    asks = first is None or (len(too_few) == 1 and first.outcome.noise >= OUTLIER)
     return _of_few(too_few) if asks and too_few else (None, None)
 
 
 def _of_few(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
     """Return the views without which a block agrees and with which it does not, and the solution without the only."""
-    told = ForeignCamera(tuple(v for v, _ in without), np.nan, np.inf, None, 1.0, RpcDiagnosis(as_stated=True), None)
+    told = ForeignCamera(tuple(v for v, _ in without), np.nan, np.inf, None, np.nan, RpcDiagnosis(as_stated=True), None)
     return told, without[0][1] if told.clear else None
 
 

@@ -351,9 +351,9 @@ def strangeness(apart: ForeignCamera) -> str:
         col, row = 0.0 - look.offset
         height = "" if look.height is None else f", or its heights by {-look.height:+.0f} m,"
         return f"shifted by {col:+.1f} columns and {row:+.1f} rows{height} {met}"
-    if not (percent := int(100 * apart.contradicted)):
+    if not apart.contradicted >= 0.01:
         return "as delivered its tie points contradict those of the other images, and these agree without it"
-    part = "all" if apart.contradicted == 1.0 else f"more than {percent} %"
+    part = "all" if apart.contradicted == 1.0 else f"more than {int(100 * apart.contradicted)} %"
     where = "; as delivered it agrees with them within its stated accuracy" if look.as_stated else ""
     return (
         f"{part} of its tie points contradict those of the other images for every shift and rotation, and these "
