@@ -113,6 +113,22 @@ def test_a_view_is_looked_at_as_often_as_its_partners_ask_for_and_tracks_return_
     np.testing.assert_allclose(back.sigma, [0.4, 0.1])  # as exact as the coarser one's pixel
 
 
+@pytest.mark.parametrize(("coarse", "kept"), [(0.06, [10.0, 20.0]), (0.04, [10.5, 20.5])])
+def test_a_track_at_two_looks_of_a_view_is_observed_once_in_it(coarse: float, kept: list[float]) -> None:
+    """Pixels of 1, 1.4 and 1.96: the first is linked to the third as it is, by the second, and by means of two."""
+    sizes = (1.0, 1.4, 1.96)
+    block = [View(f"v{k}", "", (400, 400), camera(0.0).window(0, 0, s, s), (0.0, 500.0)) for k, s in enumerate(sizes)]
+    looks = Looks.at(block, [Pair(ends, 1.0, 0.0) for ends in ((0, 1), (0, 2), (1, 2))])
+    assert looks.ends == {(0, 1): (0, 2), (0, 2): (1, 3), (1, 2): (2, 3)}
+    xy, point = [[7.0, 8.0], [10.0, 20.0], [5.0, 10.0], [7.0, 14.0], [5.0, 10.0]], np.array([0, 1, 1, 1, 1])
+    sigma = np.array([0.1, 0.1, coarse, 0.1, 0.1])
+    back = looks.tracks(Tracks(np.array([3, 0, 1, 2, 3]), point, np.array(xy), sigma))
+    assert back.view.tolist() == [2, 0, 1, 2]
+    assert back.point.tolist() == [0, 1, 1, 1]
+    np.testing.assert_allclose(back.xy, [xy[0], kept, *xy[3:]])
+    np.testing.assert_allclose(back.sigma, [0.1, min(0.1, 2.0 * coarse), 0.1, 0.1])
+
+
 def test_the_camera_of_a_look_is_that_of_the_coarser_image() -> None:
     """RPC.window is exact; the derivative is that of the projection."""
     rpc = camera(0.01)

@@ -97,10 +97,12 @@ class Looks:
         return coarser(xy, self.pixel[list(self.ends[pair])])
 
     def tracks(self, found: Tracks) -> Tracks:
-        """Return tracks over looks as tracks over views."""
-        pixel = self.pixel[found.view]
+        """Return tracks over looks as tracks over views; of two looks of a view the more accurate one counts."""
+        pixel, view = self.pixel[found.view], self.of[found.view]
         sigma = found.sigma * pixel.max(axis=1)
-        return Tracks(self.of[found.view], found.point, finer(found.xy, pixel), sigma)
+        order = np.lexsort((sigma, view, found.point))
+        rows = order[np.unique(np.stack([found.point, view])[:, order], axis=1, return_index=True)[1]]
+        return Tracks(view[rows], found.point[rows], finer(found.xy, pixel)[rows], sigma[rows])
 
 
 def _scale(view: View) -> Array:
