@@ -122,6 +122,12 @@ def test_a_group_is_told_from_what_stands_still() -> None:
     leans = [-np.linalg.solve(one[:, :2], one[:, 2]) for one in up]  # how far east and north a metre of height looks
     higher = np.ravel([lean - leans[0] for lean in leans[1:]])  # two pixels, and nobody can tell
     assert term.amplitude(residuals, replace(found, move=2.0 * higher / np.abs(higher).max())) < 0.02
+    coarse = replace(ground, by_ground=ground.by_ground * np.where(block.view == 2, 0.25, 1.0))  # pixels of four in it
+    metres, pixel = (
+        group_of(linear, coarse, group, found).metres,
+        4.0 * ground.pixel_of(np.flatnonzero(block.view == 2)),
+    )
+    assert term.amplitude(replace(residuals, ground=coarse), found) == pytest.approx(metres / pixel)
     assert term.amplitude(residuals, replace(found, moving=np.minimum(found.moving, 0.5))) == np.inf
     assert found.noise == pytest.approx(1.0, abs=0.1)
     held_out = block.without(np.isin(block.point % 5, [1, 2, 3]))

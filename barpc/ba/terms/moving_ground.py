@@ -59,7 +59,11 @@ class GroundMotion:
     @cached_property
     def pixel(self) -> float:
         """A pixel on the ground [m]."""
-        return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2] ** 2).sum(axis=(0, 1)) / 2.0)))
+        return self.pixel_of(np.arange(self.by_ground.shape[2]))
+
+    def pixel_of(self, rows: IntArray) -> float:
+        """Return the pixel on the ground [m] of some observations."""
+        return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2, rows] ** 2).sum(axis=(0, 1)) / 2.0)))
 
     def cells(self, number: int) -> IntArray:
         """Return the cell (K,) of `number` x `number` on the ground in which each observation's point lies."""

@@ -40,11 +40,15 @@ class MovingObjects(Term):
         return [cls(-1, none, np.zeros(0), cost, group=one)]
 
     def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
-        """Return the displacement between two views [px], beside an effect of height; infinite where nothing moves."""
+        """Return the displacement between two views, beside an effect of height, in the coarser one's pixels [px].
+
+        Infinite where nothing is of the group.
+        """
         if self.group is None or not (found.moving > 0.5).any():
             return np.inf
-        ground = residuals.ground
-        return moving_ground.group_of(residuals.linear, ground, self.group, found).metres / ground.pixel
+        linear, ground = residuals.linear, residuals.ground
+        one = moving_ground.group_of(linear, ground, self.group, found)
+        return one.metres / max(ground.pixel_of(np.flatnonzero(linear.view == v)) for v in one.between)
 
     def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
         """Yield its record, with the members of the group."""
