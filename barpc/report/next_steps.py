@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from barpc.ba.constraints.ground import KNOWN_BIAS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.report.outcome import Added
 from barpc.report.quality_checks import lengths
 from barpc.report.ranking import flagged, sure_pairs
 from barpc.report.records import value_of
@@ -37,9 +39,14 @@ _REPORT_PARTS = {
 """Cause of a reservation -> the part of the report that shows it; others: the table of images."""
 
 
-def next_steps(summary: Summary) -> tuple[StepEntry, ...]:
-    """Return the next steps of a run with its verdict, at most one of each kind: use, improve, review."""
+def next_steps(summary: Summary, added: Added | None = None) -> tuple[StepEntry, ...]:
+    """Return the next steps of a run with its verdict, at most one of each kind: use, improve, review.
+
+    `added` is the effect of its images on those of an earlier run, where they were added to one.
+    """
     use = {"adjust": _hand_over, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
+    if added is not None and added.beyond and not added.updated:
+        use = partial(_update, added)
     return (*use(summary), *_improve(summary), *_review(summary))
 
 
@@ -63,6 +70,13 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
         commands = ["barpc dsm . -o dsm.tif", "barpc export . s2p --to s2p", *commands]
     start = "Hand over" if summary.passed else "After review, hand over"
     yield StepEntry("use", f"{start} {listed(files, NAMED)}{best}.", tuple(commands))
+
+
+def _update(added: Added, _summary: Summary) -> Iterator[StepEntry]:
+    """Yield the update of an earlier run, without which its cameras and new ones do not agree."""
+    name, far = added.largest
+    words = f"those of {added.run} change by up to {far:.2f} px ({name})"
+    yield StepEntry("use", f"Run again with --update before old and new cameras are used together: {words}.")
 
 
 def _adjust_checked(summary: Summary) -> Iterator[StepEntry]:

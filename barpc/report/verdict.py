@@ -59,7 +59,7 @@ def summarize(run: Run) -> Summary:
     """Return the summary of a run with the verdict on it; numbers that are not finite are None."""
     views = tuple(replace(view, **view_status(view, run)) for view in measure_views(run))  # type: ignore[arg-type]
     summary = Summary.read(json_form(measure_run(run, views, block_verdict(run, views))))
-    return replace(summary, next=next_steps(summary))
+    return replace(summary, next=next_steps(summary, run.added))
 
 
 def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:

@@ -85,7 +85,11 @@ def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: Sim
     np.testing.assert_allclose(one, other, atol=0.1)  # a tenth of the tie points is another
     said = "\n".join(found.summary["verdict"])
     assert "1 image added to the 11 images of first" in said
-    assert ("change by more than 0.02 px" in said) != ("Their cameras stay valid" in said)
+    moves = "change by more than 0.02 px" in said
+    assert moves != ("Their cameras stay valid" in said)
+    use = found.summary["next"][0]  # new and old cameras are no pair where these should move
+    assert use["text"].startswith("Run again with --update before" if moves else "Hand over view_0004.vrt")
+    assert bool(use["commands"]) != moves
     assert "clouds" not in said
     assert found.summary["status"] == whole.summary["status"]
     sound(eleven / "first")
@@ -97,6 +101,7 @@ def test_what_moves_is_written_where_that_is_asked_for(eleven: Path, archive: Pa
     block, before = (BlockPrior.load(eleven / one / "tables/block.npz") for one in ("updated", "first"))
     assert set(before.names) < set(block.names)
     assert "their new cameras are written here" in "\n".join(found.summary["verdict"])
+    assert found.summary["next"][0]["text"].startswith("Hand over")
     written = {path.stem for path in (eleven / "updated").glob("*.vrt")}
     said = next(line for line in found.summary["verdict"] if "change by more" in line)
     assert {"view_0004", *(name for name in before.names if name in said)} <= written
