@@ -48,9 +48,9 @@ logger = logging.getLogger(__name__)
 
 NEEDED = 4
 """Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
-_PER_CELL = 4
+_FULL_CELL = 4
 """Tracks of a cell where an image of full cells holds the number wanted."""
-_QUOTAS = (1, 2, _PER_CELL, 8, 16)
+_QUOTAS = (1, 2, _FULL_CELL, 8, 16)
 """Tracks that a cell takes, round by round: from one on, or long tracks, which fill cells of all their views, would
 leave none for the borders that fewer views see."""
 
@@ -454,7 +454,7 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
     count = np.bincount(tracks.view, minlength=len(sizes))
     if not len(tracks) or (count <= most).all():
         return tracks
-    side = np.sqrt([_PER_CELL * width * height / most for width, height in sizes])
+    side = np.sqrt([_FULL_CELL * width * height / most for width, height in sizes])
     columns, rows = (np.array(sizes) / side[:, None]).astype(np.int64).T + 2
     first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
     col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
