@@ -92,6 +92,18 @@ def test_the_floor_is_that_of_every_stretch_of_a_spline() -> None:
     np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 3.0**2])
 
 
+@pytest.mark.parametrize(
+    ("scatter", "common"), [(0.1, 0.02), (0.04, 0.02), (0.02, 0.01), (0.005, 0.0025), (0.001, 0.002), (1e-9, 0.002)]
+)
+def test_an_error_in_common_is_half_of_a_small_scatter_and_never_none(scatter: float, common: float) -> None:
+    num = 40_000
+    made = observations(0.02, num=num)
+    made.is_tie[:] = True
+    made.of_reference[:] = False
+    weight = made.weight(np.ones(2 * num, dtype=bool), scatter / 0.1).reshape(2, num)
+    np.testing.assert_allclose((weight**2).sum(axis=1), min(num / scatter**2, 1.0 / common**2))
+
+
 def test_the_noise_is_that_of_the_tie_points_alone() -> None:
     num = 30
     made = observations(num=num)

@@ -103,7 +103,7 @@ class Observations:
         weight: Array = use / (self.sigma * noise)
         own, ties = self.structure.sum_views(np.stack([weight**2, use]) * self.is_tie).T
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
-        common = (self.noise_floor * np.minimum(noise_px / _LITTLE_NOISE, 1.0)) ** 2
+        common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2  # of copies, too: none is exact
         floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
