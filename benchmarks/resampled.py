@@ -2,8 +2,8 @@
 
 A third kind of generator beside `tests.scenes` (lines of sight through pixels) and `benchmarks.worlds` (tie points):
 the ground is a texture of octaves of noise and rectangles on hills that are given by a formula, so that an image is one
-interpolation, and tie points scatter by 0.005 px. Every block is sound: one that needs review, but for noise that hides
-the texture, is a false alarm. Truth: held-out points by the exact cameras.
+interpolation, and tie points scatter by 0.005 px where the images have little noise. Every block is sound: one that
+needs review, but for noise that hides the texture, is a false alarm. Truth: held-out points by the exact cameras.
 
     python -m benchmarks.resampled --seeds 0 30
     python -m benchmarks.resampled --full 20000     # one triplet of that many pixels a side: CPU, memory

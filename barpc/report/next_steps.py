@@ -72,8 +72,10 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
     yield StepEntry("use", f"{start} {listed(files, NAMED)}{best}.", tuple(commands))
 
 
-def _update(added: Added, _summary: Summary) -> Iterator[StepEntry]:
-    """Yield the update of an earlier run, without which its cameras and new ones do not agree."""
+def _update(added: Added, summary: Summary) -> Iterator[StepEntry]:
+    """Yield the update of an earlier run, without which its cameras and the new ones, if written, do not agree."""
+    if not any(view.outputs for view in summary.views):
+        return
     name, far = added.largest
     words = f"those of {added.run} change by up to {far:.2f} px ({name})"
     yield StepEntry("use", f"Run again with --update before old and new cameras are used together: {words}.")

@@ -17,6 +17,7 @@ from barpc.cli.terminal import print_summary
 from barpc.export import TARGETS
 from barpc.report import Run, Summary
 from barpc.report.next_steps import _REPORT_PARTS, next_steps
+from barpc.report.outcome import Added
 from barpc.report.page import _QUESTIONS, report_html
 from barpc.report.records import json_form
 from barpc.report.summary import LeftOutEntry, StepEntry
@@ -266,6 +267,21 @@ def test_one_image_is_handed_over_for_an_orthoimage_and_for_no_surface():
 
 def test_nothing_is_handed_over_of_a_run_that_wrote_nothing():
     assert not next_steps(a_summary([a_view("A"), a_view("B")], [a_pair()]))
+
+
+@pytest.mark.parametrize("updated", [False, True])
+@pytest.mark.parametrize("moved", [(), (("old", 4.385),)])
+def test_new_cameras_are_used_with_old_ones_that_they_fit(moved, updated):
+    """A run that added A; `old` is an image of the earlier run."""
+    added = Added("first", 3, 3, moved, ("old", 4.385), 0.02, updated)
+    (use,) = next_steps(a_summary([a_view("A", outputs={"A.vrt": {}})]), added)
+    if moved and not updated:
+        assert use.text.startswith("Run again with --update before old and new cameras are used together: ")
+        assert use.text.endswith("those of first change by up to 4.38 px (old).")
+        assert not use.commands
+    else:
+        assert use.text == "Hand over A.vrt."
+    assert not next_steps(a_summary([a_view("A")]), added)  # no camera was written
 
 
 def test_files_that_were_left_out_and_reservations_of_the_block_are_reviewed():

@@ -101,7 +101,7 @@ class Observations:
         errors.
         """
         weight: Array = use / (self.sigma * noise)
-        own, ties = self.structure.sum_views(np.stack([weight**2, use]) * self.is_tie).T
+        own, ties = self._of_ties(weight), self._of_ties(use.astype(np.float64))
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
         common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2  # of copies, too: none is exact
         floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
@@ -113,7 +113,11 @@ class Observations:
 
     def told_by(self, weight: Array) -> Array:
         """Return the information of tie points of weights (K,) [1/px] on each view, or that before (N,) [1/px^2]."""
-        return np.maximum(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0], self.told)
+        return np.maximum(self._of_ties(weight), self.told)
+
+    def _of_ties(self, weight: Array) -> Array:
+        """Return the sums (N,) of the squared weights (K,) of each view's tie points."""
+        return np.asarray(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0])
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
         """Estimate the observed over stated standard deviation of the observations in use; 1 where there are
