@@ -42,6 +42,8 @@ class Camera(Shown):
     """The altitudes [m above the ellipsoid] that it is made for."""
     notes: tuple[str, ...] = ()
     """What the user should know."""
+    sensor: str = ""
+    """The sensor and band that the metadata state (WV02_P, PHR1B_PAN); empty where they do not, or none were read."""
 
     def __repr__(self) -> str:
         place = self.path if len(str(self.path)) <= 50 else self.path.name

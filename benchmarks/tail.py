@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import resource
 import shutil
 import subprocess
@@ -75,7 +76,7 @@ def write_block(folder: Path, num_views: int, tracks: int, blank: int | None = N
         for n, view in enumerate(block.views)
     ]
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
-    listed.write_text("".join(f"{path}\n" for path in paths))
+    listed.write_text("".join(f"{path.name}\n" for path in paths))
     return listed
 
 
@@ -96,7 +97,7 @@ def write_pictures(folder: Path, num_views: int, side: int) -> Path:
         east, north = _seen(camera, side, origin).astype(np.float32)
         pixels = cv2.remap(ground, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         paths.append(_write_image(folder, view, pixels.astype(np.uint16)))
-    listed.write_text("".join(f"{path}\n" for path in paths))
+    listed.write_text("".join(f"{path.name}\n" for path in paths))
     return listed
 
 
@@ -142,15 +143,22 @@ def _write_blank(folder: Path, view: View, side: int) -> Path:
     return path
 
 
+def put_side_files(listed: Path, metadata: Path) -> None:
+    """Lay a maker's metadata, without its RPC, beside every image of a list."""
+    text = re.sub(r"<RPB>.*</RPB>", "", metadata.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for line in listed.read_text().splitlines():
+        (listed.parent / line).with_suffix(".xml").write_text(text, encoding="utf-8")
+
+
 def run(listed: Path, out: Path, jobs: int, only: bool, environment: dict[str, str]) -> Trial:
     """`barpc adjust` in a process of its own, and from nothing."""
     shutil.rmtree(out, ignore_errors=True)
     matches = listed.parent / "matches.npz"
-    command = [sys.executable, "-c", RUN, "-q", "adjust", "--image-list", listed]
-    command += ["--matches", matches, *["--matches-only"] * only] * matches.exists()
+    command = [sys.executable, "-c", RUN, "-q", "adjust", "--image-list", listed.name]
+    command += ["--matches", matches.name, *["--matches-only"] * only] * matches.exists()
     start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     words = [str(word) for word in (*command, "-o", out, "-j", jobs)]
-    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=listed.parent, check=False)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 3):
         raise SystemExit(done.stderr)
@@ -163,7 +171,7 @@ def run(listed: Path, out: Path, jobs: int, only: bool, environment: dict[str, s
 
 def left(listed: Path, out: Path) -> tuple[float, float]:
     """RMS [px] that the simulation's own tie points (0.1 px of noise) are left with by the cameras before and after."""
-    images = [Path(line) for line in listed.read_text().splitlines()]
+    images = [listed.parent / line for line in listed.read_text().splitlines()]
     tracks = read_matches(listed.parent / "exact.npz", [path.stem for path in images])
     found = []
     for files in (images, [out / f"{path.stem}_RPC.TXT" for path in images]):
@@ -182,10 +190,11 @@ def main() -> None:
     parser.add_argument("--blank", type=int, metavar="SIDE", help="verify matches given of blank images of this side")
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     parser.add_argument("--totals", action="store_true", help="no table of the stages")
+    parser.add_argument("--side-files", type=Path, metavar="XML", help="Maxar's metadata to lie beside each image")
     parser.add_argument("--folder", type=Path, help="where the files go and stay; default: a temporary one")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.folder or Path(temporary)
+        folder = (options.folder or Path(temporary)).resolve()
         print(" images   tracks    pairs  CPU [s]  clock [s]  memory [MB]  report.html [MB]", flush=True)
         trials, environment = {}, as_installed(ROOT, Path(temporary, "compiled"))
         for num in options.views:
@@ -194,6 +203,8 @@ def main() -> None:
                 listed = write_block(folder / name, num, options.tracks, options.blank)
             else:
                 listed = write_pictures(folder / f"pictures_{num}", num, options.matching)
+            if options.side_files:
+                put_side_files(listed, options.side_files)
             out = folder / f"run_{listed.parent.name}"
             trials[num] = found = run(listed, out, options.jobs, options.blank is None, environment)
             if options.matching is not None:

@@ -45,7 +45,10 @@ def as_installed(checkout: Path, compiled: Path) -> dict[str, str]:
 def turn(environment: dict[str, str], arguments: list[str]) -> dict[str, float]:
     """CPU seconds of one run by stage, "start" and "whole"."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-c", RUN, "-q", "adjust", *arguments, "-o", f"{folder}/out"]
+        given = [
+            os.path.relpath(text, folder) if Path(text).is_absolute() else text for text in arguments
+        ]  # as users do
+        command = [sys.executable, "-c", RUN, "-q", "adjust", *given, "-o", "out"]
         floor = cpu([sys.executable, "-c", FLOOR], environment, folder)
         whole = cpu(command, environment, folder)
         state = json.loads(Path(folder, "out", ".barpc", "state.json").read_text())

@@ -21,7 +21,7 @@ from barpc.report.runfiles import RunFiles, read_summary, read_tables
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
-from barpc.rpcio.sources import Sunlight, light_of
+from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
 from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid
 from barpc.sensor.rpc import RPC
@@ -57,7 +57,7 @@ class Shot:
     rpc: RPC
     file: str
     carrier: Path | None
-    light: Sunlight
+    light: Acquisition
     index: IntArray
     xy: Array
 
@@ -181,7 +181,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
                 + ", with --update" * update
             )
         rows = counted[starts[number] : starts[number + 1]]
-        light = light_of(view.path, None if view.rpc_source is None else view.rpc_source.path)
+        light = read_acquisition(view.path, None if view.rpc_source is None else view.rpc_source.path)
         seen = order[index[rows]], files.observations.xy[rows]
         shots.append(Shot(view, rpc, view.path, _carrier(folder, view), light, *seen))
     noise = _noise(files, counted)

@@ -28,7 +28,6 @@ from barpc.base.verb_options import CalibrateOptions
 from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
 from barpc.report import Run
 from barpc.report.runfiles import read_summary, read_tables, table_path
-from barpc.rpcio.sources import sensor_of
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
@@ -124,11 +123,7 @@ def _images_of(folder: Path) -> _OpenedRun:
     if gone:
         raise InputError(f"{gone[0].path}: an image of {folder} that cannot be opened any more; put it back")
     views, sensors, sources = corrected_views(images, earlier.prior)
-    return earlier, views, sensors, [_stated(view, source) for view, source in zip(views, sources, strict=True)]
-
-
-def _stated(view: View, source: Camera) -> str:
-    return "" if is_url(view.path) else sensor_of(Path(view.path), source.path)
+    return earlier, views, sensors, [source.sensor for source in sources]
 
 
 def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
@@ -287,7 +282,7 @@ def calibrations_of(
             raise InputError(f"{one.path}: another calibration of {one.sensor} is given; give one")
     by_sensor, found = {one.sensor: one for one in given}, dict[str, Calibration]()
     for view, source in zip(views, sources, strict=True):
-        if (used := _own(view, _stated(view, source), by_sensor)) is None:
+        if (used := _own(view, source.sensor, by_sensor)) is None:
             continue
         if used.spline.width != view.size[0]:
             raise InputError(f"{used.path}: of {used.spline.width} columns, {view.path} has {view.size[0]}: it is "
@@ -313,7 +308,7 @@ def common_errors(run: Run) -> CommonErrors:
     for view, source in zip(run.views, run.sources, strict=True):
         used = run.calibrated.get(view.name)
         if used is None and not isinstance(view.sensor, Clocked):
-            used = Calibration.prior(_stated(view, source), view.size[0])
+            used = Calibration.prior(source.sensor, view.size[0])
         found.append(used)
     return CommonErrors(tuple(found))
 

@@ -149,7 +149,7 @@ class Earlier:
                     f"{view.path}: {self.folder} was made with {'another' if image.calibration else 'no'} calibration, "
                     f"{now}: give the same, or adjust all images together"
                 )
-            if image is not None and _sha(inputs, str(source.path.absolute())) != image.camera_sha256:
+            if image is not None and _sha(inputs, str(source.path)) != image.camera_sha256:
                 raise InputError(
                     f"{source.path}: is not the camera of {view.path} used by {self.folder} (it was changed "
                     "since); put the former one back, or adjust all images together"
@@ -310,7 +310,7 @@ def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], 
     for view, ring, source in zip(run.views, rings, run.sources, strict=True):
         was, ring = before.get(view.name), np.round(ring, 8)
         of_file = choices.get(view.path, None if was is None else was.choices)
-        known, camera = inputs.get(view.path), _sha(inputs, str(source.path.absolute()))
+        known, camera = inputs.get(view.path), _sha(inputs, str(source.path))
         outline = tuple((lon, lat) for lon, lat in ring.tolist()) if np.isfinite(ring).all() else ()
         size, sha = (0, "") if known is None else (known.size, known.sha256)
         used = run.calibrated[view.name].sha256 if view.name in run.calibrated else ""

@@ -10,7 +10,7 @@ import os
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from barpc.cameras import open_split, split_spec
 from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
-from barpc.rpcio.sources import date_taken
+from barpc.rpcio.acquisition import read_acquisition
 from barpc.scene import Camera, View
 from barpc.sensor.geometry import LEAST_RANGE, footprint
 from barpc.tie.tasks import Progress
@@ -153,11 +153,15 @@ def _open_image(
             if image.size != size:
                 raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
         else:
-            path, choices = split_spec(image, hosts)
-            camera = open_split(path if here([path]) else file, choices, size=size, tags=tags)
+            _, choices = split_spec(image, hosts)
+            if "camera" in choices:  # as the image: no file has two names in a run
+                choices["camera"] = os.fspath(located(choices["camera"], hosts).absolute())
+            camera = open_split(file, choices, size=size, tags=tags)
             if camera.format in ("grid", "correction") and "camera" not in choices:
                 raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-        day = (image.date if isinstance(image, View) else "") or date_taken(file, camera.path, tags)
+        taken = read_acquisition(file, camera.path)
+        camera = replace(camera, sensor=taken.sensor)
+        day = (image.date if isinstance(image, View) else "") or taken.day(tags)
         view = View(name, os.fspath(file), size, camera.model, _altitudes_used(camera), day)
         ring = footprint(view.sensor, size, view.altitude)
         if not (abs(ring[:, 1]) <= 90).all():  # NaN fails, too

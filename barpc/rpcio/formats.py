@@ -35,9 +35,19 @@ class Format:
     sized: bool = False  # whether it states the size of its image
 
 
-def _has(*patterns: str) -> Callable[[str], bool]:
-    """Return whether a text holds all of some patterns, searched in time in proportion to it."""
-    return lambda content: all(re.search(pattern, content) for pattern in patterns)
+def _has(*patterns: str, markup: bool = False) -> Callable[[str], bool]:
+    """Return whether a text holds all of some patterns, searched in time in proportion to it.
+
+    And whether it is `markup`: the metadata of an image, 1 MB of XML, take 10 ms a pattern that is none of theirs.
+    """
+
+    def holds(content: str) -> bool:
+        return markup == bool(_MARKUP.match(content)) and all(re.search(pattern, content) for pattern in patterns)
+
+    return holds
+
+
+_MARKUP = re.compile(r"\s*+<")
 
 
 _TEXT_ENDS = ("_RPC.TXT", ".rpc", ".txt", ".rpc_adj")  # the last: of SAT-BA, beside the .rpc that it adjusted
@@ -46,7 +56,7 @@ _BESIDE = "gdal, beside an image"
 _TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
 _RPB = _has(r"(?i)lineNumCoef\s*+=")
 _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
-_is_maxar = _has(r"<(\w+:)?LINENUMCOEF")
+_is_maxar = _has(r"<(\w+:)?LINENUMCOEF", markup=True)
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
 _SYNTAXES = (
     Format("txt", _TEXT_ENDS, _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
@@ -54,9 +64,11 @@ _SYNTAXES = (
     Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
     Format("xml", (".XML",), _is_maxar, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),
     Format("json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",)),
-    Format("dimap", (), _has(r"<(\w+:)?Global_RFM"), xml.read_dimap),  # a Dimap_Document, or the model alone
-    Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>"), xml.read_enmap),
-    Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"'), xml.read_gdal),
+    Format(
+        "dimap", (), _has(r"<(\w+:)?Global_RFM", markup=True), xml.read_dimap
+    ),  # a Dimap_Document, or the model alone
+    Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>", markup=True), xml.read_enmap),
+    Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"', markup=True), xml.read_gdal),
     Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
     Format("bare", (), text.is_bare_rpc, text.read_bare),
@@ -167,7 +179,7 @@ def parse_rpc(data: bytes, name: str, options: ReadOptions | None = None) -> tup
     raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}){hint}")
 
 
-holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b")
+holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b", markup=True)
 
 
 def write_rpc(

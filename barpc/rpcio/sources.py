@@ -1,8 +1,7 @@
 """Where an image's RPC comes from: the file itself, or one of the files beside it.
 
 The order is GDAL's: a vendor's file beside an image goes before what the image itself carries, so that
-barpc sees the camera that every other tool sees. What it found, and what it passed over, is always said. The same files
-say when an image was taken and where the sun stood.
+barpc sees the camera that every other tool sees. What it found, and what it passed over, is always said.
 """
 
 from __future__ import annotations
@@ -11,18 +10,15 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import date
 from pathlib import Path
 
-import numpy as np
-
 from barpc.base.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
-from barpc.base.remote import PathOrUrl, beside, is_url, location
+from barpc.base.remote import PathOrUrl, beside, location
 from barpc.base.safe_io import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
 from barpc.rasters.raster import driver_of, identify, open_raster
 from barpc.rasters.vrt import MAGIC, read_vrt
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse_rpc
-from barpc.rpcio.images import SCANNED, read_nitf, read_tag
+from barpc.rpcio.images import read_nitf, read_tag
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
@@ -394,115 +390,3 @@ def at_tile(image: PathOrUrl, path: PathOrUrl, rpc: RPC) -> tuple[RPC, str] | No
 
 _TILE_ORIGINS = {"dimap": _tile_origin, "strip": _strip_origin}
 """Kind of a file beside a tile whose RPC is that of the whole image -> where the tile lies in it."""
-
-
-# --- sun and date -----------------------------------------------------------------------------------------
-
-_TAGS = ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME")  # the last is often that of the file
-_TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
-_FIRST = 1957  # no satellite took an image before
-_NUMBER_PATTERN = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
-_SUN = {
-    name: re.compile(
-        rb"(?<![a-z])(?:mean_?)?sun_?" + word + rb"\"?(?:\s?unit=\"\w{1,9}\")?\s{0,9}[>=:]\s{0,9}" + _NUMBER_PATTERN,
-        re.IGNORECASE,
-    )
-    for name, word in (("elevation", rb"el(?:ev(?:ation)?)?"), ("azimuth", rb"az(?:im(?:uth)?)?"))
-}
-_DAY = rb"(\d{4}-\d\d-\d\d)"
-_CLOCK = rb"(\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
-_WHEN = re.compile(
-    rb"(?:first_?line_?time|earliest_?acq_?time|tlc_?time|imaging_date|acquisition_?date(?:_?time)?|\"acquired)\"?"
-    rb"\s{0,9}[>=:]\s{0,9}\"?" + _DAY + rb"(?:T" + _CLOCK + rb")?",
-    re.IGNORECASE,
-)
-_IMAGING_TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)
-
-
-@dataclass(frozen=True)
-class Sunlight:
-    """The sun's elevation and azimuth [deg], and the time (UTC, ISO 8601; the day alone where no more is known)."""
-
-    elevation: float | None = None
-    azimuth: float | None = None
-    time: str | None = None
-
-
-def light_of(image: str, camera: str | None = None) -> Sunlight:
-    """Read sun angles and time from the camera's file and metadata beside the image: Maxar's IMD, XML, Airbus' DIM.
-
-    Of several values over the image (Airbus) the median is taken.
-    """
-    found: dict[str, float] = {}
-    time = None
-    if not image or any(name and (is_url(name) or "\0" in name) for name in (image, camera)):
-        return Sunlight()
-    for text in _texts(Path(image), Path(camera or image)):
-        for name, pattern in _SUN.items():
-            values = [float(value) for value in pattern.findall(text)]
-            if values and abs(values[0]) <= 360 and name not in found:
-                found[name] = float(np.median(values))
-        time = time or _time(text)
-    return Sunlight(found.get("elevation"), found.get("azimuth"), time or None)
-
-
-def date_taken(image: PathOrUrl, camera: PathOrUrl, tags: Mapping[str, str]) -> str:
-    """Return the day (ISO 8601) that the files of `light_of` state, or else an image's `tags`; empty if none does."""
-    stated = next((time[:10] for text in _texts(image, camera) if (time := _time(text))), "")
-    found = (_TAG.match(tags.get(tag, "").strip()) for tag in _TAGS)
-    return stated or next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")
-
-
-_SENSOR = {
-    word: re.compile(
-        rb"(?<![a-z_])(?:" + keys + rb")\"?\s{0,9}[>=:]\s{0,9}\"?([A-Za-z0-9][\w .-]{0,39}?)\"?\s{0,9}[;<,\n\r}]",
-        re.IGNORECASE,
-    )
-    for word, keys in {
-        "sensor": rb"satid|mission|satellite_id",
-        "number": rb"mission_index",
-        "band": rb"bandid|band_id|spectral_processing|instrument",
-    }.items()
-}
-
-
-def sensor_of(image: PathOrUrl, camera: PathOrUrl) -> str:
-    """Return the sensor and band that the files of `light_of` state (WV02_P, PHR1B_PAN); empty if none does."""
-    texts, found = list(_texts(image, camera)), []
-    for pattern in _SENSOR.values():
-        matches = (pattern.search(text) for text in texts)
-        found.append(next((match[1].decode() for match in matches if match), ""))
-    name, number, band = found
-    return re.sub(r"[^\w-]+", "-", name + number + ("_" + band if band else "")) if name else ""
-
-
-def _day(text: str) -> str:
-    """Return a day, if it is one of a time with satellites; else empty."""
-    try:
-        return text if date.fromisoformat(text).year >= _FIRST else ""
-    except ValueError:
-        return ""
-
-
-def _time(text: bytes) -> str:
-    stated = _WHEN.search(text)
-    day = _day(stated[1].decode()) if stated else ""
-    if not (stated and day):
-        return ""
-    clock = stated[2]
-    if clock is None and (later := _IMAGING_TIME.search(text, stated.end(), stated.end() + 500)):
-        clock = later[1]
-    return f"{day}T{clock.decode()}Z" if clock else day
-
-
-def _texts(image: PathOrUrl, camera: PathOrUrl) -> Iterator[bytes]:
-    """Yield how the file of the camera and the metadata beside an image begin; nothing of images elsewhere."""
-    if not (isinstance(image, Path) and isinstance(camera, Path)):
-        return
-    product, present = image.stem[4:], files_of(image.parent)
-    wanted = [f"{image.stem}.imd", f"{image.stem}.xml", f"{image.stem}_metadata.json"]
-    wanted += [f"dim_{part}.xml" for part in (product, product.rpartition("_")[0]) if part]
-    files = [camera] if camera != image and camera.is_file() else []
-    for file in [*files, *(image.parent / present[name.lower()] for name in wanted if name.lower() in present)]:
-        with suppress(BarpcError):
-            yield read_head(file, RPC_FILE, SCANNED)

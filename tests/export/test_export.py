@@ -15,7 +15,7 @@ from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
 from barpc.export import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
-from barpc.rpcio.sources import light_of
+from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
 
@@ -382,14 +382,14 @@ def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
 )  # fmt: skip
 def test_sun_and_time_are_read_from_what_lies_beside_an_image(name, text, expected, tmp_path):
     (tmp_path / name).write_text(text)
-    light = light_of(str(tmp_path / "a.tif"))
+    light = read_acquisition(str(tmp_path / "a.tif"))
     assert (light.elevation, light.azimuth, light.time) == expected
 
 
 def test_metadata_that_is_no_file_is_passed_over(tmp_path):
     (tmp_path / "a.xml").symlink_to("/dev/zero")
-    assert light_of(str(tmp_path / "a.tif"), "/dev/zero").time is None
-    assert light_of("https://host/a.tif", "https://host/b.xml").time is None
+    assert read_acquisition(str(tmp_path / "a.tif"), "/dev/zero").time is None
+    assert read_acquisition("https://host/a.tif", "https://host/b.xml").time is None
 
 
 def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(southern, tmp_path):

@@ -20,7 +20,7 @@ from barpc.export import pinholes
 from barpc.export import shots as scene
 from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import read_rpc
-from barpc.rpcio.sources import Sunlight
+from barpc.rpcio.acquisition import Acquisition
 from barpc.sensor.geometry import camera_center, image_grid
 
 OUT = Path("/elsewhere/out")
@@ -364,7 +364,7 @@ def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
         "9999-12-31T23:59:59Z",
     )
     assert "view:sun_azimuth" not in unknown
-    day = with_shot(south, light=Sunlight(None, None, "2020-01-02"))
+    day = with_shot(south, light=Acquisition(None, None, "2020-01-02"))
     name = south.shots[0].name
     assert json.loads(made_of.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
     west, south_lat, east, north = json.loads(made_of.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]

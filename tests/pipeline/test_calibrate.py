@@ -34,7 +34,9 @@ from barpc.pipeline.calibrate import (
 from barpc.pipeline.outputs import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
+from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.images import put_tag
+from barpc.scene import Camera
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
@@ -238,6 +240,11 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
     refused("the images state SIM1_PAN", archive[2], sensor="WV02_P")
 
 
+def stated(path: Path) -> Camera:
+    """The camera of an image as a run loads it, with the sensor that its metadata state."""
+    return replace(open_camera(path), sensor=read_acquisition(path).sensor)
+
+
 def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> None:
     """Images that state none count as of one; a calibration is in place of the prior."""
     rng = np.random.default_rng(6)
@@ -246,7 +253,7 @@ def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> 
     views = [replace(view, name=f"{i} {view.name}", path=str(path))
              for i, paths in enumerate(names) for view, path in zip(made.views, paths, strict=True)]  # fmt: skip
     views[-1] = replace(views[-1], size=(4001, 3000))
-    sources = [open_camera(Path(view.path)) for view in views]
+    sources = [stated(Path(view.path)) for view in views]
     own = Calibration.prior("SIM1_PAN", SIZE[0])
     run = Run("adjust", tuple(views), tuple(sources), made.tracks, calibrated={views[0].name: own})
     found = common_errors(run).of_view
@@ -318,7 +325,7 @@ def test_an_image_takes_the_calibration_of_its_sensor_or_of_none(tmp_path: Path)
         files(made, tmp_path / name, sensor)[0] for name, sensor in (("one", "SIM1"), ("two", "SIM2"), ("none", ""))
     ]
     views = [replace(made.views[0], name=path.parent.name, path=str(path)) for path in paths]
-    sources = [open_camera(path) for path in paths]
+    sources = [stated(path) for path in paths]
 
     def of(*given: Path, some: bool = False) -> dict[str, str]:
         found = calibrations_of([str(path) for path in given], views, sources, some=some)

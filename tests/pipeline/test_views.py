@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from barpc.pipeline.loading import image_path
 from barpc.rpcio import write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
+from benchmarks.real_sets import as_rasterio
 from tests.rpcio.conftest import make_rpc
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -324,3 +326,25 @@ def test_an_image_that_its_rpc_is_not_for_is_left_out_and_said(corner, tmp_path)
     assert result.record.status == "bad"
     alone = adjust([images[0], images[2]], tmp_path / "alone")
     assert result.tracks.xy.tolist() == alone.tracks.xy.tolist()
+
+
+# --- one name a file --------------------------------------------------------------------------------------
+
+
+def test_an_image_is_read_as_quickly_by_a_relative_name_and_a_link(tmp_path, monkeypatch) -> None:
+    """And its camera is one file, however it is spelt: 20 MB of pixels, searched as text, would take seconds."""
+    side = 3200
+    noise = np.random.default_rng(5).integers(40, 123, (side, side), dtype=np.uint16) * 257  # letters
+    path = placed(tmp_path, "a", noise)
+    with rasterio.open(path, "r+") as file:
+        file.rpcs = as_rasterio(make_rpc(), np.zeros(2))
+    (tmp_path / "a_RPC.TXT").unlink()
+    (tmp_path / "b.tif").symlink_to("a.tif")
+    monkeypatch.chdir(tmp_path)
+    for given in ("a.tif", "./a.tif", "b.tif", path, "a.tif,camera=b.tif"):
+        start = time.process_time()
+        found = load_views([given], min_views=1)
+        assert time.process_time() - start < 0.5
+        assert found.sources[0].path == Path(str(given).partition(",")[0]).absolute() or "camera" in str(given)
+        assert found.sources[0].path.is_absolute()
+        assert found.sources[0].sensor == ""

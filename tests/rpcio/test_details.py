@@ -20,6 +20,7 @@ from barpc.base.errors import ImageError, InputError, OutputError, RpcError, Rpc
 from barpc.base.safe_io import Kind
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.rpcio.images import (
@@ -32,7 +33,7 @@ from barpc.rpcio.images import (
     read_values,
     write_crop,
 )
-from barpc.rpcio.sources import Sunlight, hidden_by, light_of, metadata_beside, shadows, sidecars
+from barpc.rpcio.sources import hidden_by, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
 from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.direct_grid import DirectGrid
@@ -586,27 +587,27 @@ def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path:
 
 def test_the_sun_of_an_image_is_the_median_of_what_its_files_say(tmp_path: Path) -> None:
     image = tmp_path / "IMG_x_R1C1.TIF"
-    assert light_of(str(image)) == Sunlight()
+    assert read_acquisition(str(image)) == Acquisition()
     (tmp_path / "DIM_x.XML").write_text(
         "<IMAGING_DATE>2013-04-17</IMAGING_DATE><IMAGING_TIME>10:36:02.1Z</IMAGING_TIME>"
         + "".join(f'<SUN_ELEVATION unit="deg">{e}</SUN_ELEVATION><SUN_AZIMUTH unit="deg">{a}</SUN_AZIMUTH>'
                   for e, a in ((50.0, 140.0), (51.0, 150.0), (59.0, 141.0)))
     )  # fmt: skip
-    assert light_of(str(image)) == Sunlight(51.0, 141.0, "2013-04-17T10:36:02.1Z")
+    assert read_acquisition(str(image)) == Acquisition(51.0, 141.0, "2013-04-17T10:36:02.1Z")
     (tmp_path / "IMG_x_R1C1.IMD").write_text(
         "meanSunEl = 33.5;\nmeanSunAz = 361.0;\nfirstLineTime = 2014-01-02T03:04:05Z;"
     )
-    assert light_of(str(image)) == Sunlight(33.5, 141.0, "2014-01-02T03:04:05Z")  # no azimuth is beyond a turn
+    assert read_acquisition(str(image)) == Acquisition(33.5, 141.0, "2014-01-02T03:04:05Z")  # an azimuth within a turn
     (tmp_path / "IMG_x_R1C1.IMD").write_text("meanSunAz = -360;")
-    assert light_of(str(image)).azimuth == -360.0
-    assert light_of("https://host/IMG_x_R1C1.TIF") == Sunlight()
-    assert light_of("") == Sunlight()
+    assert read_acquisition(str(image)).azimuth == -360.0
+    assert read_acquisition("https://host/IMG_x_R1C1.TIF") == Acquisition()
+    assert read_acquisition("") == Acquisition()
 
 
 @pytest.mark.parametrize(("day", "stated"), [("1957-01-01", True), ("1956-12-31", False)])
 def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool, tmp_path: Path) -> None:
     (tmp_path / "a.IMD").write_text(f"firstLineTime = {day}T00:00:00Z;")
-    assert light_of(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
+    assert read_acquisition(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
 
 
 def test_a_correction_grid_whose_nodes_lie_nowhere_is_refused(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from barpc.rpcio import (
     write_rpc_copy,
     write_rpc_vrt,
 )
-from barpc.rpcio.sources import described, only_physical, sensor_of
+from barpc.rpcio.acquisition import read_acquisition
+from barpc.rpcio.sources import described, only_physical
 from barpc.rpcio.xml import rpc_domain
 from tests.rpcio.conftest import dimap_v2, grid, write_image
 
@@ -248,4 +249,4 @@ def test_an_xml_without_an_rpc_may_hold_a_physical_camera(tmp_path, rpc):
 )  # fmt: skip
 def test_a_sensor_is_named_by_its_satellite_and_band(name, text, sensor, tmp_path) -> None:
     (tmp_path / name).write_text(text)
-    assert sensor_of(tmp_path / "a.tif", tmp_path / name) == sensor
+    assert read_acquisition(tmp_path / "a.tif", tmp_path / name).sensor == sensor
