@@ -223,6 +223,7 @@ def _adjustment(
         left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_neighbour_correlation(block, outcome, is_tie),
         in_space_rms=model.in_space_rms,
+        changed=model.changed,
         two_groups=two_groups(found.problem.structure, outcome.residual, outcome.by_point, outcome.inlier & is_tie),
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, found.seen),

@@ -95,6 +95,9 @@ class Adjustment:
     in_space_rms : float or None
         Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
         [px].
+    changed : float
+        By how much the terms beside the plain model move images against each other, the largest median of a band of
+        eighths of their rows or columns [px]; 0 for the plain model.
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
@@ -158,6 +161,7 @@ class Adjustment:
     left: tuple[Interval, ...]
     alike: Array
     in_space_rms: float | None
+    changed: float
     two_groups: tuple[TwoGroups, ...]
     held: BoolArray
     terrain: TerrainTest | None

@@ -24,7 +24,7 @@ from barpc.ba.solving.structure import Structure
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
-from barpc.base.options import AdjustOptions
+from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
@@ -137,7 +137,8 @@ def solve_block(
             outcome = again
     drift = problem.cameras.unknowns.drift
     asked = dict[str, SmoothTest]()
-    if options.drift is None and prior is None and drift and outcome.smooth.found(SURELY * NOISE_FLOOR).any():
+    may_grow = options.drift is None and options.terms == AUTO and prior is None and drift
+    if may_grow and outcome.smooth.found(SURELY * NOISE_FLOOR).any():
         less = outcome
         problem, outcome = _with_more_drift((problem, less), block, options, heights)
         asked = {} if outcome is less else {"drift": less.smooth}

@@ -109,6 +109,11 @@ class AdjustOptions(Options):
         unit="px",
         above=0,
     )
+    terms: Literal["auto", "none"] = option(
+        "auto",
+        """Terms beside a rotation, a translation and a linear drift. `auto`: where all matches ask for them; `none`:
+        the plain model, without further drift, splines, displaced rows or columns, or moving ground.""",
+    )
     sigma_attitude: float | None = option(
         None,
         """Prior standard deviation of the rotation, on the ground (angle x distance). Without: the accuracy that

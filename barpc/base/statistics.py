@@ -62,6 +62,9 @@ SAMPLE = 2000
 BEST = 0.2
 """Lower quantile of residuals assumed free of outliers."""
 
+BANDS = 8
+"""Parts of the rows, or of the columns, of an image: a displacement counts by its mean over one of them."""
+
 TRIALS = 150
 """Random samples of three: with half inliers, none is free of outliers once in 5e8."""
 

@@ -33,6 +33,7 @@ WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
 MIN_COPY_MATCHES = 20  # Of others a hundredth lies at a whole shift by chance: 18 of 20 never do
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
+LEAST_MOVED = 0.1  # px over an eighth of an image: a finding that moves what is handed over by less is a remark
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful
 
 

@@ -12,8 +12,8 @@ from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
-from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
-from barpc.report.summary.block import AXES, LeftEntry, left_entries, strangeness
+from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
+from barpc.report.summary.block import AXES, LeftEntry, left_entries, matters, strangeness
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
 from barpc.scene import GroundPoints
@@ -64,7 +64,7 @@ def _reservations(view: ViewEntry, run: Run) -> Causes:
         disagrees = "disagrees" if run.kind == "check" else "left"
         yield disagrees if np.isfinite(error) else "unseen", {"error": error}
     moving = view.num_moving / max(view.num_moving + view.num_rejected + view.num_observations, 1)
-    if moving > MANY_REJECTED:
+    if adjustment is not None and moving > MANY_REJECTED and adjustment.changed > LEAST_MOVED:
         yield "moving_objects", {"share": 100 * moving}
     if adjustment is not None:
         yield from _poorly_fitted_parts(view, adjustment)
@@ -73,7 +73,7 @@ def _reservations(view: ViewEntry, run: Run) -> Causes:
 def _poorly_fitted_parts(view: ViewEntry, adjustment: Adjustment) -> Causes:
     """Yield the rows and columns that are inconsistent with the rest of a view."""
     for one in left_entries(adjustment):
-        if one.image == view.name and (what := inconsistency(one)):
+        if one.image == view.name and matters(one) and (what := inconsistency(one)):
             place, cause = one.place, "clouds, water, change there"
             if one.axis == AXES[0] and one.rejected <= MANY_REJECTED:  # nothing on the ground is as long as the pass
                 place, cause = f"{place}, over all rows,", "detectors or resampling"

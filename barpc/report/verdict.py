@@ -18,7 +18,7 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
 from barpc.report.datum import datum_reasons
 from barpc.report.next_steps import next_steps
-from barpc.report.outcome import MANY_REJECTED, Added, Run
+from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, Added, Run
 from barpc.report.quality_checks import (
     NOISE_LIMIT,
     anywhere,
@@ -37,7 +37,15 @@ from barpc.report.quality_checks import (
 from barpc.report.ranking import flagged
 from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary, measure_run
-from barpc.report.summary.block import AXES, explanations, held_out_places, left_entries
+from barpc.report.summary.block import (
+    AXES,
+    HeldOutEntry,
+    LeftEntry,
+    explanations,
+    held_out_places,
+    left_entries,
+    matters,
+)
 from barpc.report.summary.views import ViewEntry, measure_views
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
 
@@ -170,27 +178,36 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
 
     Regions named by the reservation of their image are left out.
     """
-    said = {view.name for view in views if view.cause in _SAY_WHERE}
     found = left_entries(adjustment)
-    if moving := [f"{one.place} of {one.image}" for one in found if one.moving]:
+    moving = [f"{one.place} of {one.image}" for one in found if one.moving]
+    if moving and adjustment.changed > LEAST_MOVED:
         yield (
             f"Most tie points of {listed(moving)} move together: moving objects, or a displacement of these rows that "
             "no camera models."
         )
-    worst: dict[str, str] = {}
-    for one in found:
-        if what := inconsistency(one):
-            place = f"{one.place.capitalize()} of {one.image}"
-            worst.setdefault(one.image, f"{place} are inconsistent with the rest: {what}.")
-    for unmet in held_out_places(run.met_worse, adjustment.names):  # what was solved with may agree with what it bent
-        worst.setdefault(unmet.image, f"{unmet.sentence}.")
-    yield from (line for image, line in worst.items() if image not in said)
+    yield from _unmet_places(run, adjustment, views, matter=True)
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     for rival in filter(None, dict.fromkeys(rivals)):
         yield (
             f"Moving objects explain the tie points that move together hardly better than {TERMS[rival].NOUN}: "
             "check where these tie points lie."
         )
+
+
+def _unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], *, matter: bool) -> Iterator[str]:
+    """Yield the worst region of each image that moves what is handed over, or of each other image one that does not."""
+    said = {view.name for view in views if view.cause in _SAY_WHERE}
+    worst: dict[str, tuple[bool, str]] = {}
+    regions: list[tuple[LeftEntry | HeldOutEntry, str]] = [
+        (one, f"{one.place.capitalize()} of {one.image} are inconsistent with the rest: {what}.")
+        for one in left_entries(adjustment)
+        if (what := inconsistency(one))
+    ]
+    # what was solved with may agree with what it bent
+    regions += [(one, f"{one.sentence}.") for one in held_out_places(run.met_worse, adjustment.names)]
+    for region, sentence in sorted(regions, key=lambda row: not matters(row[0])):
+        worst.setdefault(region.image, (matters(region), sentence))
+    yield from (line for image, (large, line) in worst.items() if image not in said and large == matter)
 
 
 def _of_same_ground(run: Run, found: Adjustment) -> Iterator[str]:
@@ -213,7 +230,9 @@ def _of_same_ground(run: Run, found: Adjustment) -> Iterator[str]:
 def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
     for group in found.two_groups:
         i, j = group.views
-        if not any(found.prior.odd[v] or is_smooth(v, found) for v in (i, j)):
+        if group.apart * group.share > LEAST_MOVED and not any(
+            found.prior.odd[v] or is_smooth(v, found) for v in (i, j)
+        ):
             yield (
                 f"Tie points of {found.names[i]} and {found.names[j]} form two groups, {100 * group.share:.0f} % "
                 f"displaced by {group.apart:.2f} px from the others: there are two solutions, and this one lies "
@@ -284,6 +303,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         )
     found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
+    yield from _unmet_places(run, run.adjustment, views, matter=False)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
     if len(run.tracks) or gcps is not None:

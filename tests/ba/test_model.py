@@ -55,7 +55,7 @@ def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **giv
     parts: Any = SimpleNamespace(inner=None, outer=None)
     options = AdjustOptions(**given)
     first: Any = by_script(None, None, options)
-    model: Any = models._select_beside(first, parts, options, by_script)
+    model: Any = models._search_beside(first, parts, options, by_script)
     return model.found.model, model.in_space_rms, asked
 
 
@@ -127,7 +127,7 @@ def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypa
     monkeypatch.setattr(models, "with_terms", without_strips)
     monkeypatch.setattr(models, "_without_moving_ground", without_moving)
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    model: Any = models._select_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    model: Any = models._search_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
     assert (model.found.model, model.in_space_rms) == ("affine", 1.0)
     assert asked == (["moving", "strips"] if judged else [])
 
@@ -531,7 +531,7 @@ def followed(
     monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
     monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    model: Any = models._select_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    model: Any = models._search_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
     return model.found.name, model.in_space_rms
 
 

@@ -8,24 +8,26 @@ Of check tie points (`met_worse`: one median hides much), rows, columns and cell
 again, are tested against the rest of their image. That no place is worse than another is the one assumption, so that
 neither how much ties scatter nor how many are wrong matters. Two tests, each bounded over all places (Bonferroni): of
 how many lie far off by the same, which wrong matches do not (exact, hypergeometric), and of what the near ones have in
-common (Hotelling). Neighbours share errors: of a small part of an image one observation is taken, and what is shared
-and no larger than any adjustment is asked to be is let be.
+common (Hotelling, then by permutation). Neighbours share errors: of a small part of an image one observation is taken,
+and what is shared and no larger than any adjustment is asked to be is let be.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import entr, fdtrc, gammaln, xlogy
 
 from barpc.ba.parameters.additional_parameters import DRIFTS
 from barpc.base.geodesy import CHUNK, Array, parts
-from barpc.base.statistics import CHANCE, FEWEST, OUTLIER, SURE
+from barpc.base.statistics import BANDS, CHANCE, FEWEST, OUTLIER, SURE
 from barpc.scene import BoolArray, IntArray
 
 BINS = 40  # stretches of an image's rows or columns
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
+_FEWEST_INSIDE = 8  # check observations of a place: fewer have no mean
+_PERMUTATIONS = 2000  # twice as many as a chance of `CHANCE` takes
 _FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
 MIN_EXTENT_RATIO = (
     0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
@@ -46,6 +48,7 @@ class Interval:
     by_share: bool  # whether the share stands out, or what they have in common
     apart: float = 0.0  # half of those that are wrong are farther off than this, where it was measured
     moves: bool = False  # the share is of a group that moves
+    part: float = 1.0  # of its image's rows or columns
 
 
 def price(views: int) -> float:
@@ -87,7 +90,8 @@ def scan(
                 step = size[axis, v] / BINS
                 inside, wrongs = whole[:, v, i:j].sum(axis=1).tolist()
                 ends = float(i * step), float(j * step)
-                found.append(Interval(v, axis, *ends, worth, wrongs / max(inside, 1.0), common, by_share))
+                told_of = worth, wrongs / max(inside, 1.0), common, by_share
+                found.append(Interval(v, axis, *ends, *told_of, part=(j - i) / BINS))
     return sorted(found, key=lambda one: -one.gain)
 
 
@@ -193,6 +197,7 @@ class ImageRegion:
     far: float  # their share that lies far off by the same
     off: float  # what the far ones are off by, half of them, else what the near ones have in common [px]
     chance: float  # of as much anywhere where all places are alike, at most
+    moved: float  # mean displacement of an eighth of the rows or columns by it [px]; 0 of a cell, which is no camera's
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +229,8 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= FEWEST]
     tests = 2.0 * len(whole) * _PLACES.shape[1]  # of each place the far ones and the near ones
-    found = [_worst(one, size[:, one.view[0]], limit, least, share) for one in whole]
-    sure = [replace(one, chance=one.chance * tests) for one in found if one and one.chance * tests < CHANCE]
-    return sorted(sure, key=lambda one: one.chance)
+    found = [_worst(one, size[:, one.view[0]], limit, least, share, tests) for one in whole]
+    return sorted((one for one in found if one), key=lambda one: one.chance)
 
 
 def _region_bounds() -> IntArray:
@@ -264,11 +268,12 @@ def _thinned(unused: Unused, size: Array) -> Unused:
     return unused.part(np.unique(row * _FINEST + col, return_index=True)[1])
 
 
-def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -> ImageRegion | None:
-    """Return the place of one image of which chance leaves least, not yet times the places; None without any."""
+def _worst(one: Unused, size: Array, limit: float, least: float, share: float, tests: float) -> ImageRegion | None:
+    """Return the place of one image of which chance leaves least, by so many `tests`; None without any."""
     col, row = _cell_indices(one, size)
     inside = _CELLS_OF_REGIONS[:, row * _FINEST + col]
     count = inside.sum(axis=1)
+    inside[count < _FEWEST_INSIDE] = False
     standard = one.residual / one.deviation
     near = np.hypot(*standard) <= limit
     if near.sum() < 2:
@@ -292,12 +297,16 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
     common = np.hypot(*mean.T) * float(np.median(one.deviation))
     along = along - along[:, near].mean(axis=1, keepdims=True)
     rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
-    told = (here > 1) & (here < near.sum()) & (common > least)
+    told = (here >= _FEWEST_INSIDE) & (here < near.sum()) & (common > least)
     known = spread > MIN_EXTENT_RATIO * spread.max()
     variance = _variances(along * near, of_near, rest, _image_cells(near, col, row))
     squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
     free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
     chances[1, told] = fdtrc(free, others, squared / free)  # Hotelling's T^2, the variance one of so many
+    chances *= tests
+    if (chances[1] < CHANCE).any():
+        permuted = _by_permutation(along[:, near][known], of_near[told][:, near], variance[told][:, known])
+        chances[1, told] = np.where(permuted < CHANCE, chances[1, told], 1.0)
     if not (chances < CHANCE).any():
         return None
     test, worst = divmod(int(chances.argmin()), len(count))
@@ -306,7 +315,26 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float) -
         off = float(np.median(np.hypot(*one.residual[:, together[worst]])))
         far = float(together[worst].sum() / count[worst])
     ends = _ends(size[0], *_PLACES[:2, worst]), _ends(size[1], *_PLACES[2:, worst])
-    return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]))
+    whole = min(BANDS / _PLACES[[0, 2], worst].max(), 1.0) if None in ends else 0.0
+    moved = off * (far or 1.0) * whole
+    return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]), moved)
+
+
+def _by_permutation(along: Array, of_near: Array, variance: Array) -> Array:
+    """Return the chance (P,) of as large a mean in some place, by permutations of the residuals among all places.
+
+    Residuals are neither normal nor of one spread: their own values tell what a mean by chance is. `along` (d, k) are
+    the residuals along their axes, `of_near` (P, k) the places, `variance` (P, d) of their means.
+    """
+    rng, here = np.random.default_rng(0), of_near.sum(axis=1)
+
+    def largest(values: Array) -> Array:
+        mean = np.einsum("pk,dk->pd", of_near, values) / here[:, None]
+        return np.asarray((mean**2 / variance).sum(axis=1))
+
+    found = largest(along)
+    drawn = [largest(along[:, rng.permutation(along.shape[1])]).max() for _ in range(_PERMUTATIONS)]
+    return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 
 def hypergeometric_tail(found: int, count: int, alike: int, whole: int) -> float:

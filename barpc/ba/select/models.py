@@ -16,6 +16,7 @@ from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_admitted, is_better, measure
 from barpc.ba.select.anomalies import standing_out
 from barpc.ba.select.beam import Selection
+from barpc.ba.select.champion import compared, is_closer
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, find_foreign_camera
 from barpc.ba.select.image_terms import with_splines, with_terms
 from barpc.ba.select.parts import Parts
@@ -35,6 +36,7 @@ class SelectedModel:
     parts: Parts
     in_space_rms: float | None = None  # [px] of check tracks with the model in space, where an affine was chosen
     foreign: ForeignCamera | None = None  # the view that was left out (one), or that may be wrong (several)
+    changed: float = 0.0  # [px] by how much it moves images beside the plain model, in some eighth of them
 
 
 def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
@@ -85,7 +87,24 @@ def _first(
 
 
 def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the model of the other hypotheses, once foreign cameras are decided."""
+    """Return the model that meets all tie points best, once foreign cameras are decided: the plain one, or a larger.
+
+    Splines and detector steps that were given as options stay.
+    """
+    selected = _search_beside(first, parts, options, solve)
+    if selected.found is first and "drift" not in first.asked:
+        return selected
+    plain = first if "drift" not in first.asked else solve(parts.inner, parts.outer, replace(options, terms="none"))
+    beside = compared(selected.found, plain, selected.parts.ties(moving=False))
+    if beside.worse and not (options.spacing or options.detectors):
+        return SelectedModel(plain, parts)
+    return replace(selected, changed=beside.changed)
+
+
+def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
+    """Return the model that a search among the other hypotheses ends with."""
+    if options.terms != AUTO:
+        return SelectedModel(first, parts)
     given = options.model != AUTO or options.drift is not None or first.goes_on
     found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
     searched = first.problem.cameras.unknowns.geometric and not first.goes_on
@@ -157,7 +176,7 @@ def _without_moving_ground(
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
-        if not is_admitted(tried.after, before, less.outer, last.gain):
+        if not is_admitted(tried.after, before, less.outer, last.gain) or not is_closer(tried, found, parts.ties()):
             break
         found, parts = tried, less
         groups.append(last)

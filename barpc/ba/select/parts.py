@@ -41,6 +41,11 @@ class Parts:
         """Observations that move."""
         return self.block.without(self.group == 0)
 
+    def ties(self, *, moving: bool = True) -> Block:
+        """Return all tie points in use, kept out or solved; those of groups that move where they are asked for."""
+        block = self.block
+        return block.without((block.point >= block.num_tracks) | ~block.use | (not moving) & (self.group > 0))
+
     def without_view(self, view: int) -> Parts:
         """Return the parts without all observations of one view."""
         of_it = self.block.view == view

@@ -16,7 +16,8 @@ from barpc.ba.terms import TERMS, Transient
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import listed
 from barpc.base.geodesy import wrap_longitude
-from barpc.report.outcome import Run
+from barpc.base.statistics import BANDS
+from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, Run
 from barpc.report.records import Number, Record, column
 from barpc.report.summary.words import Count, Vector, metres
 
@@ -150,6 +151,9 @@ class LeftEntry(Record):
     rejected_median_px: float = column("Median residual of the rejected ones", "px", "rejected by", ".2f")
     gain: float = column("Logarithm of the likelihood over that of a uniform image", "nats", "gain", ".0f")
     moving: bool = column("Whether the share is of a moving group, not of rejected tie points", default=False)
+    moved_px: Number = column(
+        "Mean displacement of an eighth of the image that the residuals there would be, at most", "px", default=None
+    )
 
     @property
     def place(self) -> str:
@@ -170,6 +174,9 @@ class HeldOutEntry(Record):
     far: float = column("Share of them with the same large residual")
     off_px: float = column("Median of the large residuals; without any the common residual", "px")
     chance: float = column("Probability of as much anywhere by chance, at most", head="p below", form=".0e")
+    moved_px: Number = column(
+        "Mean displacement of an eighth of the image that these residuals would be; 0 of a cell", "px", default=None
+    )
 
 
 class SceneEntry(Record):
@@ -218,8 +225,8 @@ class SceneEntry(Record):
     )
 
 
-_REGION_FIELDS = attrgetter("view", "axis", "start", "stop", "share", "off", "apart", "gain", "moves")
-_HELD_OUT = attrgetter("columns", "rows", "count", "far", "off", "chance")
+_REGION_FIELDS = attrgetter("view", "axis", "start", "stop", "share", "off", "apart", "gain", "moves", "part")
+_HELD_OUT = attrgetter("columns", "rows", "count", "far", "off", "chance", "moved")
 _ALTIMETRY = attrgetter("given", "near", "agree", "spread", "expected", "motion", "sigma", "why_not")
 _DEM = attrgetter("held", "known", "total", "offset", "spread", "sigma", "alike", "relief")
 
@@ -361,10 +368,19 @@ def strangeness(apart: ForeignCamera) -> str:
     )
 
 
+def matters(one: LeftEntry | HeldOutEntry) -> bool:
+    """Return whether residuals of a part of an image move what is handed over, by more than `LEAST_MOVED`."""
+    return one.moved_px is not None and one.moved_px > LEAST_MOVED
+
+
 def left_entries(adjustment: Adjustment) -> tuple[LeftEntry, ...]:
     """Return the regions that are inconsistent with the rest, the most significant first."""
-    found = [(adjustment.names[v], AXES[axis], *rest) for v, axis, *rest in map(_REGION_FIELDS, adjustment.left)]
-    return tuple(LeftEntry(image, axis, start, stop - 1.0, *rest) for image, axis, start, stop, *rest in found)
+    found = []
+    for v, axis, start, stop, rejected, off, apart, gain, moving, part in map(_REGION_FIELDS, adjustment.left):
+        residual = max(off, rejected * apart if rejected > MANY_REJECTED else 0.0)
+        sizes = rejected, off, apart, gain, moving, residual * min(BANDS * part, 1.0)
+        found.append(LeftEntry(adjustment.names[v], AXES[axis], start, stop - 1.0, *sizes))
+    return tuple(found)
 
 
 def held_out_places(places: Sequence[ImageRegion], names: Sequence[str]) -> tuple[HeldOutEntry, ...]:

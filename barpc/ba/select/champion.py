@@ -1,0 +1,148 @@
+"""The comparison of a selected model with the plain one, on all verified matches.
+
+A model that excludes what it does not explain agrees with the rest. So two models are compared by all matches, those
+that one of them excludes or that a robust step cut among them: by the median epipolar offset of each pair of images,
+and of each eighth of their rows and columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from barpc.ba.constraints.block import Block
+from barpc.ba.robust.heldout import measure, seen_in
+from barpc.ba.robust.weights import geman_mcclure
+from barpc.ba.solution import Solution
+from barpc.base.geodesy import Array
+from barpc.base.statistics import BANDS, MAD, OUTLIER, SURELY
+from barpc.scene import IntArray
+
+_LEAST = 12  # offsets of a band: fewer have no median
+_MEDIAN = 1.2533  # standard error of a median over that of a mean, normal errors
+_APART = 2  # observations of a track are paired with the next so many
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Epipolar offsets of pairs of a block's tie points, by pair of images and by eighths of their rows and columns.
+
+    An offset is the distance [px] of an observation from the epipolar line of another of its track, in its own image.
+    It does not depend on where the point is taken to be: it is the product of both residuals with the left
+    null vector of both derivatives by the point.
+    """
+
+    ties: Block
+    first: IntArray  # (M,) observations of pairs of the same point
+    second: IntArray  # (M,)
+    group: IntArray  # (5 M,) band of each offset: of both images by columns and rows, and of the pair
+    count: IntArray  # (B,) offsets of every band
+
+    @classmethod
+    def of(cls, ties: Block) -> Bands:
+        """Return the bands of the tie points of a block."""
+        first, second = _pairs(ties)
+        pair, whole = ties.view[first] * len(ties.views) + ties.view[second], np.zeros_like(first)
+        keys = [
+            np.column_stack([pair, ties.view[rows], whole + axis, _band(ties.xy[axis, rows], pair)])
+            for rows in (first, second)
+            for axis in (0, 1)
+        ]
+        keys.append(np.column_stack([pair, whole, whole + 2, whole]))
+        _, group, count = np.unique(np.concatenate(keys), axis=0, return_inverse=True, return_counts=True)
+        return cls(ties, first, second, group.ravel(), count)
+
+    def offsets(self, found: Solution) -> Array:
+        """Return the offsets (5 M,) [px] of all bands under the cameras of a solution."""
+        ties, cameras = self.ties, found.final.params
+        problem, points = seen_in(found.problem, cameras, ties)
+        projected = problem.project_points(cameras, points)
+        residual, by_point = projected.image - ties.xy, np.moveaxis(projected.by_point, -1, 0)
+        ray = np.cross(by_point[:, 0], by_point[:, 1])
+        normal = np.cross(ray[self.first], ray[self.second])
+        across = [_in_image(by_point[rows], normal) for rows in (self.first, self.second)]
+        apart = [(one * residual[:, rows].T).sum(axis=1) for one, rows in zip(across, self.both, strict=True)]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            one, other = ((apart[0] - apart[1]) / np.linalg.norm(part, axis=1) for part in across)
+        return np.concatenate([one, one, other, other, other])
+
+    @property
+    def both(self) -> tuple[IntArray, IntArray]:
+        """The two observations of every pair."""
+        return self.first, self.second
+
+    def medians(self, offsets: Array) -> tuple[Array, Array]:
+        """Return the absolute median and its standard error (B,) [px] of every band with enough offsets (5 M,)."""
+        order = np.lexsort((offsets, self.group))
+        middle, spread = np.full((2, len(self.count)), np.nan)
+        for band, part in enumerate(np.split(offsets[order], np.cumsum(self.count)[:-1])):
+            if len(part) >= _LEAST:
+                middle[band] = np.nanmedian(part)
+                spread[band] = MAD * np.nanmedian(np.abs(part - middle[band]))
+        return np.abs(middle), _MEDIAN * spread / np.sqrt(self.count)
+
+
+def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
+    """Return the first and second observations (M,) of pairs of the same point, in the order of their views."""
+    order = np.lexsort((ties.view, ties.point))
+    first, second = list[IntArray](), list[IntArray]()
+    for lag in range(1, _APART + 1):
+        same = np.flatnonzero(ties.point[order[lag:]] == ties.point[order[: len(order) - lag]])
+        first.append(order[same])
+        second.append(order[same + lag])
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _in_image(by_point: Array, normal: Array) -> Array:
+    """Return the vectors (M, 2) whose product with derivatives by the point (M, 2, 3) are normals (M, 3)."""
+    square = by_point @ np.swapaxes(by_point, 1, 2)
+    return np.asarray(np.linalg.solve(square, by_point @ normal[..., None])[..., 0])
+
+
+def _band(place: Array, pair: IntArray) -> IntArray:
+    """Return the number (M,) of the band of each place in its pair's extent."""
+    _, index = np.unique(pair, return_inverse=True)
+    low, high = np.full((2, index.max(initial=0) + 1), np.inf)
+    np.minimum.at(low, index, place)
+    np.minimum.at(high, index, -place)
+    part = BANDS * (place - low[index]) / np.maximum(-high - low, 1e-9)[index]
+    return np.asarray(np.minimum(part.astype(np.int64), BANDS - 1))
+
+
+def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
+    """Return whether a model surely meets more of all tie points of a block closely than the plain one does.
+
+    The distance of a match counts up to one standard deviation of the matches that the model keeps, whichever model
+    cut or excluded it: of two solutions that share the matches the one that fits its own no better is none.
+    """
+    noise = min(tried.outcome.noise, plain.outcome.noise)
+    far = [(measure(one.problem, one.final.params, ties).residual ** 2).sum(axis=0) for one in (tried, plain)]
+    less = np.subtract(*(geman_mcclure(one / (noise * ties.sigma) ** 2)[0] for one in far[::-1]))
+    index, point = np.unique(ties.point, return_inverse=True)
+    by_track = np.bincount(point, less)
+    return bool(by_track.mean() > SURELY * by_track.std() / np.sqrt(len(index)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A model beside the plain one, by the bands of tie points."""
+
+    worse: bool  # whether it meets some band surely worse
+    changed: float  # by how much it moves images against each other, the largest median of a band [px]
+
+
+def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
+    """Compare a model with the plain one on the tie points of a block.
+
+    A median counts up to `OUTLIER` standard deviations of tie points: a match that both cut is of neither.
+    """
+    bands = Bands.of(ties)
+    if not len(bands.first):
+        return Comparison(False, 0.0)
+    offsets = [bands.offsets(one) for one in (tried, plain)]
+    (one, _), (other, error) = (bands.medians(each) for each in offsets)
+    changed, _ = bands.medians(offsets[0] - offsets[1])
+    most = OUTLIER * plain.outcome.noise * float(np.median(ties.sigma))
+    worse = np.minimum(one, most) - np.minimum(other, most) > SURELY * error
+    return Comparison(bool(worse.any()), float(np.nanmax(changed, initial=0.0)))
