@@ -25,7 +25,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 REMOTE = "allow_remote"
 _ALL = "barpc.help_all"  # key of a context whose help shows every flag
 TIE = ("tie.band", "tie.matcher", "matches", "matches_only", "overlap_list", "aoi")
-CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.fixed", "calibration")
+CAMERA = ("adjust.model", "adjust.drift", "adjust.jitter", "adjust.terms", "adjust.fixed", "calibration")
 GROUND = (
     "gcp",
     "gcp_crs",

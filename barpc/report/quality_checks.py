@@ -8,6 +8,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.control.snooping import ControlTest
+from barpc.ba.parameters.priors import is_stated
 from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
@@ -124,7 +125,7 @@ def _of_camera(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
             f"is {apart.scale:.0f} times less accurate than stated" if apart.scale > 1.0 else "does not match the image"
         )
         yield "foreign_camera", {"stated": stated, "strangeness": strangeness(apart)}
-    if prior.odd[i]:
+    if prior.odd[i] and is_stated(run.views[i], adjustment.options):
         others = [adjustment.names[j] for j in np.flatnonzero(prior.odd) if j != i]
         either = f" (or that of {listed(others)}: undetermined by tie points)" if others else ""
         yield "odd", {"scale": prior.scale[i], "either": either}

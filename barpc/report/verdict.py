@@ -11,6 +11,7 @@ import numpy as np
 
 from barpc.ba import Adjustment, check_residuals
 from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.parameters.priors import DEFAULT_ACCURACY, is_stated
 from barpc.ba.select.foreign_camera import FOREIGN_CAMERA
 from barpc.ba.terms import TERMS
 from barpc.base.errors import listed
@@ -115,7 +116,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         return
     if len(run.tracks):
         yield from (
-            *_of_cameras(found),
+            *_of_cameras(run, found),
             *_of_places(run, found, views),
             *_of_same_ground(run, found),
             *_of_solution(run, found),
@@ -136,9 +137,14 @@ def common_lean(views: Sequence[ViewEntry]) -> float:
     return float(np.abs(leans[known].sum())) / max(int(known.sum()), 1)
 
 
-def _of_cameras(found: Adjustment) -> Iterator[str]:
-    common = float(np.min(found.prior.scale)) if len(found.prior.scale) else 1.0
-    if common > PRIOR_WIDENED:
+def _common_scale(found: Adjustment) -> float:
+    """Return by how much the standard deviations of all cameras were widened."""
+    return float(np.min(found.prior.scale)) if len(found.prior.scale) else 1.0
+
+
+def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
+    common = _common_scale(found)
+    if common > PRIOR_WIDENED and any(is_stated(view, found.options) for view in run.views):
         yield (
             f"The cameras are {common:.1f} times less accurate than stated: their standard deviations were widened, "
             "and with them the uncertainty of the scene's position."
@@ -250,7 +256,8 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
     held = used or bool(found.reference_inlier.any()) or bool(found.options.fixed or run.known)
     by_heights = _holds(found) or (found.terrain is not None and found.terrain.shows and found.terrain.held > 0)
     moved = moved[:2] if by_heights else moved
-    if not held and (moved[np.isfinite(moved)] > SURELY).any():
+    stated = by_heights or any(is_stated(view, found.options) for view in run.views)
+    if stated and not held and (moved[np.isfinite(moved)] > SURELY).any():
         which = "check that the heights are of this place, or add GCPs" if by_heights else "add GCPs or a DEM"
         yield (
             f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times the standard deviation expected "
@@ -303,6 +310,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         )
     found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
+    yield from _pointing_lines(run, run.adjustment, views)
     yield from _unmet_places(run, run.adjustment, views, matter=False)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
@@ -320,6 +328,22 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
+
+
+def _pointing_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
+    """Yield by how much cameras were off whose accuracy nobody states, where that is more than was assumed."""
+    common, off = _common_scale(found) > PRIOR_WIDENED, dict[str, float]()
+    for view, given, odd in zip(views, run.views, found.prior.odd, strict=False):
+        shift = value_of(view, "correction.center_shift_px")
+        if shift is not None and (common or odd) and not is_stated(given, found.options):
+            off[view.name] = float(np.hypot(*shift))
+    if off:
+        assumed = np.sqrt(2.0) * DEFAULT_ACCURACY / median([view.gsd_m for view in views])  # rotation and translation
+        names = listed([f"{name} ({px:.0f} px)" for name, px in off.items()], NAMED)
+        yield (
+            f"The delivered pointing of {names} was off by more than the {assumed:.0f} px assumed where no file states "
+            "its accuracy, and was corrected."
+        )
 
 
 def _added_lines(added: Added, num: int) -> Iterator[str]:

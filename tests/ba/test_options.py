@@ -15,6 +15,7 @@ import scipy.optimize
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.parameters.priors import prior_sigmas, stated_accuracy
+from barpc.ba.select import models
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import Tracks
@@ -106,6 +107,7 @@ ROWS = [
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"loss": "linear", "solver": "sparse"}),
 ]
 ELSEWHERE = {
+    "terms": "test_no_terms_is_the_plain_model_and_needs_no_search",
     "center": "test_views_turn_about_the_centre_that_is_asked_for",
     "min_observations": "test_a_view_needs_as_many_observations_as_asked_for",
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
@@ -332,3 +334,27 @@ def test_views_turn_about_the_centre_that_is_asked_for(dirty):
         wanted = camera_center(view.sensor, view.size, view.alt_range, "projective").ecef
         np.testing.assert_array_equal(far.center, wanted)
         assert np.linalg.norm(far.center - near.center) > 1e4
+
+
+def test_no_terms_is_the_plain_model_and_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    block = simulate_block(3, 1500, seed=21)
+
+    def searched(*_: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(models, "_search_beside", searched)
+    tracks = block.tracks
+    xy = tracks.xy.copy()
+    xy[(tracks.view == 1) & (np.abs(tracks.xy[:, 1] - 9000.0) < 1500.0)] += (1.0, 2.0)
+    jumped = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
+    with pytest.raises(AssertionError):
+        adjust_tracks(block.views, jumped)
+    found = adjust_tracks(block.views, jumped, AdjustOptions(terms="none"))
+    assert found.cameras.unknowns.drift == 1
+    assert found.cameras.unknowns.waves is None
+    assert (found.findings, found.changed) == ((), 0.0)
+    assert not found.moving.any()
+    monkeypatch.undo()
+    followed = adjust_tracks(block.views, jumped)
+    assert [one.kind for one in followed.findings] == ["step"]
+    assert followed.changed > 0.5  # of two pixels, beside what the plain model bends

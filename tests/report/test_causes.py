@@ -20,10 +20,10 @@ from barpc.report.summary.block import explanations, left_entries, strangeness
 NAMES = "west", "east"
 
 
-def adjustment(findings: Any = (), left: Any = (), apart: Any = None) -> Any:
+def adjustment(findings: Any = (), left: Any = (), apart: Any = None, changed: float = 0.0) -> Any:
     half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
     cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
-    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart)
+    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart, changed=changed)
 
 
 def reasons(found: Any) -> list[str]:
@@ -204,7 +204,7 @@ def interval(view: int, share: float, off: float) -> Interval:
 
 
 def test_what_is_left_is_a_reason_where_it_is_much() -> None:
-    left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.09)]
+    left = [interval(0, 0.8, 0.0), interval(0, 0.4, 0.0), interval(1, 0.02, 0.19)]
     found = adjustment(left=left)
     first, second = reasons(found)
     assert first == (
@@ -213,15 +213,19 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
         "2.50 px."
     )
     assert (
-        second == "Rows 100-399 of east are inconsistent with the rest: their tie points share a residual of 0.09 px."
+        second == "Rows 100-399 of east are inconsistent with the rest: their tie points share a residual of 0.19 px."
     )
     assert [one.last for one in left_entries(found)] == [399.0] * 3
     assert reasons(adjustment(left=[interval(0, 0.1, 0.05)])) == []
+    assert reasons(adjustment(left=[interval(0, 0.1, 0.09)])) == []  # of less than 0.1 px: a remark
+    narrow = [replace(interval(0, 0.1, 0.19), part=1 / 32)]  # over a quarter of an eighth
+    assert reasons(adjustment(left=narrow)) == []
 
 
 def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     left = [replace(interval(view, 0.8, 0.0), moves=True) for view in (0, 1, 0, 1)]
-    (said,) = reasons(adjustment(left=left))
+    assert reasons(adjustment(left=left, changed=0.09)) == []
+    (said,) = reasons(adjustment(left=left, changed=0.11))
     assert said == (
         "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west, rows 100-399 of east "
         "move together: moving objects, or a displacement of these rows that no camera models."

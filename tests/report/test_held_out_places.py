@@ -75,6 +75,7 @@ def test_rows_that_stand_out_among_all_are_not_said_twice(run: Run) -> None:
         by_share=True,
         apart=0.5,
         moves=False,
+        part=0.25,
     )
     found: Any = replace(changed.adjustment, left=(first,))  # type: ignore[arg-type, type-var]
     reasons = summarize(replace(changed, adjustment=found)).reasons

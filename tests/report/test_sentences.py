@@ -40,7 +40,9 @@ def adjusted(**fields: Any) -> Any:
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
-        "options": SimpleNamespace(drift=None, fixed=(), min_convergence=1.0, dem_sigma=2.0),
+        "options": SimpleNamespace(drift=None, fixed=(), min_convergence=1.0, dem_sigma=2.0, sigma_attitude=7.5,
+                                   sigma_position=7.5),
+        "changed": 0.0,
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1]),
@@ -294,6 +296,25 @@ def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
         assert found[0].startswith("The cameras are 2.1 times less accurate than stated")
 
 
+def test_an_accuracy_that_nobody_stated_is_no_reason():
+    """The default is no statement: what was off is said with its size, and corrected."""
+    nobody = SimpleNamespace(**{**vars(adjusted().options), "sigma_attitude": None, "sigma_position": None})
+    off = [a_view(name, gsd_m=0.5, correction=a_correction(center_shift_px=(0.0, 31.0))) for name in NAMES]
+    for odd, scale, names in (
+        ([0, 0, 0], [2.1, 9.0, 9.0], "A (31 px), B (31 px), C (31 px)"),
+        ([0, 1, 0], [1.0, 9.0, 1.0], "B (31 px)"),
+    ):
+        prior = SimpleNamespace(odd=np.array(odd, bool), scale=np.array(scale), drift_sigma=())
+        silent = tuple(SimpleNamespace(name=name, sensor=replace(make_rpc(), err_bias=None)) for name in NAMES)
+        run = run_of(adjusted(prior=prior, options=nobody), views=silent)
+        found = block_verdict(run, off)
+        assert found["reasons"] == []
+        assert [view_status(view, run)["cause"] for view in off] == [None] * 3
+        (line,) = (line for line in found["verdict"] if "pointing" in line)
+        assert line.startswith(f"The delivered pointing of {names} was off by more than the 21 px assumed")
+    assert reasons(moved(600.0, options=nobody), views=silent) == []
+
+
 @pytest.mark.parametrize(("noise", "said_of"), [(2.5, False), (2.6, True)])
 def test_tie_points_that_scatter_are_said_to(noise, said_of):
     found = reasons(adjusted(noise=noise))
@@ -358,7 +379,7 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
         assert len(reasons(lifted)) == told
     assert reasons(moved(6.1, reference_inlier=np.ones(2, bool), terrain=dem)) == []
     assert reasons(moved(6.1), known=frozenset("A")) == []
-    fixed = SimpleNamespace(drift=None, fixed=("A",), min_convergence=1.0, dem_sigma=2.0)
+    fixed = SimpleNamespace(**{**vars(adjusted().options), "fixed": ("A",)})
     assert reasons(moved(6.1, options=fixed)) == []
     for used, num in ((True, 0), (False, 1)):
         test = ControlTest(np.array([used]), np.zeros((1, 3)), np.zeros(1), np.ones(1))

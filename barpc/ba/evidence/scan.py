@@ -297,7 +297,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
     common = np.hypot(*mean.T) * float(np.median(one.deviation))
     along = along - along[:, near].mean(axis=1, keepdims=True)
     rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
-    told = (here >= _FEWEST_INSIDE) & (here < near.sum()) & (common > least)
+    told = (count >= _FEWEST_INSIDE) & (here > 1) & (here < near.sum()) & (common > least)
     known = spread > MIN_EXTENT_RATIO * spread.max()
     variance = _variances(along * near, of_near, rest, _image_cells(near, col, row))
     squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
@@ -305,7 +305,7 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
     chances[1, told] = fdtrc(free, others, squared / free)  # Hotelling's T^2, the variance one of so many
     chances *= tests
     if (chances[1] < CHANCE).any():
-        permuted = _by_permutation(along[:, near][known], of_near[told][:, near], variance[told][:, known])
+        permuted = _by_permutation(along[:, near][known], of_near[told][:, near])
         chances[1, told] = np.where(permuted < CHANCE, chances[1, told], 1.0)
     if not (chances < CHANCE).any():
         return None
@@ -320,20 +320,21 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
     return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]), moved)
 
 
-def _by_permutation(along: Array, of_near: Array, variance: Array) -> Array:
+def _by_permutation(along: Array, of_near: Array) -> Array:
     """Return the chance (P,) of as large a mean in some place, by permutations of the residuals among all places.
 
     Residuals are neither normal nor of one spread: their own values tell what a mean by chance is. `along` (d, k) are
-    the residuals along their axes, `of_near` (P, k) the places, `variance` (P, d) of their means.
+    the residuals along their axes, `of_near` (P, k) tells the places.
     """
-    rng, here = np.random.default_rng(0), of_near.sum(axis=1)
+    rng, here, count = np.random.default_rng(0), of_near.sum(axis=1), along.shape[1]
+    along = along - along.mean(axis=1, keepdims=True)
+    scale = (1.0 / here - 1.0 / count)[:, None] * (along**2).mean(axis=1)
 
-    def largest(values: Array) -> Array:
-        mean = np.einsum("pk,dk->pd", of_near, values) / here[:, None]
-        return np.asarray((mean**2 / variance).sum(axis=1))
+    def standard(values: Array) -> Array:
+        return np.asarray(((of_near @ values.T / here[:, None]) ** 2 / scale).sum(axis=1))
 
-    found = largest(along)
-    drawn = [largest(along[:, rng.permutation(along.shape[1])]).max() for _ in range(_PERMUTATIONS)]
+    found = standard(along)
+    drawn = [standard(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
     return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 

@@ -165,6 +165,13 @@ def states_accuracy(view: View) -> bool:
     return stated is not None and stated > USABLE_ACCURACY
 
 
+def is_stated(view: View, options: AdjustOptions) -> bool:
+    """Return whether a person, a file or a radar's metadata state the accuracy of a view; else it is the default."""
+    given = options.sigma_attitude is not None or options.sigma_position is not None
+    of_model = isinstance(view.sensor, Pushbroom | Clocked) and view.sensor.accuracy is not None
+    return given or of_model or states_accuracy(view)
+
+
 def _stated_accuracy(view: View) -> tuple[float, float]:
     """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
     clocks [m].

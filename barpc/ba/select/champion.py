@@ -77,9 +77,10 @@ class Bands:
         order = np.lexsort((offsets, self.group))
         middle, spread = np.full((2, len(self.count)), np.nan)
         for band, part in enumerate(np.split(offsets[order], np.cumsum(self.count)[:-1])):
-            if len(part) >= _LEAST:
-                middle[band] = np.nanmedian(part)
-                spread[band] = MAD * np.nanmedian(np.abs(part - middle[band]))
+            known = part[np.isfinite(part)]
+            if len(known) >= _LEAST:
+                middle[band] = np.median(known)
+                spread[band] = MAD * np.median(np.abs(known - middle[band]))
         return np.abs(middle), _MEDIAN * spread / np.sqrt(self.count)
 
 
@@ -128,7 +129,7 @@ def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
 class Comparison:
     """A model beside the plain one, by the bands of tie points."""
 
-    worse: bool  # whether it meets some band surely worse
+    worse: bool  # whether it meets some band surely worse, and by more than the plain one meets any other worse
     changed: float  # by how much it moves images against each other, the largest median of a band [px]
 
 
@@ -144,5 +145,6 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
     (one, _), (other, error) = (bands.medians(each) for each in offsets)
     changed, _ = bands.medians(offsets[0] - offsets[1])
     most = OUTLIER * plain.outcome.noise * float(np.median(ties.sigma))
-    worse = np.minimum(one, most) - np.minimum(other, most) > SURELY * error
-    return Comparison(bool(worse.any()), float(np.nanmax(changed, initial=0.0)))
+    grown = np.minimum(one, most) - np.minimum(other, most)
+    surely = (grown > SURELY * error).any() and np.nanmax(grown) > -np.nanmin(grown)
+    return Comparison(bool(surely), float(np.nanmax(changed, initial=0.0)))

@@ -91,6 +91,8 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 
     Splines and detector steps that were given as options stay.
     """
+    if options.terms != AUTO:
+        return SelectedModel(first, parts)
     selected = _search_beside(first, parts, options, solve)
     if selected.found is first and "drift" not in first.asked:
         return selected
@@ -103,8 +105,6 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 
 def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the model that a search among the other hypotheses ends with."""
-    if options.terms != AUTO:
-        return SelectedModel(first, parts)
     given = options.model != AUTO or options.drift is not None or first.goes_on
     found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
     searched = first.problem.cameras.unknowns.geometric and not first.goes_on
