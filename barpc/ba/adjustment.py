@@ -24,6 +24,7 @@ from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select.anomalies import left_over
+from barpc.ba.select.champion import largest_offset
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver
 from barpc.ba.select.models import SelectedModel, select_model
 from barpc.ba.select.parts import Parts
@@ -218,7 +219,7 @@ def _adjustment(
         told=outcome.told,
         smooth=outcome.smooth,
         asked=found.asked,
-        findings=tuple(_reported_findings(found.findings, parts, points)),
+        findings=tuple(_reported_findings(found, parts, points)),
         moving=parts.block.in_order(parts.group > 0)[ties],
         left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_neighbour_correlation(block, outcome, is_tie),
@@ -256,15 +257,17 @@ def _neighbour_correlation(block: Block, outcome: Outcome, is_tie: BoolArray) ->
     return neighbours_alike(block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views))
 
 
-def _reported_findings(findings: Sequence[Finding], parts: Parts, points: Array) -> Iterator[Finding]:
+def _reported_findings(found: Solution, parts: Parts, points: Array) -> Iterator[Finding]:
     """Yield the findings as they are reported, with the place and size of a motion."""
     number = 0
-    for one in findings:
+    for one in found.findings:
         if one.moved is None:
             yield one
         else:
             number += 1
-            yield replace(one, moved=None, motion=parts.motion(number, one.moved, points))
+            size = largest_offset(found, parts.block.without(parts.group != number)) * one.moved.ground.pixel
+            moved = replace(one.moved, metres=max(one.moved.metres, size))
+            yield replace(one, moved=None, motion=parts.motion(number, moved, points))
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:

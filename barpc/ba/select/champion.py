@@ -16,7 +16,7 @@ from barpc.ba.robust.heldout import measure, seen_in
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solution import Solution
 from barpc.base.geodesy import Array
-from barpc.base.statistics import BANDS, MAD, OUTLIER, SURELY
+from barpc.base.statistics import BANDS, LEVEL, MAD, OUTLIER, SURELY
 from barpc.scene import IntArray
 
 _LEAST = 12  # offsets of a band: fewer have no median
@@ -148,3 +148,11 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
     grown = np.minimum(one, most) - np.minimum(other, most)
     surely = (grown > SURELY * error).any() and np.nanmax(grown) > -np.nanmin(grown)
     return Comparison(bool(surely), float(np.nanmax(changed, initial=0.0)))
+
+
+def largest_offset(found: Solution, ties: Block) -> float:
+    """Return the largest epipolar offset [px] of tie points of a block, but for one in twenty; 0 without a pair."""
+    bands = Bands.of(ties)
+    offsets = np.abs(bands.offsets(found)) if len(bands.first) else np.zeros(0)
+    offsets = offsets[np.isfinite(offsets)]
+    return float(np.quantile(offsets, 1.0 - LEVEL)) if len(offsets) else 0.0

@@ -22,10 +22,13 @@ from barpc.ba.select.image_terms import with_splines, with_terms
 from barpc.ba.select.parts import Parts
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
+from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, RIVALS
+
+MIN_MOTION = 0.2  # px between images of one pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +152,33 @@ def _at_lower_degree(
     return plain if is_better(plain[0].after, measure(found.problem, found.final.params, outer), outer) else None
 
 
+def _least_motion(one: MovingGroup, parts: Parts) -> float:
+    """Return the least motion [px] of a group: seconds apart no ground moves by less than errors of matches are.
+
+    Images without a date count as of one pass.
+    """
+    first, second = (parts.block.views[v].date for v in one.between)
+    return MIN_MOTION if first == second else 0.0
+
+
+def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
+    """Return the block by that of two groups which is likelier the ground: by its share of the ties and its cameras.
+
+    A deck of clouds may cover more than half of the ground; then the cameras that follow it lie farther from their
+    priors, as these were given. Control has told before.
+    """
+    exchanged = parts.exchanged()
+    if found.heights.has_control or not exchanged.is_tied():
+        return found, parts
+    try:
+        other = solve(exchanged.inner, exchanged.outer, options)
+    except (AdjustError, np.linalg.LinAlgError):
+        return found, parts
+    cost, of_other = (float((one.problem.camera_prior.residual(one.final.params) ** 2).sum()) for one in (found, other))
+    share = np.log(exchanged.inner.use.sum() / parts.inner.use.sum())
+    return (other, exchanged) if 0.5 * (cost - of_other) + share > 0.0 else (found, parts)
+
+
 def _without_moving_ground(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection]:
@@ -172,12 +202,15 @@ def _without_moving_ground(
         if options.is_plain or any(row.gain > last.gain for row in findings):
             break
         less = parts.less(found, last.moved)
-        if len(groups) == RIVALS or not less.is_tied():
+        if len(groups) == RIVALS or not less.is_tied() or parts.pixels(last.moved) < _least_motion(last.moved, parts):
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
         if not is_admitted(tried.after, before, less.outer, last.gain) or not is_closer(tried, found, parts.ties()):
             break
+        if less.lies_across() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
+            break
+        tried, less = _of_ground(tried, less, options, solve)
         found, parts = tried, less
         groups.append(last)
     unexplained = found.has_trend and not (groups or findings)

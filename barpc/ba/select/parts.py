@@ -62,6 +62,30 @@ class Parts:
             group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
         return replace(self, group=group)
 
+    def pixels(self, one: MovingGroup) -> float:
+        """Return by how much a group moves in pixels of the coarser of the two images between which it moves most."""
+        view = self.inner.view
+        return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
+
+    def lies_across(self) -> bool:
+        """Return whether the last group is what lies on one side of a row in every image, but for a tenth."""
+        number = self.group.max(initial=0)
+        ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
+        for v in range(len(self.block.views)):
+            rows = np.flatnonzero(ties & (self.block.view == v))
+            moves = self.group[rows[np.argsort(self.block.xy[1, rows], kind="stable")]] == number
+            before = np.cumsum(np.append(0, moves)) - np.cumsum(np.append(0, ~moves))  # more of these than of others
+            apart = np.abs(2 * before - before[-1]).max(initial=0)
+            if len(rows) and apart < 0.8 * len(rows):
+                return False
+        return True
+
+    def exchanged(self) -> Parts:
+        """Return the parts with the last group taken for the ground, and the ground for a group that moves."""
+        number = self.group.max(initial=0)
+        moves = np.where(self.group == 0, number, np.where(self.group == number, 0, self.group))
+        return replace(self, group=moves)
+
     def is_tied(self) -> bool:
         """Return whether every view keeps enough observations and the views stay connected as they were."""
         block, inner = self.block, self.inner
