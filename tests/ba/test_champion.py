@@ -11,7 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.constraints.block import first_state, join, make_problem
-from barpc.ba.select import champion
+from barpc.ba.select import champion, models
 from barpc.ba.select.champion import Bands, compared, is_closer
 from barpc.base.statistics import BANDS
 from barpc.scene import Tracks
@@ -103,3 +103,91 @@ def test_what_a_model_excludes_still_counts(block: Any) -> None:
     compromise, ties = delivered(clouded, xy, params=spread.params, noise=9.0)
     of_half, _ = delivered(clouded, xy, params=found.params)
     assert is_closer(of_half, compromise, ties)
+
+
+# --- what moves, and which of two groups is the ground ----------------------------------------------------------
+
+
+def moving(made: Any, share: float, by: float, dates: tuple[str, ...] = ("", "", "")) -> tuple[Any, Any, np.ndarray]:
+    """A block with a corner of its ground that moves by so many pixels a view; and which tracks are on it."""
+    tracks = made.tracks
+    first = np.full(tracks.num_points, np.nan)
+    for v in range(len(made.views)):
+        rows = np.flatnonzero(tracks.view == v)
+        new = rows[np.isnan(first[tracks.point[rows]])]
+        first[tracks.point[new]] = tracks.xy[new, 0] + 0.7 * tracks.xy[new, 1]
+    member = first < np.quantile(first, share)
+    xy = tracks.xy + np.outer(member[tracks.point] * by * tracks.view / (len(made.views) - 1), (0.6, 0.8))
+    views = tuple(replace(view, date=date) for view, date in zip(made.views, dates, strict=False))
+    return views, Tracks(tracks.view, tracks.point, xy, tracks.sigma), member
+
+
+@pytest.mark.parametrize(("by", "seen"), [(0.3, False), (20.0, True)])
+def test_ground_that_moves_within_a_pass_moves_by_more_than_matches_err(block: Any, by: float, seen: bool) -> None:
+    views, tracks, member = moving(block, 0.35, by)
+    found = adjust_tracks(views, tracks)
+    assert found.moving.any() == seen
+    if seen:
+        np.testing.assert_allclose(found.moving[~found.held_out], member[tracks.point][~found.held_out], atol=1)
+        assert np.mean(found.moving != member[tracks.point]) < 0.02
+        (one,) = (finding for finding in found.findings if finding.motion is not None)
+        # the largest displacement across the base, 0.5 m a pixel: less than the whole motion, which may be height
+        assert one.motion is not None
+        assert 1.0 < one.motion.metres < 11.0
+
+
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
+def test_a_deck_that_covers_more_than_half_is_told_by_the_priors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cameras are far from where they were delivered; without that it is the larger group that stands."""
+    made = simulate_block(4, 1200, seed=1)
+    views, tracks, member = moving(made, 0.6, 100.0, ("",) * 4)
+    exchanged: list[bool] = []
+    before = models._of_ground
+
+    def noted(found: Any, parts: Any, *rest: Any) -> Any:
+        out = before(found, parts, *rest)
+        exchanged.append(out[1] is not parts)
+        return out
+
+    monkeypatch.setattr(models, "_of_ground", noted)
+    adjust_tracks(views, tracks)
+    assert exchanged[:1] == [True]
+    exchanged.clear()
+    adjust_tracks(views, moving(made, 0.45, 20.0, ("",) * 4)[1])
+    assert exchanged == [False]
+    assert member.mean() == pytest.approx(0.6, abs=0.01)
+
+
+@pytest.mark.parametrize(("low", "high", "across"), [(0.6, 1.0, True), (0.0, 0.5, True), (0.3, 0.7, False)])
+def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: float, high: float, across: bool) -> None:
+    ties = join(block.views, block.tracks, None, AdjustOptions())
+    rng, inside = np.random.default_rng(2), np.zeros(len(ties.view), dtype=bool)
+    for v in range(3):
+        rows = ties.view == v
+        edges = np.quantile(ties.xy[1, rows], (low, high))
+        inside[rows] = (ties.xy[1, rows] >= edges[0]) & (ties.xy[1, rows] <= edges[1])
+    inside ^= rng.random(len(inside)) < 0.05
+    parts = models.Parts(ties, np.zeros_like(inside), inside.astype(np.int64))
+    assert parts.lies_across() == across
+    swapped = parts.exchanged()
+    np.testing.assert_array_equal(swapped.group > 0, ~inside)
+    assert swapped.lies_across() == across
+
+
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
+def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = simulate_block(4, 600, seed=1)
+    tracks, rng = made.tracks, np.random.default_rng(1)
+    wrong = (tracks.view == 3) & (rng.random(len(tracks)) < 0.6)
+    xy = tracks.xy + wrong[:, None] * rng.uniform(-30, 30, tracks.xy.shape)
+    mixed = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
+    found = adjust_tracks(made.views, mixed)
+    assert found.apart is None  # its wrong matches lie anywhere and are cut: the others stay as without it
+    three = adjust_tracks(made.views[:3], tracks.select(tracks.view < 3))
+    monkeypatch.setattr(models, "MOST_BENT", 1e-9)
+    alone = adjust_tracks(made.views, mixed)
+    assert alone.apart is not None
+    assert (alone.apart.views, alone.apart.clear) == ((3,), True)
+    np.testing.assert_array_equal(alone.params[3], 0.0)
+    off = np.abs(alone.params[:3] - three.params).max()
+    assert off < 0.2 * np.abs(three.params).max()  # other tracks are held out

@@ -465,7 +465,7 @@ def _(s, start):
 def _(s, offset, a, b, best_a, best_b, angle, height):
     pairs = {(pair.a, pair.b): pair for pair in s.pairs}
     if offset:
-        ends = [pair.epipolar_after if s.kind == "adjust" else pair.epipolar_before for pair in s.pairs]
+        ends = [pair.epipolar_kept if s.kind == "adjust" else pair.epipolar_before for pair in s.pairs]
         near(offset, max(end.rms for end in ends if end))
     if best_a:
         near(angle, pairs[best_a, best_b].convergence_deg)

@@ -155,7 +155,12 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
         "1.4",
         "+0.300 ± 0.200",
         "+0.000 ± 0.100",
+        "-",
     ]
+    kept = OffsetEntry(0.0, 0.08, 0.09, 50)  # of those in use: ranked by
+    section = asked("pairs", pairs=[replace(pairs[0], epipolar_kept=kept)])
+    assert texts(section.tables[0])[0][-2:] == ["+0.000 ± 0.100", "+0.000 ± 0.080"]
+    assert "0.090 px (RMS) in the worst pair" in section.answer
     assert asked("pairs") is None
 
 

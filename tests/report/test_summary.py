@@ -163,18 +163,23 @@ def test_base_to_height_is_the_distance_of_two_cameras_one_unit_up(block_run):
 
 
 def test_two_steps_from_the_tie_points_altitudes_find_the_epipolar_offset(block_run):
+    """Of all verified matches; and of those in use, of which there are fewer."""
     run = block_run.run
-    for ties in pair_ties(run.tracks, run.keep)[:4]:
-        for sensors, when in ((run.before, "before"), (run.after, "after")):
-            i, j = ties.views
-            a, b = run.tracks.xy[ties.a], run.tracks.xy[ties.b]
+    for ties, kept in zip(pair_ties(run.tracks)[:4], pair_ties(run.tracks, run.keep)[:4], strict=True):
+        assert ties.views == kept.views
+        assert len(kept.a) < len(ties.a)
+        for sensors, when, of in (
+            (run.before, "before", ties), (run.after, "after", ties), (run.after, "kept", kept)
+        ):  # fmt: skip
+            i, j = of.views
+            a, b = run.tracks.xy[of.a], run.tracks.xy[of.b]
             offset, _ = epipolar_offset(sensors[i], sensors[j], a, b, 0.0, steps=20)
             found = next(
                 p for p in block_run.summary["pairs"] if (p["a"], p["b"]) == tuple(run.views[k].name for k in (i, j))
             )
             assert found[f"epipolar_{when}"]["count"] == len(a)
-            assert found[f"epipolar_{when}"]["rms"] == pytest.approx(np.sqrt(np.mean(offset**2)), rel=1e-6)
-            assert found[f"epipolar_{when}"]["median"] == pytest.approx(np.median(offset), abs=1e-7)
+            assert found[f"epipolar_{when}"]["rms"] == pytest.approx(np.sqrt(np.mean(offset**2)), rel=1e-4)
+            assert found[f"epipolar_{when}"]["median"] == pytest.approx(np.median(offset), abs=1e-6)
 
 
 def test_the_simulated_camera_sees_half_a_metre(block_run):

@@ -173,8 +173,13 @@ def find_foreign_camera(
 
 def _of_few(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
     """Return the views without which a block agrees and with which it does not, and the solution without the only."""
-    told = ForeignCamera(tuple(v for v, _ in without), np.nan, np.inf, None, np.nan, RpcDiagnosis(as_stated=True), None)
+    told = contradicted_view(*(v for v, _ in without))
     return told, without[0][1] if told.clear else None
+
+
+def contradicted_view(*views: int) -> ForeignCamera:
+    """Return the diagnosis of a view, or of one of several, of which nothing but its contradiction is known."""
+    return ForeignCamera(views, np.nan, np.inf, None, np.nan, RpcDiagnosis(as_stated=True), None)
 
 
 def agrees(found: Solution) -> bool:

@@ -13,22 +13,24 @@ import numpy as np
 
 from barpc.ba.constraints.block import Block
 from barpc.ba.parameters.priors import NOISE_FLOOR
-from barpc.ba.robust.heldout import is_admitted, is_better, measure
+from barpc.ba.robust.heldout import HeldOut, is_better, measure
 from barpc.ba.select.anomalies import standing_out
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
-from barpc.ba.select.foreign_camera import ForeignCamera, Solver, find_foreign_camera
+from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
 from barpc.ba.select.image_terms import with_splines, with_terms
-from barpc.ba.select.parts import Parts
+from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
 from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.options import AUTO, AdjustOptions
-from barpc.base.statistics import MUCH_NOISE, RIVALS
+from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px between images of one pass
+MOST_BENT = 0.06  # px by which a view that contradicts the others may move these
+_FEWEST_VIEWS = 3  # of which any might be the wrong one
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,30 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
         parts = parts.without_view(foreign.view)
     start = first if without is None else without
     assert start is not None
-    return replace(_select_beside(start, parts, options, solve), foreign=foreign)
+    selected = replace(_select_beside(start, parts, options, solve), foreign=foreign)
+    return _without_contradicted(selected, options, solve) if foreign is None and not start.goes_on else selected
+
+
+def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve: Solver) -> SelectedModel:
+    """Return the block without a view most of whose tie points were cut, where the others' cameras depend on it.
+
+    Before three images are said to be adjusted, they are adjusted alone: what they agree to without the fourth is
+    handed over, if it is another result by more than `MOST_BENT`.
+    """
+    found, parts = selected.found, selected.parts
+    lost = lost_shares(found, parts.inner)
+    view = int(lost.argmax())
+    others = parts.without_view(view)
+    groups = others.inner.groups(others.inner.use)
+    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _FEWEST_VIEWS:
+        return selected
+    try:
+        alone = _select_beside(solve(others.inner, others.outer, options), others, options, solve)
+    except (AdjustError, np.linalg.LinAlgError):
+        return selected
+    if compared(alone.found, found, alone.parts.ties()).changed <= MOST_BENT:
+        return selected
+    return replace(alone, foreign=contradicted_view(view))
 
 
 def _first(
@@ -152,20 +177,25 @@ def _at_lower_degree(
     return plain if is_better(plain[0].after, measure(found.problem, found.final.params, outer), outer) else None
 
 
-def _least_motion(one: MovingGroup, parts: Parts) -> float:
-    """Return the least motion [px] of a group: seconds apart no ground moves by less than errors of matches are.
+def _may_move(one: MovingGroup, solved: tuple[Solution, Solution], before: HeldOut, parts: Parts, less: Parts) -> bool:
+    """Return whether a group moves as ground does, by the block solved without it and with it.
 
-    Images without a date count as of one pass.
+    Errors of matches, which neighbours share, are as large as a small motion: seconds apart no ground moves by less
+    than `MIN_MOTION`, and between dates the block without the group must meet more of ALL tie points closely. A larger
+    one explains check tie points elsewhere surely better. Images without a date count as of one pass.
     """
+    without, found = solved
     first, second = (parts.block.views[v].date for v in one.between)
-    return MIN_MOTION if first == second else 0.0
+    if parts.pixels(one) >= MIN_MOTION:
+        return is_better(without.after, before, less.outer)
+    return first != second and is_closer(without, found, parts.ties())
 
 
 def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
     """Return the block by that of two groups which is likelier the ground: by its share of the ties and its cameras.
 
-    A deck of clouds may cover more than half of the ground; then the cameras that follow it lie farther from their
-    priors, as these were given. Control has told before.
+    A deck of clouds may cover more than half of the ground, in one block of twenty (`LEVEL`); then the cameras that
+    follow it lie farther from their priors, as these were given. Control has told before.
     """
     exchanged = parts.exchanged()
     if found.heights.has_control or not exchanged.is_tied():
@@ -175,8 +205,7 @@ def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Sol
     except (AdjustError, np.linalg.LinAlgError):
         return found, parts
     cost, of_other = (float((one.problem.camera_prior.residual(one.final.params) ** 2).sum()) for one in (found, other))
-    share = np.log(exchanged.inner.use.sum() / parts.inner.use.sum())
-    return (other, exchanged) if 0.5 * (cost - of_other) + share > 0.0 else (found, parts)
+    return (other, exchanged) if 0.5 * (cost - of_other) > -np.log(LEVEL) else (found, parts)
 
 
 def _without_moving_ground(
@@ -202,11 +231,11 @@ def _without_moving_ground(
         if options.is_plain or any(row.gain > last.gain for row in findings):
             break
         less = parts.less(found, last.moved)
-        if len(groups) == RIVALS or not less.is_tied() or parts.pixels(last.moved) < _least_motion(last.moved, parts):
+        if len(groups) == RIVALS or not less.is_tied():
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
-        if not is_admitted(tried.after, before, less.outer, last.gain) or not is_closer(tried, found, parts.ties()):
+        if is_better(before, tried.after, less.outer) or not _may_move(last.moved, (tried, found), before, parts, less):
             break
         if less.lies_across() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
             break

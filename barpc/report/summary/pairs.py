@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any, ClassVar
 
@@ -10,13 +11,14 @@ import numpy as np
 
 from barpc.base.geodesy import CHUNK, Array, ground_from_ecef
 from barpc.base.statistics import MAD
-from barpc.report.outcome import Run
+from barpc.report.outcome import PairTies, Run, pair_ties
 from barpc.report.records import Cell, Column, Number, Record, column, json_form
 from barpc.report.summary.words import Count
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several, base_to_height, convergence_angle, epipolar_offset, ground_sample_distance
 
+_FROM_FAR = 4  # steps to a pair's closest approach, from the altitude of the scene
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
 
 
@@ -43,12 +45,13 @@ class PairEntry(Record):
         "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
         "beaten": Column("instead of", lambda pair: "; ".join(pair.beaten)),
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
+        "kept": Column("kept [px]", lambda pair: _offset_cell(pair.epipolar_kept), ".3f", adjusted=True),
     }
     PAGE: ClassVar = (
-        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after"
+        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after kept"
     )
     AGAIN: ClassVar = "pair tied_by num_matches beaten"
-    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
+    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after kept"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
         "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms "
@@ -61,8 +64,8 @@ class PairEntry(Record):
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
-    epipolar_before: OffsetEntry | None = column("Epipolar offset through the delivered cameras")
-    epipolar_after: OffsetEntry | None = column("Epipolar offset through the new cameras")
+    epipolar_before: OffsetEntry | None = column("Epipolar offset of all verified matches, delivered cameras")
+    epipolar_after: OffsetEntry | None = column("The same, rejected and excluded ones too, through the new cameras")
     matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
     tied_by: str | None = column(
         "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
@@ -75,11 +78,12 @@ class PairEntry(Record):
     )
     beaten: tuple[str, ...] = column("Attempts with too few matches: matcher, matches of those required", default=())
     chosen_by: str | None = column("Reason of its selection: overlap and angle, same date, listed, ...", default=None)
+    epipolar_kept: OffsetEntry | None = column("Of those in use, through the new cameras", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:
         """RMS of the offsets before and after."""
-        before, after = self.epipolar_before, self.epipolar_after
+        before, after = self.epipolar_before, self.epipolar_kept or self.epipolar_after
         return None if before is None else before.rms, None if after is None else after.rms
 
 
@@ -91,21 +95,24 @@ _PAIR_REPORT_FIELDS = attrgetter("means", "control_share", "spread", "beaten", "
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
     """Return the record of every pair of images with common tie points."""
     reports = {report.names: report for report in run.matched}
-    before = _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2])
-    after = [None] * len(before) if run.after is None else _pair_offsets(run, run.after, run.ground[:, 2])
+    none: _Offsets = [None] * len(run.pairs)
+    before, _ = _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2])
+    after, kept = (none, none) if run.after is None else _pair_offsets(run, run.after, run.ground[:, 2])
     entries = []
-    for ties, (angle, base, height), first, last in zip(run.pairs, _pair_geometry(run), before, after, strict=True):
+    offsets = zip(before, after, kept, strict=True)
+    for ties, (angle, base, height), (first, last, used) in zip(run.pairs, _pair_geometry(run), offsets, strict=True):
         names = (run.views[ties.views[0]].name, run.views[ties.views[1]].name)
         report = reports.get(names)
         told = () if report is None else _PAIR_REPORT_FIELDS(report)
-        entries.append(PairEntry(*names, len(ties.a), angle, base, height, first, last, json_form(report), *told))
+        measured = PairEntry(*names, len(ties.a), angle, base, height, first, last, json_form(report), *told)
+        entries.append(replace(measured, epipolar_kept=used))
     return tuple(entries)
 
 
 def _pair_geometry(run: Run) -> list[list[float]]:
     """Return the medians over a hundred points of each pair: angle [deg], B/H, height per pixel [m]."""
     picks = [slice(None, None, max(1, len(ties.a) // 100)) for ties in run.pairs]
-    a, b, pair = _picked_matches(run, picks)
+    a, b, pair = _picked_matches(run.pairs, picks)
     seen = np.isfinite(run.ground[run.tracks.point[a]]).all(axis=1)
     a, b, pair = a[seen], b[seen], pair[seen]
     values = np.empty((3, len(a)))
@@ -119,24 +126,35 @@ def _pair_geometry(run: Run) -> list[list[float]]:
     return [list(row) for row in found.tolist()]
 
 
-def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> list[OffsetEntry | None]:
-    """Return the epipolar offsets of each pair's matches.
+_Offsets = list[OffsetEntry | None]
+
+
+def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple[_Offsets, _Offsets]:
+    """Return the epipolar offsets of each pair's verified matches, and of those of them that are in use.
 
     The altitudes (P,) [m] of the tracks through these cameras are near the closest approach of a pair's rays: two steps
-    from there converge.
+    from there converge. Tracks without one, of which nothing is in use, start from that of the scene.
     """
-    counts = [len(ties.a) for ties in run.pairs]
-    most = MAX_PER_PAIR
-    picks = [slice(n) if n <= most else np.linspace(0, n - 1, most).astype(np.int64) for n in counts]
-    a, b, pair = _picked_matches(run, picks)
-    height = alt[run.tracks.point[a]]
-    seen = np.isfinite(height)
-    a, b, pair = a[seen], b[seen], pair[seen]
-    offset, height, xy = np.empty(len(a)), height[seen], run.tracks.xy
+    of_all = {ties.views: ties for ties in pair_ties(run.tracks)}
+    every = [of_all[ties.views] for ties in run.pairs]
+    picks = [_evenly(len(ties.a)) for ties in every]
+    a, b, pair = _picked_matches(every, picks)
+    height = np.where(np.isfinite(alt), alt, run.altitude)[run.tracks.point[a]]
+    offset, xy = np.empty(len(a)), run.tracks.xy
     for part, first, second in _match_parts(run, sensors, a, b):
-        offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part], steps=2)
+        offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part], steps=_FROM_FAR)
+    used, num = run.keep[a] & run.keep[b], len(every)
+    return _offset_entries(offset, pair, num), _offset_entries(offset[used], pair[used], num)
+
+
+def _evenly(count: int) -> slice | IntArray:
+    return slice(count) if count <= MAX_PER_PAIR else np.linspace(0, count - 1, MAX_PER_PAIR).astype(np.int64)
+
+
+def _offset_entries(offset: Array, pair: IntArray, num: int) -> _Offsets:
+    """Return the records of offsets (n,) of pairs (n,), of `num` pairs in all."""
     known = np.isfinite(offset)
-    offset, pair, num = offset[known], pair[known], len(counts)
+    offset, pair = offset[known], pair[known]
     center = medians(offset, pair, num)
     spread = MAD * medians(np.abs(offset - center[pair]), pair, num)
     count, square = np.bincount(pair, minlength=num), np.bincount(pair, offset**2, minlength=num)
@@ -154,10 +172,12 @@ def _match_parts(
         yield part, Several(sensors, run.tracks.view[a[part]]), Several(sensors, run.tracks.view[b[part]])
 
 
-def _picked_matches(run: Run, picks: Sequence[slice | IntArray]) -> tuple[IntArray, IntArray, IntArray]:
+def _picked_matches(
+    pairs: Sequence[PairTies], picks: Sequence[slice | IntArray]
+) -> tuple[IntArray, IntArray, IntArray]:
     """Return the selected matches of all pairs: their observations in both views, and the index of their pair."""
     none = np.empty(0, dtype=np.int64)
-    a, b = ([getattr(t, of)[pick] for t, pick in zip(run.pairs, picks, strict=True)] for of in ("a", "b"))
+    a, b = ([getattr(t, of)[pick] for t, pick in zip(pairs, picks, strict=True)] for of in ("a", "b"))
     pair = np.repeat(np.arange(len(a)), [len(rows) for rows in a])
     return np.concatenate([none, *a]), np.concatenate([none, *b]), pair
 
