@@ -111,8 +111,8 @@ class AdjustOptions(Options):
     )
     terms: Literal["auto", "none"] = option(
         "auto",
-        """Terms beside a rotation, a translation and a linear drift. `auto`: where all matches ask for them; `none`:
-        the plain model, without further drift, splines, displaced rows or columns, or moving ground.""",
+        """Terms beside a rotation, a translation and a linear drift: `auto`, where all matches ask for them; or
+        `none`.""",
     )
     sigma_attitude: float | None = option(
         None,

@@ -151,9 +151,7 @@ class LeftEntry(Record):
     rejected_median_px: float = column("Median residual of the rejected ones", "px", "rejected by", ".2f")
     gain: float = column("Logarithm of the likelihood over that of a uniform image", "nats", "gain", ".0f")
     moving: bool = column("Whether the share is of a moving group, not of rejected tie points", default=False)
-    moved_px: Number = column(
-        "Mean displacement of an eighth of the image that the residuals there would be, at most", "px", default=None
-    )
+    moved_px: Number = column("The residual there as a mean over an eighth of the image", "px", default=None)
 
     @property
     def place(self) -> str:
@@ -175,7 +173,7 @@ class HeldOutEntry(Record):
     off_px: float = column("Median of the large residuals; without any the common residual", "px")
     chance: float = column("Probability of as much anywhere by chance, at most", head="p below", form=".0e")
     moved_px: Number = column(
-        "Mean displacement of an eighth of the image that these residuals would be; 0 of a cell", "px", default=None
+        "The residual there as a mean over an eighth of the image; 0 of a cell", "px", default=None
     )
 
 

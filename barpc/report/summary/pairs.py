@@ -64,8 +64,10 @@ class PairEntry(Record):
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
-    epipolar_before: OffsetEntry | None = column("Epipolar offset of all verified matches, delivered cameras")
-    epipolar_after: OffsetEntry | None = column("The same, rejected and excluded ones too, through the new cameras")
+    epipolar_before: OffsetEntry | None = column(
+        "Epipolar offset through the delivered cameras, of all verified matches"
+    )
+    epipolar_after: OffsetEntry | None = column("The same through the new cameras")
     matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
     tied_by: str | None = column(
         "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
@@ -78,7 +80,7 @@ class PairEntry(Record):
     )
     beaten: tuple[str, ...] = column("Attempts with too few matches: matcher, matches of those required", default=())
     chosen_by: str | None = column("Reason of its selection: overlap and angle, same date, listed, ...", default=None)
-    epipolar_kept: OffsetEntry | None = column("Of those in use, through the new cameras", default=None)
+    epipolar_kept: OffsetEntry | None = column("The same, of the matches in use", default=None)
 
     @property
     def offset_rms(self) -> tuple[float | None, float | None]:
