@@ -321,7 +321,9 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
         if one.motion.gcps:
             words["control"] = f", with the GCPs {listed(one.motion.gcps)}"
         if one.motion.share > _MINORITY:
-            words["larger"] = "; the larger part of the ground was taken to stand still"
+            larger = "the smaller part, whose cameras are nearer to their priors,"
+            larger = larger if one.motion.share > 0.5 else "the larger part of the ground"
+            words["larger"] = f"; {larger} was taken to stand still"
         fields = {"share": one.motion.share, "moved_m": one.motion.metres, "between": between, "box": box}
     elif one.where is not None:
         axis, start, stop, origin, rate = one.where
