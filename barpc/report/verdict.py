@@ -201,7 +201,7 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
 
 
 def _unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], *, matter: bool) -> Iterator[str]:
-    """Yield the worst region of each image that moves what is handed over, or of each other image one that does not."""
+    """Yield the worst region of each image: of those above `LEAST_MOVED`, or of the images without such a region."""
     said = {view.name for view in views if view.cause in _SAY_WHERE}
     worst: dict[str, tuple[bool, str]] = {}
     regions: list[tuple[LeftEntry | HeldOutEntry, str]] = [
@@ -331,7 +331,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def _pointing_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield by how much cameras were off whose accuracy nobody states, where that is more than was assumed."""
+    """Yield the pointing errors of cameras without a stated accuracy, where they exceed the default."""
     common, off = _common_scale(found) > PRIOR_WIDENED, dict[str, float]()
     for view, given, odd in zip(views, run.views, found.prior.odd, strict=False):
         shift = value_of(view, "correction.center_shift_px")

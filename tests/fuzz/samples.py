@@ -34,9 +34,9 @@ from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
 from barpc.report.runfiles import read_summary, table_path
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
+from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.images import put_tag
-from barpc.rpcio.sources import light_of
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.scene import View
 from barpc.sensor.direct_grid import DirectGrid
@@ -522,7 +522,7 @@ SAMPLES: dict[str, Sample] = {
     ),
     "metadata": Sample(
         "product.xml",
-        lambda path: light_of("image.tif", str(path)),
+        lambda path: read_acquisition("image.tif", str(path)),
         lambda: b"<X><IMAGING_DATE>2013-04-17</IMAGING_DATE><SUN_ELEVATION>5e1</SUN_ELEVATION></X>",
         (mutate_text,),
     ),

@@ -68,7 +68,7 @@ class Parts:
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
 
     def lies_across(self) -> bool:
-        """Return whether the last group is what lies on one side of a row in every image, but for a tenth."""
+        """Return whether the last group lies on one side of a row in every image, but for a tenth of its tie points."""
         number = self.group.max(initial=0)
         ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
         for v in range(len(self.block.views)):

@@ -369,7 +369,7 @@ def strangeness(apart: ForeignCamera) -> str:
 
 
 def matters(one: LeftEntry | HeldOutEntry) -> bool:
-    """Return whether residuals of a part of an image move what is handed over, by more than `LEAST_MOVED`."""
+    """Return whether the residuals of a region displace an eighth of the image by more than `LEAST_MOVED`."""
     return one.moved_px is not None and one.moved_px > LEAST_MOVED
 
 
