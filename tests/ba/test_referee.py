@@ -190,7 +190,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         ),
         ("jitter 0.1 at 5 Hz", "look", "px with a period of 27"),
         ("clouds 60 %", "bad", "check for clouds, water and change"),
-        ("RPC 200 px wrong", "look", "less accurate than stated"),
+        ("RPC 200 px wrong", "good", "was off by more than the"),
     ],
 )
 def test_what_is_said_is_true(name, status, word):

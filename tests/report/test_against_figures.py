@@ -364,6 +364,15 @@ def _(s, degree, rest):
         assert found[1] == ", ".join(map(metres, s.scene.drift_sigma_m))
 
 
+@says(rf"The delivered pointing of (.*) was off by more than the {NUM} px assumed .*")
+def _(s, names, assumed):
+    near(assumed, np.sqrt(2.0) * 7.5 / median([view.gsd_m for view in s.views]))
+    for name, shift in re.findall(r"(\S+) \((\d+) px\)", names):
+        view = next(one for one in s.views if one.name == name)
+        near(shift, float(np.hypot(*view.correction.center_shift_px)))
+        assert view.prior_scale > 1.0
+
+
 @says(rf"The cameras are {NUM} times less accurate than stated: their standard deviations were widened, .*")
 def _(summary, times):
     scale = min(view.prior_scale for view in summary.views)

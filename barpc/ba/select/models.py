@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc.ba.constraints.block import Block
 from barpc.ba.parameters.priors import NOISE_FLOOR
-from barpc.ba.robust.heldout import HeldOut, is_better, measure
+from barpc.ba.robust.heldout import is_better, measure
 from barpc.ba.select.anomalies import standing_out
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
@@ -177,18 +177,15 @@ def _at_lower_degree(
     return plain if is_better(plain[0].after, measure(found.problem, found.final.params, outer), outer) else None
 
 
-def _may_move(one: MovingGroup, solved: tuple[Solution, Solution], before: HeldOut, parts: Parts, less: Parts) -> bool:
+def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts) -> bool:
     """Return whether a group moves as ground does, by the block solved without it and with it.
 
     Errors of matches, which neighbours share, are as large as a small motion: seconds apart no ground moves by less
-    than `MIN_MOTION`, and between dates the block without the group must meet more of ALL tie points closely. A larger
-    one explains check tie points elsewhere surely better. Images without a date count as of one pass.
+    than `MIN_MOTION`, and between dates the block without the group must meet more of ALL tie points closely. Images
+    without a date count as of one pass.
     """
-    without, found = solved
     first, second = (parts.block.views[v].date for v in one.between)
-    if parts.pixels(one) >= MIN_MOTION:
-        return is_better(without.after, before, less.outer)
-    return first != second and is_closer(without, found, parts.ties())
+    return parts.pixels(one) >= MIN_MOTION or (first != second and is_closer(without, found, parts.ties()))
 
 
 def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
@@ -235,7 +232,7 @@ def _without_moving_ground(
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
-        if is_better(before, tried.after, less.outer) or not _may_move(last.moved, (tried, found), before, parts, less):
+        if is_better(before, tried.after, less.outer) or not _may_move(last.moved, tried, found, parts):
             break
         if less.lies_across() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
             break

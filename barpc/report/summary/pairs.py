@@ -51,7 +51,7 @@ class PairEntry(Record):
         "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after kept"
     )
     AGAIN: ClassVar = "pair tied_by num_matches beaten"
-    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after kept"
+    TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
     CSV: ClassVar = (
         "a b num_matches convergence_deg base_to_height height_m_per_px epipolar_before.median epipolar_before.spread "
         "epipolar_before.rms epipolar_after.median epipolar_after.spread epipolar_after.rms "
