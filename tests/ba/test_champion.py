@@ -169,6 +169,8 @@ def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: floa
     inside ^= rng.random(len(inside)) < 0.05
     parts = models.Parts(ties, np.zeros_like(inside), inside.astype(np.int64))
     assert parts.lies_across() == across
+    few = rng.random(len(inside)) < 0.05  # nearly all others lie on one side of some row: that tells nothing
+    assert not models.Parts(ties, np.zeros_like(few), few.astype(np.int64)).lies_across()
     swapped = parts.exchanged()
     np.testing.assert_array_equal(swapped.group > 0, ~inside)
     assert swapped.lies_across() == across

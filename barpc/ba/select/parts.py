@@ -15,6 +15,7 @@ from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
+_ACROSS = 0.8  # of the statistic's 1: a tenth of either lies on the other side
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
@@ -68,15 +69,14 @@ class Parts:
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
 
     def lies_across(self) -> bool:
-        """Return whether the last group lies on one side of a row in every image, but for a tenth of its tie points."""
+        """Return whether a row of every image parts the last group from the ground, but for a tenth of either."""
         number = self.group.max(initial=0)
         ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
         for v in range(len(self.block.views)):
             rows = np.flatnonzero(ties & (self.block.view == v))
             moves = self.group[rows[np.argsort(self.block.xy[1, rows], kind="stable")]] == number
-            before = np.cumsum(np.append(0, moves)) - np.cumsum(np.append(0, ~moves))  # more of these than of others
-            apart = np.abs(2 * before - before[-1]).max(initial=0)
-            if len(rows) and apart < 0.8 * len(rows):
+            below = [np.cumsum(one) / max(one.sum(), 1) for one in (moves, ~moves)]
+            if len(rows) and np.abs(below[0] - below[1]).max() < _ACROSS:  # the statistic of Kolmogorov and Smirnov
                 return False
         return True
 
