@@ -157,7 +157,10 @@ def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeyp
     for i, j in ((0, 1), (0, 2), (1, 2)):
         errors = scene.errors(i, j, *common_tracks(found.tracks, i, j))
         assert len(errors) > 100
-        assert np.sqrt((errors**2).mean(axis=0)).max() <= 0.1
+        off = np.abs(errors).max(axis=1)  # a point of another look lies pixels off; a roof's edge by up to 1.5 px
+        assert np.median(off) <= 0.05
+        assert np.quantile(off, 0.95) <= 0.2
+        assert off.max() < 2.0
 
 
 @pytest.mark.slow
