@@ -50,7 +50,7 @@ def _setup(views, model, drift, ecef, scale=5.0):
     """Cameras that see ten points each, where their corrected sensors see them."""
     edges = np.array([[5000.0, 12000.0], [9000.0, np.inf], [np.inf, np.inf]])
     periods = np.array([[2000.0, 5000.0], [np.inf, np.inf], [7000.0, np.inf]])
-    waves = AdditionalParameters(9, edges, np.zeros((3, 0, 5)), periods) if drift == 2 else None
+    waves = AdditionalParameters(9, edges, np.zeros((3, 0, 5)), periods) if drift == 2 or model == "affine" else None
     unknowns, bounds = make_unknowns(views, model, drift, waves=waves), np.array([0, 10, 20, 30])
     assert unknowns.size
     params = np.random.default_rng(3).normal(0, scale, (3, unknowns.size))

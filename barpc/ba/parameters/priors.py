@@ -201,7 +201,7 @@ def prior_sigmas(
             parts.append(np.tile(one[:, None], (1, 3)))
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
-        return np.full((count, size), IMAGE_MODEL_SIGMA)
+        return np.hstack([np.full((count, size), IMAGE_MODEL_SIGMA), np.full((count, waves), FIRST_SIGMA)])
     radars = [isinstance(view.sensor, Clocked) for view in views]
     parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
     parts += [np.full((count, 3), DRIFT_SIGMA)] * drift

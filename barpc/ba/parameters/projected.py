@@ -92,8 +92,7 @@ class Cameras:
             out.image[:] = found[0]
             out.by_point[:] = found[1][:, : out.by_point.shape[1]]
             out.by_unknown[:] = found[2][:, : out.by_unknown.shape[1]]
-            return
-        if views.start in unknowns.radars:
+        elif views.start in unknowns.radars:
             self._timed(params[views.start], ecef, views.start, out)
         else:
             self._moved(params[views], ecef, views, bounds, seen, out)

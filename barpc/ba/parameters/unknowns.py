@@ -51,14 +51,12 @@ class Unknowns:
     @property
     def size(self) -> int:
         """Number of unknowns q of a view."""
-        if not self.geometric:
-            return 2 * len(_IMAGE_TERMS[self.model])
-        return self._in_space + (0 if self.waves is None else self.waves.size)
+        return self._of_model + (0 if self.waves is None else self.waves.size)
 
     @property
-    def _in_space(self) -> int:
-        """Unknowns of a view that move the camera; those in the image follow."""
-        return self.constants + 3 * self.drift
+    def _of_model(self) -> int:
+        """Number of unknowns of a view that are the model's; additional parameters follow."""
+        return self.constants + 3 * self.drift if self.geometric else 2 * len(_IMAGE_TERMS[self.model])
 
     @property
     def constants(self) -> int:
@@ -67,8 +65,8 @@ class Unknowns:
 
     @property
     def in_waves(self) -> slice:
-        """Slice of a view's unknowns that act in the image."""
-        return slice(self._in_space, self.size)
+        """Slice of a view's unknowns that are additional parameters in the image."""
+        return slice(self._of_model, self.size)
 
     @property
     def sight(self) -> Array | None:
@@ -105,13 +103,13 @@ class Unknowns:
 
     def drift_vectors(self, params: Array, views: slice = slice(None)) -> Array:
         """Return the rotation vectors (n, D, 3) [rad] that the powers of the normalised row add."""
-        vectors = params[:, self.constants : self._in_space].reshape(len(params), self.drift, 3)
+        vectors = params[:, self.constants : self._of_model].reshape(len(params), self.drift, 3)
         return vectors / self.distance[views, None, None]
 
     def timing(self, params: Array, view: int) -> Timing:
         """Return the clock correction of a radar with the unknowns (q,)."""
         radar = self.radars[view]
-        drift = params[self.constants : self._in_space].reshape(-1, 3)[:, :2]
+        drift = params[self.constants : self._of_model].reshape(-1, 3)[:, :2]
         place = (float(values[radar.azimuth_axis, view]) for values in (self.middle, self.half))
         return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
 
@@ -122,7 +120,7 @@ class Unknowns:
         radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
         u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
         part = by_timing / np.array([[1.0], [radar.speed]])
-        for at in (0, *range(self.constants, self._in_space, 3)):
+        for at in (0, *range(self.constants, self._of_model, 3)):
             out[:, at : at + 2] = part
             part = part * u
         return out
@@ -177,18 +175,25 @@ class Unknowns:
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
         coefficients = np.zeros((2, 3, image.shape[1]))
-        coefficients[:, chosen] = np.moveaxis(params.reshape(-1, 2, m)[index], 0, -1)
+        coefficients[:, chosen] = np.moveaxis(params[:, : 2 * m].reshape(-1, 2, m)[index], 0, -1)
         moved = image + (coefficients * basis).sum(axis=1)
         slope = coefficients[:, 1:] / self.half[:, index]
         by_moved = by_point + slope[:, 0, None] * by_point[0] + slope[:, 1, None] * by_point[1]
-        by_unknown = np.zeros((2, 2 * m, image.shape[1]))
-        by_unknown[0, :m] = by_unknown[1, m:] = basis[chosen]
+        by_unknown = np.zeros((2, self.size, image.shape[1]))
+        by_unknown[0, :m] = by_unknown[1, m : 2 * m] = basis[chosen]
         return moved, by_moved, by_unknown
 
     def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
         """Return every view's sensor behind the correction that its unknowns (N, q) stand for."""
-        if not self.geometric:
-            return tuple(ImageCorrected(view.sensor, self._affine(params[i], i)) for i, view in enumerate(views))
+        found = self._moved(params, views) if self.geometric else self._in_images(params, views)
+        if self.waves is not None:
+            for i, one in enumerate(params[:, self.in_waves]):
+                of_rows = float(self.middle[1, i]), float(self.half[1, i])
+                found[i] = Splined(found[i], self.waves.correction(one, i, *of_rows))
+        return tuple(found)
+
+    def _moved(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
+        """Return every view's sensor behind its correction in space, or of its clocks."""
         vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
         rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
         corrections = [
@@ -197,18 +202,15 @@ class Unknowns:
         found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
         for i, radar in self.radars.items():
             found[i] = Timed(radar, self.timing(params[i], i))
-        if self.waves is not None:
-            for i, one in enumerate(params[:, self.in_waves]):
-                of_rows = float(self.middle[1, i]), float(self.half[1, i])
-                found[i] = Splined(found[i], self.waves.correction(one, i, *of_rows))
-        return tuple(found)
+        return found
 
-    def _affine(self, params: Array, i: int) -> ImageAffine:
-        normalized = np.zeros((2, 3))
-        normalized[:, list(_IMAGE_TERMS[self.model])] = params.reshape(2, -1)
-        slope = normalized[:, 1:] / self.half[:, i]
-        shift = normalized[:, 0] - slope @ self.middle[:, i]
-        return ImageAffine(shift, slope)
+    def _in_images(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
+        """Return every view's sensor behind the model in its image."""
+        normalized = np.zeros((len(params), 2, 3))
+        normalized[..., list(_IMAGE_TERMS[self.model])] = params[:, : self._of_model].reshape(len(params), 2, -1)
+        slope = normalized[..., 1:] / self.half.T[:, None]
+        shift = normalized[..., 0] - np.einsum("nij,jn->ni", slope, self.middle)
+        return [ImageCorrected(v.sensor, ImageAffine(*one)) for v, *one in zip(views, shift, slope, strict=True)]
 
 
 def make_unknowns(

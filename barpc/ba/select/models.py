@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.constraints.block import Block
 from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_better, measure
 from barpc.ba.select.anomalies import standing_out
@@ -133,35 +132,64 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 
 def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the model that a search among the other hypotheses ends with."""
-    given = options.model != AUTO or options.drift is not None or first.goes_on
-    found, affine = first, None if given else _with_image_affine(first, parts, options, solve)
-    searched = first.problem.cameras.unknowns.geometric and not first.goes_on
-    if searched and (affine is None or not _is_calm(affine, parts.inner, options.noise_floor)):
-        found, parts, selected = _without_moving_ground(found, parts, options, solve)
+    geometric = first.problem.cameras.unknowns.geometric and not first.goes_on
+    given = not geometric or options.model != AUTO or options.drift is not None
+    searched = None if given else _beside_affine(first, parts, options, solve)
+    if searched is not None:
+        found, in_images, less = searched
+        better = _is_much_better(in_images, found)
+        if _is_calm(in_images if better else found, less, options.noise_floor):
+            return SelectedModel(in_images, less, found.after.whole_rms) if better else SelectedModel(found, less)
+    found = first
+    if geometric:
+        found, parts, selected = _without_moving_ground(first, parts, options, solve)
         found = with_terms(found, selected, parts, options)
-    if found.outcome is not first.outcome:  # else the same would be solved and found again
-        affine = None if given else _with_image_affine(found, parts, options, solve)
-    if searched:
-        smooth = with_splines(found, parts, options)
-        if affine is None or smooth.after.error < MUCH_BETTER * affine.after.error:
-            return SelectedModel(smooth, parts)
-    return SelectedModel(found, parts) if affine is None else SelectedModel(affine, parts, found.after.whole_rms)
+    smooth = with_splines(found, parts, options) if geometric else found
+    if searched is None and (given or found.outcome is first.outcome):
+        return SelectedModel(smooth, parts)
+    affine, less = (_with_image_affine(found, parts, options, solve), parts) if searched is None else searched[1:]
+    if affine is None or not _is_much_better(affine, found) or smooth.after.error < MUCH_BETTER * affine.after.error:
+        return SelectedModel(smooth, parts)
+    return SelectedModel(affine, less, found.after.whole_rms)
+
+
+def _beside_affine(
+    found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
+) -> tuple[Solution, Solution, Parts] | None:
+    """Solve the block with what is found beside an affine in every image: with the model in space, and with affines.
+
+    What an affine explains looks like many steps to a model in space, so an affine is what they are searched beside
+    where it is much better; None where it is not.
+    """
+    in_images = replace(options, model="affine")
+    affine = _with_image_affine(found, parts, options, solve)
+    if affine is None or _is_calm(affine, parts, options.noise_floor):
+        return None if affine is None else (found, affine, parts)
+    affine, less, selected = _without_moving_ground(affine, parts, in_images, solve)
+    in_space = found if less is parts else solve(less.inner, less.outer, options)
+    in_space = replace(in_space, findings=affine.findings)
+    there = replace(selected, step=np.zeros_like(in_space.final.params))
+    return with_terms(in_space, there, less, options), with_terms(affine, selected, less, in_images), less
 
 
 def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
     """Solve the block with an affine in every image, where residuals are systematic and it is much better."""
-    skew = found.is_skew
-    if not (skew or found.has_trend):
+    if not (found.is_skew or found.has_trend):
         return None
-    tried = solve(parts.inner, parts.outer, replace(options, model="affine"))
-    better = tried.after.error < (CLEARLY if skew else MUCH_BETTER) * found.after.error
+    affine = solve(parts.inner, parts.outer, replace(options, model="affine"))
+    return affine if _is_much_better(affine, found) else None
+
+
+def _is_much_better(affine: Solution, found: Solution) -> bool:
+    """Return whether an affine in every image is much better than a model in space; clearly, where that is skew."""
+    better = affine.after.error < (CLEARLY if found.is_skew else MUCH_BETTER) * found.after.error
     # it leaves the tilts of the scene open: not for less than an adjustment is asked for
-    return tried if better and tried.after.whole_rms < found.after.whole_rms - NOISE_FLOOR else None
+    return better and affine.after.whole_rms < found.after.whole_rms - NOISE_FLOOR
 
 
-def _is_calm(found: Solution, block: Block, floor: float) -> bool:
+def _is_calm(found: Solution, parts: Parts, floor: float) -> bool:
     """Return whether no residuals are left that terms of an image, or moving ground, might explain."""
-    return not (found.has_trend or found.has_waves or standing_out(found.outcome, block, floor))
+    return not (found.has_trend or found.has_waves or standing_out(found.outcome, parts.inner, floor))
 
 
 def _at_lower_degree(
