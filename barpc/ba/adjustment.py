@@ -229,6 +229,7 @@ def _adjustment(
         held=found.heights.weak[: block.num_tracks],
         terrain=found.heights.test(final.points, found.seen),
         left_out=block.left_out,
+        deformed=found.deformed,
         **_control(found, block, covariance, inlier[ties.stop :]),
         options=options,
     )

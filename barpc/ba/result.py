@@ -11,6 +11,7 @@ from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.constraints.gauge import GaugeReport
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.constraints.shape import Deformation
 from barpc.ba.control.snooping import ControlTest
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.interior import CommonErrors
@@ -127,6 +128,8 @@ class Adjustment:
         CPU time.
     common : CommonErrors or None
         Errors that images have in common, which are in the covariance.
+    deformed : Deformation or None
+        A deformation of an image by control, which tie points do not show; drifts were held to what these show.
     earlier : BlockPrior or None
         What an earlier block knew of those of its views that are among these.
     options : AdjustOptions
@@ -178,6 +181,7 @@ class Adjustment:
     altimetry: AltimetryTest | None = None
     earlier: BlockPrior | None = field(default=None, repr=False)
     common: CommonErrors | None = field(default=None, repr=False)
+    deformed: Deformation | None = None
 
     def __repr__(self) -> str:
         used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"

@@ -10,6 +10,7 @@ import numpy as np
 from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block, first_state, make_problem
 from barpc.ba.constraints.ground import PointConstraints, staying
 from barpc.ba.constraints.incremental import BlockPrior
+from barpc.ba.constraints.shape import MOST_SIGMAS, Deformation, shape_change
 from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.control.agreement import UNCONSTRAINED_SIGMA, Agreement, agreement, offsets_of
 from barpc.ba.control.snooping import ControlTest, control_test
@@ -50,6 +51,7 @@ class Solution:
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
     agreed: Agreement | None = None  # which control points hold it
+    deformed: Deformation | None = None  # by control
 
     @property
     def final(self) -> State:
@@ -149,9 +151,28 @@ def solve_block(
     _check_inliers(outcome, block)
     first = Solution(problem, state, before, heights, outcome, start, start, None, asked, (), agreed)
     found = finished(first, problem, block, outer, outcome)
-    if free is None or not found.heights.has_control:
+    if free is not None and found.heights.has_control:
+        found = _without_distorting_control(found, free, block, outer, options)
+    return found if prior is not None else _held_in_shape(found, block, outer)
+
+
+def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
+    """Return the block; solved again with the drift priors of the tie points alone where control deforms an image."""
+    heights, problem = found.heights, found.problem
+    if not heights.kinds:
         return found
-    return _without_distorting_control(found, free, block, outer, options)
+    sigmas, px = shape_change(problem, found.final.params, block.views)
+    if not sigmas.max() > MOST_SIGMAS:
+        return found
+    start = State(np.zeros_like(found.final.params), found.state.points)
+    free = Rounds(problem, block, start, heights.without_control(UNCONSTRAINED_SIGMA), block.use).run()
+    asked, _ = shape_change(problem, free.state.params, block.views)
+    view = int((sigmas - asked).argmax())
+    if not sigmas[view] - asked[view] > MOST_SIGMAS:
+        return found
+    outcome = Rounds(problem, block, start, heights, block.use, widest=np.array(free.prior.wide)).run()
+    deformed = Deformation(view, float(sigmas[view]), float(px[view]), heights.kinds)
+    return replace(finished(found, problem, block, outer, outcome), deformed=deformed)
 
 
 def _with_more_drift(

@@ -352,6 +352,21 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
     yield f"The DEM covers {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
 
 
+CONTROL_WORDS = {"dem": "the DEM", "gcps": "the GCPs", "reference": "the reference"}
+"""Kind of control -> its words in a sentence."""
+
+
+def deformation_reasons(adjustment: Adjustment) -> Iterator[str]:
+    """Yield the reservation on control that asks for another shape of an image than tie points do."""
+    if (one := adjustment.deformed) is not None:
+        control = listed([CONTROL_WORDS[kind] for kind in one.control])
+        yield (
+            f"To follow {control}, the shape of {adjustment.names[one.view]} would change by {one.px:.1f} px at its "
+            f"corners, {one.sigmas:.0f} times the standard deviation of its camera, which tie points alone do not ask "
+            f"for. Drifts were held to what tie points show: check {control}."
+        )
+
+
 def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
     """Yield reservations on the DEM: another terrain, or a contradiction to the delivered cameras."""
     terrain = adjustment.terrain
@@ -364,6 +379,12 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
             "It was not used."
         )
         return
+    if not terrain.agrees:
+        yield (
+            f"The DEM has {terrain.relief:.2g} times the relief of the adjusted tie points: their heights and the "
+            "scene's position follow a DEM of another terrain, or without its own (water, filled or smoothed heights). "
+            "Leave it out, or give another."
+        )
     (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
     if level > SURELY:
         why = "check its heights, their datum, and the cameras"

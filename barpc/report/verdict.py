@@ -24,6 +24,7 @@ from barpc.report.quality_checks import (
     NOISE_LIMIT,
     anywhere,
     control_reasons,
+    deformation_reasons,
     dem_lines,
     dem_reasons,
     enu,
@@ -121,6 +122,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             *_of_same_ground(run, found),
             *_of_solution(run, found),
         )
+    yield from deformation_reasons(found)
     yield from dem_reasons(found)
     yield from datum_reasons(run.datums, found, common_lean(views))
 

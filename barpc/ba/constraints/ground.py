@@ -8,7 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.constraints.terrain import NUM_BENDS, RegularisedDem, Relief, Terrain, believe, terrain_slopes
+from barpc.ba.constraints.terrain import (
+    NUM_BENDS,
+    RegularisedDem,
+    Relief,
+    Terrain,
+    believe,
+    relief_ratio,
+    terrain_slopes,
+)
 from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.problem import Problem
@@ -172,6 +180,7 @@ class TerrainTest:
     gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
     relief: float = np.nan  # its relief as a multiple of the tie points'
     shows: bool = True  # whether that may be one: else it is of another terrain, and holds nothing
+    agrees: bool = True  # whether it may be one still beside the adjusted tie points, which it holds
     is_known: bool = True  # whether it is known what its heights count from
     # (3,) how the tie points lie to it as delivered, level, rise to the east and to the north [m]
     delivered: tuple[float, ...] = (np.nan,) * 3
@@ -199,6 +208,20 @@ class PointConstraints:
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of control beside the tie points: `dem`, `gcps`, `reference`."""
+        given = {"dem": self.dem is not None, "gcps": self.has_control, "reference": self.reference is not None}
+        return tuple(kind for kind, there in given.items() if there)
+
+    def without_control(self, sigma: float) -> PointConstraints:
+        """Return the priors of tie points alone: no DEM, the points of GCPs and of a reference known to `sigma` [m]."""
+        control = [
+            replace(one, rows=enu_basis(ground_from_ecef(one.mean)) / sigma, common=one.common[..., :0])
+            for one in self.control
+        ]
+        return replace(self, control=tuple(control), dem=None, relief=None, reference=None, has_control=False)
 
     @property
     def is_judged(self) -> bool:
@@ -268,8 +291,9 @@ class PointConstraints:
         if self.dem is None:
             return None
         index = self.tracks[seen[self.tracks]]
-        lon, lat, alt = ground_from_ecef(points[index]).T
-        above = alt - self.dem(lon, lat)
+        ground = ground_from_ecef(points[index])
+        dem = self.dem(ground[:, 0], ground[:, 1])
+        above = ground[:, 2] - dem
         known = np.isfinite(above)
         believed = self._believed(points)
         held, shows = self._held(points), believed is None or believed.shows
@@ -281,10 +305,13 @@ class PointConstraints:
         if self.relief is not None:
             delivered, beyond = self.relief.delivered, self.relief.beyond(self._bias)
             found = replace(found, delivered=tuple(map(float, delivered)), beyond=tuple(map(float, beyond)))
-        if believed is None:
-            return found
-        judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}
-        return replace(found, gains=tuple(map(float, believed.gains)), **judged)
+        if believed is not None:
+            judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}
+            found = replace(found, gains=tuple(map(float, believed.gains)), **judged)
+        if self.relief is not None and shows:
+            times, agrees = relief_ratio(ground[known], dem[known], self.options.dem_sigma)
+            found = replace(found, relief=times, agrees=agrees)
+        return found
 
     def warn(self) -> None:
         """Warn that tracks are constrained in height without a DEM."""

@@ -318,6 +318,21 @@ def variance_inflation(at: Array, pull: Array) -> float:
     return found
 
 
+def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]:
+    """Return the relief of a DEM's heights (n,) as a multiple of that of ground points (n, 3); whether it may be one.
+
+    At the end, when cameras are adjusted: no more than a level and slopes are of these. Heights are known to
+    `stated` [m].
+    """
+    near = _middling(ground[:, 2] - dem)
+    if near.sum() < MANY:
+        return float("nan"), True
+    at = (ground - ground[near].mean(axis=0))[near, :2] * metres_per_unit(ground[near].mean(axis=0))[:2]
+    plane = np.column_stack([np.ones(len(at)), at / max(float(np.abs(at).max()), 1.0)])
+    relief = dem[near] - plane @ _least_squares_fit(plane, dem[near])
+    return _relief_ratio(relief, ground[near, 2], plane, stated)
+
+
 def _relief_ratio(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
     """Return a DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
     seen = above - smooth @ _least_squares_fit(smooth, above)

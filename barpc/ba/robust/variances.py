@@ -147,6 +147,7 @@ class Variances:
     # variances given, and their freedom, of the place, of those that are stated, of the drift degree by degree, and
     # along the lines of sight; in the third row the number of views that state
     shown: Array | None = None
+    widest: Array | None = None  # (D + 1,) largest factors of drifts and turns, of tie points alone
 
     @classmethod
     def of(
@@ -463,7 +464,8 @@ class Variances:
             self._likely(total, freedom, careful and float(chdtrc(freedom, total)) < CHANCE)
             for total, freedom in self._sums(params, known)[1:]
         ]
-        return np.minimum(np.sqrt(factors), TIMES * (1.0 if last is None else np.array(last.wide)))
+        most = TIMES * (1.0 if last is None else np.array(last.wide))
+        return np.minimum(np.sqrt(factors), most if self.widest is None else np.minimum(most, self.widest))
 
 
 def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:

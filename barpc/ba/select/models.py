@@ -156,10 +156,10 @@ def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 def _beside_affine(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Solution, Parts] | None:
-    """Solve the block with what is found beside an affine in every image: with the model in space, and with affines.
+    """Solve the block with the terms of a search beside an affine in every image: in space, and with the affines.
 
-    What an affine explains looks like many steps to a model in space, so an affine is what they are searched beside
-    where it is much better; None where it is not.
+    Residuals that an affine explains look like many steps beside a model in space. None where the affine is not much
+    better than that.
     """
     in_images = replace(options, model="affine")
     affine = _with_image_affine(found, parts, options, solve)
