@@ -316,7 +316,6 @@ DIRECT = {
     "cameras.py": "no file: a row of the table of openers",
     "report/runfiles.py": "the schema, which is part of the package",
     "cli/process.py": "the null device",
-    "pointio/gcp_formats.py": "layers of a GeoPackage or Shapefile, which fiona opens, once their head is read",
 }
 """Modules that may open a file for reading by themselves, and what they open."""
 ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")
