@@ -1,4 +1,4 @@
-"""Layers of points of a GIS, GeoPackages (OGC 12-128r19) and Shapefiles: without GDAL, which opens what is beside them."""
+"""Layers of points, GeoPackages (OGC 12-128r19) and Shapefiles: without GDAL, which opens what is beside them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DBF_TEXTS = b"CNFDL"
 
 
 def read_layer(path: Path) -> tuple[list[Feature], str | None]:
-    """Return the points of a layer, of a GeoPackage the first, and its reference system; InputError where it is none."""
+    """Return the points of a layer, of a GeoPackage the first, and its reference system; InputError: it is none."""
     data = read_bytes(path, TABLE)
     read = _of_geopackage if data.startswith(GEOPACKAGE) else _of_shapefile
     try:
