@@ -118,7 +118,11 @@ def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTa
     num = max(len(cells.index if isinstance(cells, Texts) else cells) for cells in columns.values())
 
     def stated(key: str, default: float | Array) -> Array:
-        cells = columns.get(key, [None] * num)
+        cells = columns.get(key)
+        if cells is None:
+            return np.broadcast_to(np.asarray(default, dtype=np.float64), num)
+        if isinstance(cells, np.ndarray):
+            return cells
         known = np.array([cell is not None for cell in cells], dtype=bool)
         return np.where(known, np.array(cells, dtype=np.float64), default)
 

@@ -311,6 +311,7 @@ DIRECT = {
     "pipeline/verify_outputs.py": "reopens what barpc has just written, as its consumers do",
     "rasters/raster.py": "images, checked there",
     "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
+    "pointio/tables.py": "no file: lines that were read",
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
