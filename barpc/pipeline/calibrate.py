@@ -260,7 +260,7 @@ _Pixels = Annotated[float, msgspec.Meta(gt=-_ABSURD, lt=_ABSURD)]
 
 
 class _File(Record):
-    """What is read of a calibration file."""
+    """Fields of a calibration file, with their limits."""
 
     sensor: str = column("Sensor", min_length=1, max_length=200)
     columns: int = column("Columns of its images", ge=2, le=1 << 24)

@@ -413,6 +413,15 @@ def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     return table._replace(crs=system, said=said), size
 
 
+def _read_tagged(path: Path) -> GcpTable:
+    if driver_of(read_head(path, TABLE)) is None:
+        raise InputError(f"{path}: neither a text nor a file of points that is read ({', '.join(GCP_FORMATS)})")
+    table, _ = read_tags(path)
+    if not table.names:
+        raise InputError(f"{path}: an image without GCP tags")
+    return table
+
+
 _CENTRE_TOLERANCE = 1e-3  # px: GCPs that end so near to a pixel's centre or edge are meant to lie there
 
 
@@ -479,9 +488,7 @@ def _read_micmac(path: Path) -> GcpTable:
 
 GCP_FORMATS: dict[str, GcpFormat] = {
     "GeoPackage or Shapefile": GcpFormat(lambda _, head: head.startswith((GEOPACKAGE, SHAPEFILE)), _read_vector),
-    "image with GCP tags": GcpFormat(
-        lambda text, head: driver_of(head) is not None or "\0" in text, lambda path: read_tags(path)[0]
-    ),
+    "image with GCP tags": GcpFormat(lambda text, head: driver_of(head) is not None or "\0" in text, _read_tagged),
     "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
     MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
     "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1

@@ -1,4 +1,4 @@
-"""Layers of points, GeoPackages (OGC 12-128r19) and Shapefiles: without GDAL, which opens what is beside them."""
+"""GeoPackages (OGC 12-128r19) and Shapefiles of points, read without GDAL, which opens the files beside them."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ _PLAIN_PARAMETERS = {
 
 
 def plain_crs(text: str, of: PathOrUrl | str, kind: type[BarpcError] = InputError) -> str:
-    """Return a reference system as it was written, where nothing in it makes PROJ or GDAL open a file or an address.
+    """Return the text of a reference system that makes PROJ and GDAL open nothing.
 
     Allowed are codes and names that PROJ's database has, WKT without grids, and projections by plain parameters. Else
     an error of the class `kind`, which begins with `of`, the file or flag that the text is from.
@@ -61,7 +61,7 @@ def plain_crs(text: str, of: PathOrUrl | str, kind: type[BarpcError] = InputErro
 
 
 def _wrong_in_wkt(wkt: str) -> str:
-    """Return what a WKT could make PROJ open; empty: nothing."""
+    """Return the first part of a WKT that could make PROJ open a file, in words; empty where there is none."""
     if wkt.count('"') % 2 or not _TOKEN.sub("", wkt).isascii():
         return "its quotation marks are not in pairs"
     open_nodes = [("", list[str]())]
@@ -91,7 +91,7 @@ def _wrong_in_node(node: str, texts: Sequence[str]) -> str:
 
 
 def _wrong_parameter(text: str) -> str:
-    """Return what in a text of parameters is none of a projection; empty: nothing."""
+    """Return the first wrong word of a text of projection parameters, in words; empty where there is none."""
     for word in text.split():
         key, _, value = word.removeprefix("+").partition("=")
         pattern = _PLAIN_PARAMETERS.get(key)

@@ -217,8 +217,6 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
     head = read_head(name, IMAGE, 64)  # (os.fspath leaves a Remote as it is)
-    if not head:
-        raise ImageError(f"{name}: the file is empty")
     driver = driver or driver_of(head)
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
