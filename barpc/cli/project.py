@@ -8,6 +8,7 @@ import sys
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -114,6 +115,9 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 # --- tables of points -------------------------------------------------------------------------------------
 
 
+_POINTS = replace(TABLE, empty=True)  # no points, as standard input may have none
+
+
 def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None) -> Array:
     """Return points (N, columns) from arguments, a CSV file, or standard input ("-").
 
@@ -121,7 +125,7 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
     column where it is not given.
     """
     if file is not None:
-        with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
+        with nullcontext(sys.stdin) if file == "-" else opened_text(file, _POINTS, newline="") as stream:
             return _point_table(stream, file, names, fill)
     width = len(names) if fill is None else len(names) - 1
     if not numbers or len(numbers) % width:

@@ -268,7 +268,8 @@ def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "not JSON"),
+        ("", "the file is empty"),
+        ("{", "not JSON"),
         ("[]", "schema None"),
         ('{"schema": "barpc calibration 9"}', "not a calibration that this release reads"),
         ('{"schema": "barpc calibration 1"}', "damaged"),
