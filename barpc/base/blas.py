@@ -26,7 +26,7 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def _switches() -> Iterator[tuple[Callable[[], int], Callable[[int], object]]]:
-    """Yield, for each library that is loaded, the function that reads its number of threads and that which sets it."""
+    """Yield getter and setter of the number of threads of each loaded OpenBLAS."""
     lines = _MAPS.read_text().splitlines() if _MAPS.exists() else []
     for path in sorted({line.split(maxsplit=5)[-1] for line in lines if "openblas" in line.rpartition("/")[2]}):
         with suppress(OSError):
