@@ -17,7 +17,7 @@ from typing import Any
 
 from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
 from barpc.base.geodesy import EVERYWHERE as EVERYWHERE
-from barpc.base.remote import PathOrUrl, located, location
+from barpc.base.remote import PathOrUrl, is_url, located, location
 from barpc.base.safe_io import IMAGE, read_head
 from barpc.pointio.correspondences import (
     GRID_TAG,
@@ -31,13 +31,16 @@ from barpc.rasters.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical
-from barpc.scene import Camera
+from barpc.scene import Camera, View
+from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
 
 ChoiceReader = Callable[[str], Any]
+ImageLike = Any
+"""A path, perhaps with choices behind it (`open_camera`), an open rasterio dataset, a View or a Camera."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +57,12 @@ class Opener:
     """Whether it states the size of its image: of pixels of another size it is no camera."""
 
 
-def open_camera(spec: str | Path, **choices: Any) -> Camera:
+def open_camera(spec: ImageLike | SensorModel, **choices: Any) -> Camera:
     """Open a camera, whatever it is.
 
     Parameters
     ----------
-    spec : str or Path
+    spec : path, open rasterio dataset, View, Camera or SensorModel
         A file or folder, perhaps with choices behind it, ``,name=value``; a file of this whole name goes first.
     **choices
         The same as values; they go before those in `spec`. For every kind: ``camera`` (the file with the camera of the
@@ -84,7 +87,29 @@ def open_camera(spec: str | Path, **choices: Any) -> Camera:
     >>> camera.format, camera.size, camera.alt_range
     ('tag', (1000, 1000), (-50.0, 550.0))
     """
-    return open_split(*split_spec(spec), **choices)
+    spec = file_of(spec)
+    if isinstance(spec, (str, os.PathLike)):
+        return open_split(*split_spec(os.fspath(spec)), **choices)
+    if choices:
+        raise InputError(f"{', '.join(choices)} given for a {type(spec).__name__}; they are choices for a file")
+    if isinstance(spec, Camera):
+        return spec
+    if isinstance(spec, View):
+        return Camera(spec.sensor, Path(spec.path or spec.name), "view", spec.size, spec.alt_range)
+    if isinstance(spec, SensorModel):
+        levels = altitude_range(spec) if isinstance(spec, RPC) else EVERYWHERE
+        return Camera(spec, Path(type(spec).__name__), "model", getattr(spec, "size", None), levels)
+    raise InputError(f"{spec!r} is no image: give a path, an open dataset, a View or a Camera")
+
+
+def file_of(image: ImageLike) -> Any:
+    """Return the path of an open dataset; anything else as it is. InputError for a dataset without a file."""
+    name, mode = getattr(image, "name", None), getattr(image, "mode", None)
+    if isinstance(image, (str, os.PathLike, View, Camera)) or not (hasattr(image, "crs") and isinstance(name, str)):
+        return image
+    if mode != "r" or not (is_url(name) or os.path.lexists(name)):
+        raise InputError(f"{name}: a dataset without a file that can be read (mode {mode}); write it to disk first")
+    return name
 
 
 def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Camera:

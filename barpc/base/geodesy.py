@@ -66,12 +66,27 @@ def parts(stop: int, size: int = CHUNK, start: int = 0) -> Iterator[slice]:
         yield slice(first, min(first + size, stop))
 
 
+def as_numbers(values: npt.ArrayLike, what: str, wanted: str = "") -> Array:
+    """Return values as float64, those that are masked as NaN; InputError where they are complex, or no numbers."""
+    given: Any = values
+    try:
+        if isinstance(given, (list, tuple)) and any(isinstance(one, np.ma.MaskedArray) for one in given):
+            given = np.ma.stack(given)
+        found: Any = given if isinstance(given, np.ndarray) else np.asarray(given)
+        if found.dtype.kind == "c":
+            raise InputError(f"{what}: complex numbers; give their real parts")
+        if isinstance(found, np.ma.MaskedArray):
+            found = np.ma.filled(found.astype(np.float64), np.nan)
+        return np.asarray(found, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{what}: numbers are expected{wanted} ({error})") from error
+
+
 def as_points(values: npt.ArrayLike, width: int, what: str, axis: str) -> Array:
     """Return points as float64 (..., width); InputError names the last axis that is expected and the shape found."""
-    try:
-        points = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: numbers are expected, (..., {width}): {axis} ({error})") from error
+    points = as_numbers(values, what, f", (..., {width}): {axis}")
     if points.shape[-1:] != (width,):
         turned = "; transpose them" if points.ndim == 2 and len(points) == width else ""
         raise InputError(f"{what} of shape {points.shape}: (..., {width}) is expected, {axis} on the last axis{turned}")
@@ -104,7 +119,7 @@ def pointwise(
     lead, k = points.shape[:-1], points.shape[-1]
     flat: list[Array] = [points.reshape(-1, k)]
     if alt is not None:
-        alt = np.asarray(alt, dtype=np.float64)
+        alt = as_numbers(alt, "altitudes")
         if alt.shape != lead:
             try:
                 lead = np.broadcast_shapes(lead, alt.shape)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from barpc.base.errors import InputError
@@ -81,7 +81,7 @@ def read(folder: Path) -> tuple[str, list[Layer]]:
 
     InputError where its SHA256SUMS is missing or damaged.
     """
-    data = read_bytes(folder / SUMS, SUMMARY)
+    data = read_bytes(folder / SUMS, replace(SUMMARY, empty=True))
     try:
         return hashlib.sha256(data).hexdigest(), parse(data.decode())
     except ValueError as error:

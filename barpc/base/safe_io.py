@@ -46,6 +46,7 @@ class Kind:
     most: int | None  # larger files are refused [bytes]; None for images, which are never read whole
     error: type[BarpcError] = InputError
     lines: int | None = None  # texts of more lines, or of a line of more than `MAX_LINE_BYTES` bytes, are refused
+    empty: bool = False  # whether a file of no bytes says something
     values: int = 8 * MB  # of JSON, which take 60 to 110 bytes each in memory: 1 GB at most
 
     def check(self, path: Path | str, size: int) -> None:
@@ -78,7 +79,7 @@ XML = Kind("an XML file", MAX_XML, RpcFormatError)
 TABLE = Kind("a table of points", 1024 * MB, lines=_MAX_TABLE_LINES)
 ARRAYS = Kind("an archive of arrays", 1024 * MB)
 GEOJSON = Kind("a GeoJSON file", 256 * MB)
-OPTIONS = Kind("an options file", MB)
+OPTIONS = Kind("an options file", MB, empty=True)
 CALIBRATION = Kind("a calibration", 4 * MB)
 NAMES = Kind("a list of names", 16 * MB)
 CAMERA_STATE = Kind("a camera's state", 64 * MB, RpcFormatError)
@@ -86,13 +87,16 @@ SUMMARY = Kind("a run's summary", 512 * MB, values=32 * MB)
 
 
 @contextmanager
-def opened(path: Path | str, kind: Kind) -> Iterator[BinaryIO]:
+def opened(path: Path | str, kind: Kind) -> Iterator[io.BufferedReader]:
     """Open a regular file for reading; links are followed.
 
-    One line of the class of `kind` where there is no such file, it is a folder, pipe or device, or cannot be read.
+    One line of the class of `kind` where there is no such file, it is a folder, pipe or device, empty, or cannot be
+    read.
     """
     try:
         with _regular(path, kind) as file:
+            if not (kind.empty or file.peek(1)):
+                raise kind.error(f"{path}: the file is empty")
             yield file
     except BarpcError:
         raise
@@ -112,7 +116,7 @@ def versioned(path: PathOrUrl, kind: Kind) -> PathOrUrl:
         raise kind.error(f"{path}: cannot be read ({error})") from error
 
 
-def _regular(path: Path | str, kind: Kind) -> BinaryIO:
+def _regular(path: Path | str, kind: Kind) -> io.BufferedReader:
     if isinstance(path, Remote):
         elsewhere = RemoteFile(versioned(path, kind))
         kind.check(path, elsewhere.size)

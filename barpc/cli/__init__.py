@@ -152,8 +152,7 @@ def main(args: list[str] | None = None) -> None:
     if args is None:  # the process is ours
         quicken()
         hold_streams()
-    for name in THREADS:  # sums keep their order whatever the machine; -j spreads the work
-        os.environ.setdefault(name, "1")
+    os.environ.update(dict.fromkeys(THREADS, "1"))  # sums keep their order whatever is set; -j spreads the work
     code: object
     with interruptible(own=args is None) as interrupt, warnings.catch_warnings():
         try:

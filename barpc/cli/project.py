@@ -8,6 +8,7 @@ import sys
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -17,10 +18,11 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import TABLE, opened_text
 from barpc.base.verb_options import HeightOptions
+from barpc.cameras import open_camera
 from barpc.cli.flags import flags_of, given_flags
 from barpc.cli.terminal import echo, tell_gate, wants_json
 from barpc.verbs import points as verbs
-from barpc.verbs.images import camera_of, place_of
+from barpc.verbs.images import place_of
 
 _MAX_INTERSECTION_ERROR = 1.0  # px: lines of sight that a point's places miss by as much (RMS) do not meet
 _NUMBERS = {"ignore_unknown_options": True}  # -3.5 is a number, not an option
@@ -46,7 +48,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
       barpc project image.tif 5.44 43.26 180
       barpc project image.tif --points ground.csv --json
     """
-    camera, terrain = camera_of(image), verbs.terrain_of(**given_flags(heights))
+    camera, terrain = open_camera(image), verbs.terrain_of(**given_flags(heights))
     given = given_points(numbers, points, ("lon", "lat", "alt"), fill=np.nan if terrain else alt)
     ground = verbs.with_altitudes(given, None, terrain)
     found = camera.model.project(ground)
@@ -69,7 +71,7 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
       barpc localize image.tif 512.5 300 --alt 180
       barpc localize image.tif 512.5 300 --dem N44E005.hgt --geoid egm96
     """
-    camera, terrain = camera_of(image), verbs.terrain_of(**given_flags(heights))
+    camera, terrain = open_camera(image), verbs.terrain_of(**given_flags(heights))
     at = given_points(numbers, points, ("col", "row", "alt"), fill=np.nan)
     if terrain is None and (without := np.isnan(at[:, 2])).any():
         at[without, 2] = verbs.altitude_of(camera, place_of(image), alt)
@@ -94,7 +96,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
       barpc triangulate left.tif right.tif --at 512 300 --at 498 301
       barpc triangulate a.tif b.tif c.tif --points ties.csv
     """
-    cameras = [camera_of(image) for image in images]
+    cameras = [open_camera(image) for image in images]
     names = [f"{axis}{i}" for i in range(1, len(images) + 1) for axis in ("col", "row")]
     if points is None and len(at) != len(images) > 1:
         raise click.UsageError(f"{len(at)} points given with --at for {len(images)} images")
@@ -113,6 +115,9 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 # --- tables of points -------------------------------------------------------------------------------------
 
 
+_POINTS = replace(TABLE, empty=True)  # no points, as standard input may have none
+
+
 def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None) -> Array:
     """Return points (N, columns) from arguments, a CSV file, or standard input ("-").
 
@@ -120,7 +125,7 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
     column where it is not given.
     """
     if file is not None:
-        with nullcontext(sys.stdin) if file == "-" else opened_text(file, TABLE, newline="") as stream:
+        with nullcontext(sys.stdin) if file == "-" else opened_text(file, _POINTS, newline="") as stream:
             return _point_table(stream, file, names, fill)
     width = len(names) if fill is None else len(names) - 1
     if not numbers or len(numbers) % width:

@@ -13,8 +13,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import FitError
-from barpc.base.geodesy import MAX_COORDINATE, Array, BoolArray, metres_per_unit, parts, wrap_longitude
+from barpc.base.errors import FitError, InputError
+from barpc.base.geodesy import MAX_COORDINATE, Array, BoolArray, as_numbers, metres_per_unit, parts, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
@@ -131,7 +131,10 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
 
     FitError: no points, a wrong shape, numbers that are not finite or out of range.
     """
-    ground, image = np.asarray(ground, dtype=np.float64), np.asarray(image, dtype=np.float64)
+    try:
+        ground, image = as_numbers(ground, "ground points"), as_numbers(image, "image points")
+    except InputError as error:
+        raise FitError(f"points: {error}") from error
     if ground.ndim != 2 or ground.shape[1:] != (3,) or image.shape != (len(ground), 2):
         raise FitError(f"points: expected (N, 3) and (N, 2), found {ground.shape} and {image.shape}")
     if not len(ground):

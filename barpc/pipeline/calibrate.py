@@ -7,8 +7,9 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import numpy as np
 
 from barpc import __version__
@@ -27,6 +28,7 @@ from barpc.base.statistics import SURE
 from barpc.base.verb_options import CalibrateOptions
 from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
 from barpc.report import Run
+from barpc.report.records import Record, column
 from barpc.report.runfiles import read_summary, read_tables, table_path
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
@@ -43,6 +45,8 @@ SUFFIX = ".cal"
 _FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
 _MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
 _ABSURD = 1e3  # px: no curve is larger
+_MOST_EDGES = 64  # focal planes have up to some thirty detectors, and 40 steps are learnt
+_ROUNDED = 1e-4  # of the largest variance: what five digits a number leave of eigenvalues that are zero
 _FLAT = 30.0  # deg: rows that run within so much of each other are of one direction
 
 
@@ -246,22 +250,55 @@ def read_calibration(path: str | Path) -> Calibration:
     if schema != CALIBRATION_SCHEMA:
         raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({CALIBRATION_SCHEMA})")
     try:
-        edges, steps = np.array(found["edges"], dtype=np.float64), np.array(found["steps_px"], dtype=np.float64)
-        coeffs, width = np.array(found["coefficients_px"], dtype=np.float64), found["columns"]
-        if type(width) is not int or not isinstance(found["sensor"], str) or coeffs.shape != (LINE_SPLINES, 2):
-            raise ValueError("its columns, sensor or coefficients are none")
-        spline = ColumnSpline(width, coeffs, edges, steps.reshape(-1, 2))
-        size = 2 * (LINE_SPLINES + len(edges))
-        rows, covariance = np.tril_indices(size), np.zeros((size, size))
-        covariance[rows] = np.array(found["covariance_px2"], dtype=np.float64)
-        covariance += np.tril(covariance, -1).T
-        if not (np.abs(spline.coeffs) < _ABSURD).all() or not (np.abs(spline.steps) < _ABSURD).all():
-            raise ValueError("a distortion that is absurdly large")
-        if not (np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
-            raise ValueError("its covariance is none")
-    except (ValueError, TypeError, KeyError, AttributeError, RpcError) as error:
+        file = _File.read(found)
+        return Calibration(file.sensor, *file.curve(), str(path), fingerprint(path).sha256)
+    except (ValueError, RpcError) as error:
         raise InputError(f"{path}: damaged ({plain(error)}); make it again (barpc calibrate)") from error
-    return Calibration(found["sensor"], spline, covariance, str(path), fingerprint(path).sha256)
+
+
+_Pixels = Annotated[float, msgspec.Meta(gt=-_ABSURD, lt=_ABSURD)]
+
+
+class _File(Record):
+    """Fields of a calibration file, with their limits."""
+
+    sensor: str = column("Sensor", min_length=1, max_length=200)
+    columns: int = column("Columns of its images", ge=2, le=1 << 24)
+    coefficients_px: tuple[tuple[_Pixels, _Pixels], ...] = column(
+        "Spline coefficients", min_length=LINE_SPLINES, max_length=LINE_SPLINES
+    )
+    edges: tuple[float, ...] = column("Columns at which another detector begins", max_length=_MOST_EDGES)
+    steps_px: tuple[tuple[_Pixels, _Pixels], ...] = column("What is added from each on", max_length=_MOST_EDGES)
+    covariance_px2: tuple[float, ...] = column("Lower triangle of the covariance of the coefficients and steps")
+
+    def curve(self) -> tuple[ColumnSpline, Array]:
+        """Return the correction and its covariance; an error where they do not go together."""
+        edges = np.array(self.edges)
+        if not ((edges > -0.5) & (edges < self.columns - 0.5)).all():
+            raise ValueError(f"edges outside the line of {self.columns} columns")
+        steps, coeffs = np.array(self.steps_px).reshape(-1, 2), np.array(self.coefficients_px)
+        spline = ColumnSpline(self.columns, coeffs, edges, steps)
+        size = 2 * (LINE_SPLINES + len(edges))
+        if len(self.covariance_px2) != size * (size + 1) // 2:
+            raise ValueError(f"{len(self.covariance_px2)} numbers of a covariance of {size} unknowns")
+        covariance = np.zeros((size, size))
+        covariance[np.tril_indices(size)] = self.covariance_px2
+        covariance += np.tril(covariance, -1).T
+        if not _may_be_covariance(covariance):
+            raise ValueError("its covariance is none")
+        return spline, covariance
+
+
+def _may_be_covariance(matrix: Array) -> bool:
+    """Return whether a matrix [px^2] is positive definite, but for constants and slopes, which have no variance."""
+    variance = np.diag(matrix)
+    if not (np.isfinite(matrix).all() and (variance > 0.0).all() and (variance < _ABSURD**2).all()):
+        return False
+    try:
+        np.linalg.cholesky(matrix + _ROUNDED * variance.max() * np.eye(len(matrix)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def calibrations_of(

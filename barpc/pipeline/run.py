@@ -18,6 +18,7 @@ import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks, block_prior
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
+from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.frozen import html_table
 from barpc.base.geodesy import ground_from_ecef
@@ -141,6 +142,7 @@ class AdjustResult:
         return remake_report(Path(self.run.out_dir))
 
 
+@one_blas_thread()
 def adjust(
     images: Sequence[Image],
     out_dir: str | Path,

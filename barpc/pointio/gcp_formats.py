@@ -10,8 +10,6 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +21,7 @@ from barpc.base.errors import BarpcError, InputError, listed, plain
 from barpc.base.geodesy import INFERRED, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
+from barpc.pointio.layers import GEOPACKAGE, SHAPEFILE, read_layer
 from barpc.pointio.tables import (
     GROUND_SIGMA,
     IMAGE_SIGMA,
@@ -119,7 +118,11 @@ def of_columns(path: Path, columns: Mapping[str, Any], empty: GcpTable) -> GcpTa
     num = max(len(cells.index if isinstance(cells, Texts) else cells) for cells in columns.values())
 
     def stated(key: str, default: float | Array) -> Array:
-        cells = columns.get(key, [None] * num)
+        cells = columns.get(key)
+        if cells is None:
+            return np.broadcast_to(np.asarray(default, dtype=np.float64), num)
+        if isinstance(cells, np.ndarray):
+            return cells
         known = np.array([cell is not None for cell in cells], dtype=bool)
         return np.where(known, np.array(cells, dtype=np.float64), default)
 
@@ -330,13 +333,13 @@ def read_geojson(path: Path) -> GcpTable:
     return _of_features(path, features, None if crs is None or crs.endswith(("CRS84", "EPSG::4326")) else crs)
 
 
-def _of_features(path: Path, features: Sequence[Any], crs: str | None) -> GcpTable:
+def _of_features(path: Path, features: Sequence[Any], crs: str | None, what: str = "a GeoJSON") -> GcpTable:
     """Read features with points and properties: `ji` (col, row) or names as of columns, `sigma_m` of three numbers."""
     try:
         rows = list(map(_properties, features))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(
-            f"{path}: not a GeoJSON of points, each with ji = [col, row], filename; sigma_m is [east, north, up], "
+            f"{path}: not {what} of points, each with ji = [col, row], filename; sigma_m is [east, north, up], "
             f"sigma_px a number ({plain(error)})"
         ) from error
     if not rows:
@@ -359,6 +362,8 @@ def _properties(feature: Any) -> dict[str, Any]:
         of["id"] = feature["id"]
     for key in spread.keys() & of.keys():
         of |= dict(zip(spread[key], of.pop(key), strict=True))
+    if feature["geometry"] is None:
+        raise ValueError("a feature without a geometry")
     x, y, *z = feature["geometry"]["coordinates"]
     return {"lon": x, "lat": y} | ({"alt": z[0]} if z else {}) | of
 
@@ -376,38 +381,8 @@ def _value(key: str, cell: Any) -> float | None:
 
 
 def _read_vector(path: Path) -> GcpTable:
-    """Read the points of a GeoPackage or Shapefile, by pyogrio or fiona."""
-    reader = next((name for name in ("pyogrio", "fiona") if find_spec(name)), None)
-    if reader is None:
-        raise InputError(f"{path}: a GeoPackage or Shapefile, which pyogrio reads: pip install pyogrio")
-    try:
-        if reader == "fiona":
-            with import_module(reader).open(path) as file:
-                features, crs = [dict(shape.__geo_interface__, id=None) for shape in file], file.crs_wkt or None
-        else:
-            meta, _, shapes, fields = import_module("pyogrio.raw").read(path)
-            rows = zip(shapes, *(field.tolist() for field in fields), strict=True)
-            features, crs = (
-                [
-                    {
-                        "geometry": {"coordinates": _point(shape)},
-                        "properties": dict(zip(meta["fields"], cells, strict=True)),
-                    }
-                    for shape, *cells in rows
-                ],
-                meta["crs"],
-            )
-    except (RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"{path}: a GeoPackage or Shapefile that {reader} cannot read") from error
-    return _of_features(path, features, crs)
-
-
-def _point(wkb: bytes) -> list[float]:
-    """Return the coordinates of a point in OGC's or ISO's well-known binary; ValueError for another shape."""
-    order = "<" if wkb[0] else ">"
-    if int(np.frombuffer(wkb, f"{order}u4", 1, 1)[0]) & 0xFFFFFFF not in (1, 1001):
-        raise ValueError("no point")
-    return [float(value) for value in np.frombuffer(wkb, f"{order}f8", offset=5)]
+    """Read the points of a GeoPackage or Shapefile."""
+    return _of_features(path, *read_layer(path), "a layer")
 
 
 # --- images -----------------------------------------------------------------------------------------------
@@ -436,6 +411,15 @@ def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     said = f"{len(gcps)} GCPs of {path.name}, counted from {where} of the first pixel{why}"
     system = None if crs is None or crs.to_string() in ("EPSG:4326", "OGC:CRS84") else crs.to_string()
     return table._replace(crs=system, said=said), size
+
+
+def _read_tagged(path: Path) -> GcpTable:
+    if driver_of(read_head(path, TABLE)) is None:
+        raise InputError(f"{path}: neither a text nor a file of points that is read ({', '.join(GCP_FORMATS)})")
+    table, _ = read_tags(path)
+    if not table.names:
+        raise InputError(f"{path}: an image without GCP tags")
+    return table
 
 
 _CENTRE_TOLERANCE = 1e-3  # px: GCPs that end so near to a pixel's centre or edge are meant to lie there
@@ -503,12 +487,8 @@ def _read_micmac(path: Path) -> GcpTable:
 
 
 GCP_FORMATS: dict[str, GcpFormat] = {
-    "GeoPackage or Shapefile": GcpFormat(
-        lambda _, head: head.startswith((b"SQLite format 3\0", b"\0\0\x27\x0a")), _read_vector
-    ),
-    "image with GCP tags": GcpFormat(
-        lambda text, head: driver_of(head) is not None or "\0" in text, lambda path: read_tags(path)[0]
-    ),
+    "GeoPackage or Shapefile": GcpFormat(lambda _, head: head.startswith((GEOPACKAGE, SHAPEFILE)), _read_vector),
+    "image with GCP tags": GcpFormat(lambda text, head: driver_of(head) is not None or "\0" in text, _read_tagged),
     "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
     MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
     "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1

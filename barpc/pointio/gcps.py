@@ -22,6 +22,7 @@ from barpc.base.safe_io import TABLE, read_head
 from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, GcpTable, Row, open_gcps
 from barpc.pointio.names import ViewNames
 from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
+from barpc.rasters.crs import crs_of
 from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of, vertical_of
 from barpc.scene import GroundPoints, IntArray
@@ -181,7 +182,6 @@ def _lift(ground: Array, known: BoolArray, vertical: Vertical, by_person: str | 
 # --- reference systems ----------------------------------------------------------------------------------
 
 
-_MAX_CRS_LETTERS = 50_000  # of a reference system: the longest WKT of EPSG has a fifth
 _NOTEWORTHY_ACCURACY = 1.0  # m: better known transformations need no word; ensembles as WGS84 are no better
 
 
@@ -204,11 +204,11 @@ def to_wgs84(place: Array, crs: str, source: str) -> tuple[Array, Vertical, str]
     Returns the places, what their altitudes (still in their unit) count from, and words: the system's name and how well
     it is known on WGS84. InputError where PROJ knows no such system of places; `source` says so for messages.
     """
-    from pyproj import CRS, Transformer
+    from pyproj import Transformer
     from pyproj.exceptions import CRSError, ProjError
 
     try:
-        system = CRS.from_user_input(crs[:_MAX_CRS_LETTERS])
+        system = crs_of(crs, source)
         level, *upper = system.sub_crs_list if system.is_compound else [system]
         if not (level.is_geographic or level.is_projected or level.is_geocentric):
             raise CRSError("no places")

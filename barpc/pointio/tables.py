@@ -297,16 +297,25 @@ class Texts:
     def per_row(self) -> list[str]:
         """Return the text of each row."""
         texts = list(map(str, self.different))
-        return [texts[i] for i in self.index]
+        return texts if len(texts) == len(self.index) else [texts[i] for i in self.index.tolist()]
 
 
 def index_texts(texts: Iterable[str], known: dict[str, int]) -> IntArray:
     """Return the number of each text, that of its first appearance among all that are `known`, which grows."""
-    return np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64)
+    every, first = list(texts), len(known)
+    new = dict(zip(every, range(first, first + len(every)), strict=True))
+    if len(new) == len(every) and known.keys().isdisjoint(new.keys()):  # labels, mostly
+        known.update(new)
+        return np.arange(first, first + len(every))
+    for text in new:
+        known.setdefault(text, len(known))
+    return np.fromiter(map(known.__getitem__, every), np.int64, len(every))
 
 
 def distinct(rows: Array, *by: Array) -> tuple[IntArray, IntArray]:
     """Return the first of all rows (N, m) that are the same, least in `by` (N,), in their order; and which each is."""
+    if (np.diff(rows[:, 0]) > 0.0).all():
+        return np.arange(len(rows)), np.arange(len(rows))
     order = np.lexsort((*by, *rows.T[::-1]))
     new = np.ones(len(rows), dtype=bool)
     new[1:] = (np.diff(rows[order], axis=0) != 0).any(axis=1)
@@ -334,7 +343,7 @@ class _Texts:
     def column(self) -> Texts:
         index = np.concatenate([np.zeros(0, dtype=np.int64), *self._parts])
         if self._known is not None:
-            return Texts([from_cell(cell) for cell in self._known], index)
+            return Texts([from_cell(cell) if cell[:1] == "'" else cell for cell in self._known], index)
         values, first, inverse = np.unique(index, return_index=True, return_inverse=True)
         order = np.argsort(first)
         return Texts(values[order], np.argsort(order)[inverse.ravel()])
@@ -363,24 +372,37 @@ class _GrowingTable:
 
     def parsed(self, lines: Sequence[str]) -> dict[str, Any]:
         """Return the cells of each column: texts, numbers, or, where they may be blank, numbers and None."""
-        sign = self._delimiter
+        sign, text = self._delimiter, "".join(lines)
+        found = self._all_numbers(lines, text)
+        most = -1 if not found else max((self.columns[name] for name in self.texts), default=0) + 1
         plain = sign != " "  # split at once; what is left of blanks does no harm to numbers
-        rows = [line.split(sign) if plain and '"' not in line else row_of(line, sign) for line in lines]
-        found: dict[str, Any] = {}
+        rows = [line.split(sign, most) if plain and '"' not in line else row_of(line, sign) for line in lines]
         for name, place in self.columns.items():
-            if name in self._blank:
-                cells = [row[place].strip() if place < len(row) else "" for row in rows]
-                found[name] = [float(_pointed(cell, sign)) if cell else None for cell in cells]
-            elif name in self.texts:
-                cells = [row[place].rstrip("\r\n") for row in rows]
-                # a blank before a name in quotes is its own
-                found[name] = [
-                    cell if '"' in line else cell.lstrip(" ") for cell, line in zip(cells, lines, strict=True)
-                ]
-            else:
+            if name in self.texts:
                 cells = [row[place] for row in rows]
-                found[name] = _numeric([_pointed(cell, sign) for cell in cells] if sign in ";\t" else cells, name)
+                if "\n" in "".join(cells):
+                    cells = [cell.rstrip("\r\n") for cell in cells]
+                if " " in text:  # a blank before a name in quotes is its own
+                    cells = [c if '"' in line else c.lstrip(" ") for c, line in zip(cells, lines, strict=True)]
+                found[name] = cells
+            elif name not in found:
+                cells = [row[place] if place < len(row) or name not in self._blank else "" for row in rows]
+                found[name] = _numeric(
+                    [_pointed(cell, sign) for cell in cells] if sign in ";\t" else cells, name, name in self._blank
+                )
         return found
+
+    def _all_numbers(self, lines: Sequence[str], text: str) -> dict[str, Any]:
+        """Return the columns of numbers, where every cell is one as numpy reads them at once; else nothing."""
+        names = [name for name in self.columns if name not in self.texts]
+        if not (names and lines) or any(mark in text for mark in _SLOW_MARKS[self._delimiter]):
+            return {}
+        where, sign = [self.columns[name] for name in names], self._delimiter.strip(" ") or None
+        try:
+            table = np.loadtxt(lines, delimiter=sign, usecols=where, comments=None, ndmin=2)
+        except ValueError:
+            return {}
+        return dict(zip(names, table.T.copy(), strict=True))
 
     def whole(self) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -389,18 +411,26 @@ class _GrowingTable:
             if isinstance(parts, _Texts):
                 found[name] = parts.column()
             else:
-                found[name] = list(chain.from_iterable(parts)) if name in self._blank else np.concatenate([[], *parts])
+                some_blank = any(isinstance(part, list) for part in parts)
+                found[name] = list(chain.from_iterable(parts)) if some_blank else np.concatenate([[], *parts])
         return found
+
+
+_SLOW_MARKS = {",": '"', ";": '",', "\t": '",', " ": '"\t'}
+"""Delimiter -> what takes more than one: cells in quotes, decimal commas."""
 
 
 def _pointed(cell: str, delimiter: str) -> str:
     return cell.replace(",", ".") if delimiter in ";\t" else cell
 
 
-def _numeric(cells: list[str], name: str) -> Array:
+def _numeric(cells: list[str], name: str, blank: bool = False) -> Array | list[float | None]:
+    """Return cells as numbers; a list with None where some are blank."""
     try:
-        return np.array(cells, np.float64)
+        return np.fromiter(map(float, cells), np.float64, len(cells))
     except ValueError:
+        if blank:
+            return [float(cell) if (cell := one.strip()) else None for one in cells]
         if name not in ("lon", "lat"):
             raise
         return np.array([degrees(cell, name) for cell in cells])

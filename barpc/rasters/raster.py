@@ -37,6 +37,7 @@ from barpc.base.geodesy import Array, utm
 from barpc.base.identity import Input
 from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
 from barpc.base.safe_io import IMAGE, read_head
+from barpc.rasters.crs import crs_of, plain_crs, refuse_opening_crs
 from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
 
 DRIVERS: dict[bytes, str] = {
@@ -92,6 +93,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
 
 
 def _open_dataset(file: PathOrUrl, driver: str) -> Any:
+    refuse_opening_crs(file, driver)
     if isinstance(file, Remote):
         return _opened_remote(file, driver)
     with _WARNINGS, warnings.catch_warnings():
@@ -160,12 +162,7 @@ def map_crs(given: str | None, middle: Array) -> CRS:
     """Return the requested CRS, in metres, or the UTM zone of a position."""
     if given is None:
         return CRS.from_string(utm(*middle[:2])[1])
-    try:
-        if given.upper().startswith("EPSG:"):
-            int(given[5:])  # older GDAL reads a code up to what is no digit
-        found = CRS.from_user_input(given)
-    except (CRSError, ValueError) as error:
-        raise InputError(f"--crs {given}: no reference system that PROJ knows ({error})") from error
+    found = CRS.from_wkt(crs_of(given, f"--crs {given}").to_wkt())
     if not found.is_projected or found.linear_units_factor[1] != 1.0:
         raise InputError(f"--crs {given}: cells need a projected reference system in metres, such as EPSG:32631")
     return found
@@ -220,8 +217,6 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
     head = read_head(name, IMAGE, 64)  # (os.fspath leaves a Remote as it is)
-    if not head:
-        raise ImageError(f"{name}: the file is empty")
     driver = driver or driver_of(head)
     if driver is None:
         known = ", ".join(sorted(set(DRIVERS.values())))
@@ -273,7 +268,7 @@ class Mosaic:
 
     def _crs(self, text: str) -> CRS | None:
         try:
-            return CRS.from_string(text) if text else None
+            return CRS.from_string(plain_crs(text, self.name, ImageError)) if text else None
         except CRSError as error:
             raise ImageError(f"{self.name}: the VRT's coordinate system cannot be read ({error})") from error
 

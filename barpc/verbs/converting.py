@@ -17,7 +17,7 @@ from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
 from barpc.base.safe_io import plain_path
 from barpc.base.verb_options import ConvertOptions
-from barpc.cameras import open_camera
+from barpc.cameras import ImageLike, open_camera
 from barpc.fit import FitOptions
 from barpc.fit.points import Sample, widened
 from barpc.pipeline.verify_outputs import Reading, unverified, verify, verify_grid
@@ -44,7 +44,7 @@ from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.tie import read_area
 from barpc.tie.tasks import Progress
-from barpc.verbs.images import ImageLike, camera_of, every, place_of
+from barpc.verbs.images import every, place_of
 from barpc.verbs.moving import moved, refitted
 from barpc.verbs.points import altitude_of, exchanged, terrain_of
 from barpc.workspace import Workspace
@@ -148,7 +148,7 @@ def _to_folder(images: list[ImageLike], folder: Path, choices: ConvertOptions, p
         raise UsageError("--images goes with whole images, not with --bbox or --aoi")
     carrier, words = choices.images or "vrt", choices.rpc_format or ("" if choices.cut else "txt")
     names = [name.strip() for name in words.split(",") if name.strip()]
-    own = [camera_of(image) for image in images] if choices.rpc is None else []
+    own = [open_camera(image) for image in images] if choices.rpc is None else []
     files = [Path(place_of(image)) for image in images]
     _refuse_source_folder(files, folder, names)
     cameras = own or _cameras(files, Path(choices.rpc or ""))
@@ -170,7 +170,7 @@ def _to_target(source: ImageLike, target: str, choices: ConvertOptions) -> Conve
     """Write one RPC in another syntax, as a grid, or with a part of its image."""
     if any(one is not None for one in (choices.rpc, choices.images, choices.move, choices.transform)):
         raise UsageError("give SOURCE and TARGET, or images and -o DIR (with it: --rpc, --images, --move, --transform)")
-    camera = camera_of(source)
+    camera = open_camera(source)
     image = Path(place_of(source))
     if target.endswith(GRID_SUFFIX) and not choices.cut:
         check_target(target, [image, camera.path], choices.overwrite)

@@ -11,12 +11,13 @@ from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, RpcError
 from barpc.base.geodesy import feature_collection, geojson_feature, polygon
 from barpc.base.verb_options import InfoOptions
+from barpc.cameras import ImageLike, open_camera
 from barpc.fit.poles import smallest_denominator
 from barpc.rasters.dem import Dem
 from barpc.scene import Camera
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
-from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
+from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, exchanged, ground_at, terrain_of
 
 
@@ -61,7 +62,7 @@ def described(
     images: Sequence[ImageLike], at: tuple[float, ...] | None, alt: float | None, terrain: Dem | None
 ) -> list[dict[str, Any]]:
     """Return the figures of every image, with `pairs` those of each with the later ones."""
-    cameras = [camera_of(image) for image in images]
+    cameras = [open_camera(image) for image in images]
     if at is not None and (wrong := exchanged(cameras[0], np.array([at]))):
         raise InputError(f"--at {at}: {wrong}")
     alts = [_altitude(image, camera, alt, terrain) for image, camera in zip(images, cameras, strict=True)]
@@ -87,7 +88,7 @@ def outlines_geojson(images: Sequence[ImageLike], alt: float | None, terrain: De
     """Return GeoJSON (RFC 7946: cut at the antimeridian) of the images' outlines."""
     features = []
     for image in images:
-        camera = camera_of(image)
+        camera = open_camera(image)
         height = _altitude(image, camera, alt, terrain)
         border = geometry.image_border(camera.extent)
         level = height if terrain is None else ground_at(camera, border, height, terrain)[:, 2]

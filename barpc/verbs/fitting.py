@@ -15,7 +15,7 @@ from barpc.base.declarations import declared
 from barpc.base.errors import FitError, Remark
 from barpc.base.options import FitOptions, RunOptions
 from barpc.base.verb_options import RefitOptions
-from barpc.cameras import read_points, split_spec
+from barpc.cameras import ImageLike, file_of, open_camera, read_points, split_spec
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import terrain_range
 from barpc.rpcio import read_rpc, write_camera
@@ -23,7 +23,7 @@ from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.tie.tasks import Progress
 from barpc.verbs.converting import check_target
-from barpc.verbs.images import ImageLike, camera_of, file_of, place_of
+from barpc.verbs.images import place_of
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.points import terrain_of
 
@@ -128,7 +128,7 @@ def _fit_source(
             warnings.warn(valid, Remark, stacklevel=4)
         ground, image, sigma = points.ground, points.image, points.sigma
         return fit_rpc_points(ground, image, sigma=sigma, size=size, options=options, strict=False), size
-    camera = camera_of(source)
+    camera = open_camera(source)
     if spec and split_spec(spec)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
     return _fit_camera(camera, options, choices), camera.size

@@ -12,24 +12,9 @@ from typing import Any
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.safe_io import IMAGE, read_head, unread
-from barpc.cameras import EVERYWHERE, open_camera, split_spec
+from barpc.cameras import ImageLike, file_of, open_camera, split_spec
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
-
-ImageLike = Any
-"""A path, perhaps with choices behind it (`barpc.open_camera`), an open rasterio dataset, a View or a Camera."""
-
-
-def file_of(image: ImageLike) -> Any:
-    """Return the path of an open dataset; anything else as it is. InputError for a dataset without a file."""
-    name, mode = getattr(image, "name", None), getattr(image, "mode", None)
-    if isinstance(image, (str, os.PathLike, View, Camera)) or not (hasattr(image, "crs") and isinstance(name, str)):
-        return image
-    if mode != "r" or not (is_url(name) or os.path.lexists(name)):
-        raise InputError(f"{name}: a dataset without a file that can be read (mode {mode}); write it to disk first")
-    return name
 
 
 def one_or_many(images: ImageLike | Iterable[ImageLike]) -> tuple[list[ImageLike], bool]:
@@ -46,25 +31,10 @@ def every(images: ImageLike | Iterable[ImageLike]) -> list[Any]:
     return found
 
 
-def camera_of(image: ImageLike | SensorModel) -> Camera:
-    """Return the camera of an image, of a view or of a sensor model, opened where it is a path."""
-    image = file_of(image)
-    if isinstance(image, Camera):
-        return image
-    if isinstance(image, View):
-        return Camera(image.sensor, Path(image.path or image.name), "view", image.size, image.alt_range)
-    if isinstance(image, (str, os.PathLike)):
-        return open_camera(os.fspath(image))
-    if isinstance(image, SensorModel):
-        levels = altitude_range(image) if isinstance(image, RPC) else EVERYWHERE
-        return Camera(image, Path(type(image).__name__), "model", getattr(image, "size", None), levels)
-    raise InputError(f"{image!r} is no image: give a path, an open dataset, a View or a Camera")
-
-
 def place_of(image: ImageLike | SensorModel) -> PathOrUrl:
     """Return the file of an image, as given."""
     given = file_of(image)
-    return split_spec(os.fspath(given))[0] if isinstance(given, (str, os.PathLike)) else camera_of(given).path
+    return split_spec(os.fspath(given))[0] if isinstance(given, (str, os.PathLike)) else open_camera(given).path
 
 
 # --- folders and patterns ---------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
 from barpc.base.verb_options import OrthoOptions
+from barpc.cameras import ImageLike, open_camera
 from barpc.export.shots import Scene, read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
@@ -33,7 +34,7 @@ from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
-from barpc.verbs.images import ImageLike, camera_of, every, one_or_many, place_of
+from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Homes, Workspace
@@ -97,7 +98,7 @@ def ortho(
     choices, (given, _) = with_values(OrthoOptions(), keywords, "ortho"), one_or_many(images)
     alt, terrain = choices.alt, terrain_of(choices.dem, choices.geoid, choices.alt)
     if (run := run_folder(given)) is None:
-        cameras, files = zip(*((camera_of(image), Path(place_of(image))) for image in every(given)), strict=True)
+        cameras, files = zip(*((open_camera(image), Path(place_of(image))) for image in every(given)), strict=True)
     else:
         cameras, heights = _of_run(scene := read_scene(run))
         files = tuple(Path(camera.path) for camera in cameras)

@@ -12,13 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
-from barpc.base.geodesy import Array, as_ground, as_image, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_from_ecef, wrap_longitude
 from barpc.base.remote import PathOrUrl
+from barpc.cameras import ImageLike, open_camera
 from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
 from barpc.sensor import SensorModel, geometry
 from barpc.sensor.rpc import RPC
-from barpc.verbs.images import ImageLike, camera_of, one_or_many, place_of
+from barpc.verbs.images import one_or_many, place_of
 
 _SAME_PLACE = 0.01  # deg: places that are one; others that are seen alike lie degrees away
 
@@ -62,7 +63,7 @@ def project(
     >>> barpc.project("data_samples/view_00.tif", [5.4, 43.3, 120.0]).round(2)
     array([509.77, 494.61])
     """
-    camera, terrain = camera_of(image), terrain_of(dem, geoid)
+    camera, terrain = open_camera(image), terrain_of(dem, geoid)
     points = with_altitudes(ground, alt, terrain)
     if wrong := exchanged(camera, np.nan_to_num(points.reshape(-1, 3))):
         warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
@@ -108,10 +109,10 @@ def localize(
     array([[  5.3975,  43.3027, 120.    ],
            [  5.3999,  43.3   , 120.    ]])
     """
-    camera, terrain, points = camera_of(image), terrain_of(dem, geoid, alt), as_image(at)
+    camera, terrain, points = open_camera(image), terrain_of(dem, geoid, alt), as_image(at)
     if terrain is None:
         level = altitude_of(camera, place_of(image)) if alt is None else alt
-        return camera.model.localize(points, np.asarray(level, dtype=np.float64))
+        return camera.model.localize(points, as_numbers(level, "altitudes"))
     return ground_at(camera, points.reshape(-1, 2), 0.0, terrain).reshape(*points.shape[:-1], 3)
 
 
@@ -141,7 +142,7 @@ def triangulate(images: Sequence[ImageLike | SensorModel], at: npt.ArrayLike) ->
     >>> ground.round(3), bool(error < 1e-6)
     (array([  5.4,  43.3, 120. ]), True)
     """
-    cameras = [camera_of(image) for image in one_or_many(images)[0]]
+    cameras = [open_camera(image) for image in one_or_many(images)[0]]
     if len(cameras) < 2:
         raise UsageError("one image; the lines of sight of at least two can meet")
     xy = as_image(at)
@@ -174,9 +175,9 @@ def terrain_of(dem: Files | None = None, geoid: str | None = None, alt: npt.Arra
 
 def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: Dem | None) -> Array:
     """Return ground points (..., 3) of such, or of (..., 2) and their altitudes [m] or a terrain, which goes first."""
-    points = np.asarray(ground, dtype=np.float64)
+    points = as_numbers(ground, "ground points")
     if points.shape[-1:] == (2,) and (alt is not None or terrain is not None):
-        level = np.asarray(np.nan if alt is None else alt, dtype=np.float64)[..., None]
+        level = as_numbers(np.nan if alt is None else alt, "altitudes")[..., None]
         lead = np.broadcast_shapes(points.shape[:-1], level.shape[:-1])
         points = np.concatenate([np.broadcast_to(part, (*lead, part.shape[-1])) for part in (points, level)], axis=-1)
     points = as_ground(points)

@@ -13,7 +13,8 @@ from barpc import pipeline
 from barpc.base.declarations import with_values
 from barpc.base.errors import UsageError
 from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
-from barpc.verbs.images import ImageLike, every, one_or_many
+from barpc.cameras import ImageLike
+from barpc.verbs.images import every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 

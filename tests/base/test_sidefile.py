@@ -311,12 +311,12 @@ DIRECT = {
     "pipeline/verify_outputs.py": "reopens what barpc has just written, as its consumers do",
     "rasters/raster.py": "images, checked there",
     "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
+    "pointio/tables.py": "no file: lines that were read",
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
     "report/runfiles.py": "the schema, which is part of the package",
     "cli/process.py": "the null device",
-    "pointio/gcp_formats.py": "layers of a GeoPackage or Shapefile, which fiona opens, once their head is read",
 }
 """Modules that may open a file for reading by themselves, and what they open."""
 ARRAYS_OF_A_PATH = ("load", "fromfile", "genfromtxt", "loadtxt")

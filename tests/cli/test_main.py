@@ -217,10 +217,11 @@ def test_only_a_process_of_its_own_has_its_garbage_left_alone(
     monkeypatch.setattr(sys, "argv", ["barpc", "info", "a b"])
     monkeypatch.delenv(THREADS[0], raising=False)
     monkeypatch.setenv(THREADS[1], "4")
+    monkeypatch.setenv(THREADS[2], "4")
     verb(0)
     assert run("info") == 0
     assert asked == []
-    assert [os.environ[name] for name in THREADS[:2]] == ["1", "4"]
+    assert [os.environ[name] for name in THREADS] == ["1", "1", "1"]
     given = list[object]()
     monkeypatch.setattr(cli, "main", lambda **how: given.append(how))
     monkeypatch.setattr("barpc.cli.interruptible", lambda own: asked.append(own) or interruptible(own=False))

@@ -158,7 +158,7 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
     ground = SimpleNamespace(all_ground=(-500.0, 9000.0))
     camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5))
     monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
-    monkeypatch.setattr(fit, "camera_of", lambda _: camera)
+    monkeypatch.setattr(fit, "open_camera", lambda _: camera)
     assert run("fit", source) == 0
     assert [alts for alts, _ in asked] == [(-500.0, 9000.0), (1.0, 200.5)][:count]
     error = capsys.readouterr().err

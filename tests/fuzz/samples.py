@@ -26,6 +26,7 @@ from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
 from barpc.cli.terminal import print_comparison
 from barpc.export import export_run
+from barpc.pipeline.calibrate import read_calibration
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.correspondences import read_correspondences
 from barpc.pointio.gcps import read_gcps
@@ -46,9 +47,11 @@ from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
 from barpc.tie.pairing.area import read_area
 from barpc.workspace import Workspace
+from tests.pipeline.test_calibrate import written as calibration_of
 from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import binary, colmap
 from tests.pointio.test_gcp_formats import SAME as GCP_FILES
+from tests.pointio.test_gcp_formats import geopackage_of, shapefile_of
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
 from tests.sensor import terrasar_files
@@ -454,6 +457,28 @@ POINTS = (
 )
 
 
+def _read_layer(path: Path) -> object:
+    """Points of a layer that is called so, or lies beside."""
+    return read_gcps(path if path.suffix == ".gpkg" else path.with_suffix(".shp"), ["left"])
+
+
+def _beside_shapefile(folder: Path) -> None:
+    shapefile_of(folder, rows=3)
+
+
+@cache
+def _of_shapefile(name: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        _beside_shapefile(Path(folder))
+        return (Path(folder) / name).read_bytes()
+
+
+@cache
+def _calibration() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return calibration_of(Path(folder) / "a.cal").read_bytes()
+
+
 SAMPLES: dict[str, Sample] = {
     **{f"rpc {kind}": _rpc_sample(kind) for kind in TEXTS},
     "rpc tag": Sample("b.tif", read_rpc, _tiff, (mutate_header,)),
@@ -463,6 +488,11 @@ SAMPLES: dict[str, Sample] = {
     "gcps csv": Sample("a.csv", lambda path: read_gcps(path, NAMES), lambda: CSV_GCPS, (mutate_text,)),
     "gcps json": Sample("a.geojson", lambda path: read_gcps(path, NAMES), lambda: GCPS, (mutate_json,)),
     **{f"gcps {kind}": _gcp_sample(*row) for kind, row in GCP_FILES.items()},
+    "gcps geopackage": Sample("a.gpkg", _read_layer, geopackage_of, share=0.3),
+    "gcps shp": Sample("left.shp", _read_layer, lambda: _of_shapefile("left.shp"), (), _beside_shapefile),
+    "gcps dbf": Sample("left.dbf", _read_layer, lambda: _of_shapefile("left.dbf"), (), _beside_shapefile),
+    "gcps prj": Sample("left.prj", _read_layer, lambda: _of_shapefile("left.prj"), (mutate_text,), _beside_shapefile),
+    "calibration": Sample("a.cal", read_calibration, _calibration, (mutate_json,), share=0.3),
     "matches csv": Sample("t.csv", lambda path: read_matches(path, NAMES), lambda: MATCHES, (mutate_text,)),
     "matches npz": Sample(
         "t.npz",

@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 
 import barpc
 from barpc.ba.calibration import SensorTies, learn
-from barpc.ba.interior import Calibration
+from barpc.ba.interior import Calibration, LineCurve
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.base.statistics import SURE
@@ -25,6 +25,7 @@ from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
 from barpc.pipeline.calibrate import (
     _FinishedRun,
+    _may_be_covariance,
     _refuse_unsure,
     _row_direction,
     calibrations_of,
@@ -267,7 +268,8 @@ def test_errors_are_common_to_images_of_one_sensor_and_width(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "not JSON"),
+        ("", "the file is empty"),
+        ("{", "not JSON"),
         ("[]", "schema None"),
         ('{"schema": "barpc calibration 9"}', "not a calibration that this release reads"),
         ('{"schema": "barpc calibration 1"}', "damaged"),
@@ -311,11 +313,26 @@ def test_a_calibration_is_read_as_it_stands(tmp_path: Path) -> None:
     for changes in (
         {"columns": 4000.0}, {"sensor": 5}, {"coefficients_px": [[0, 0]] * 27}, {"coefficients_px": [[1e3, 0]] * 28},
         {"steps_px": [[0.0, 0.0], [0.0, -1e3]]}, {"edges": [900.5]}, {"covariance_px2": numbers[:-1]},
-        {"covariance_px2": [-1.0, *numbers[1:]]},
+        {"covariance_px2": [-1.0, *numbers[1:]]}, {"covariance_px2": 0.0}, {"covariance_px2": [0.0] * len(numbers)},
+        {"covariance_px2": [n * 1e90 for n in numbers]}, {"covariance_px2": list(map(str, numbers))},
+        {"covariance_px2": [numbers[0], numbers[0] * 1.1, *numbers[2:]]}, {"edges": [900.5, 4100.5]},
+        {"edges": [-1.0, 2100.5]}, {"edges": ["900.5", "2100.5"]}, {"edges": [2100.5, 900.5]}, {"columns": True},
+        {"edges": list(range(3000)), "steps_px": [[0.0, 0.0]] * 3000, "covariance_px2": 0.0}, {"columns": 10**15},
     ):  # fmt: skip
         with pytest.raises(InputError, match=r"a\.cal: damaged \(.*\); make it again"):
             read_calibration(written(path, **changes))
-    read_calibration(written(path, coefficients_px=[[999.0, -999.0]] * 28, covariance_px2=[0.0] * len(numbers)))
+    read_calibration(written(path, coefficients_px=[[999.0, -999.0]] * 28))
+
+
+@pytest.mark.parametrize("edges", [0, 1, 40, 64])
+def test_a_covariance_of_curves_without_constant_and_slope_is_one_with_the_digits_that_are_written(edges: int) -> None:
+    curve = LineCurve(SIZE[0], np.linspace(100.5, 3900.5, edges))
+    root = curve.bent @ np.random.default_rng(edges).normal(0, 0.1, (2 * curve.size, 20))
+    for scale in (1e-4, 1.0, 100.0):
+        matrix = np.vectorize(lambda value: float(f"{value:.5g}"))(scale * root @ root.T)
+        assert _may_be_covariance(matrix)
+        matrix[0, 1] = matrix[1, 0] = 1.1 * np.sqrt(matrix[0, 0] * matrix[1, 1])
+        assert not _may_be_covariance(matrix)
 
 
 def test_an_image_takes_the_calibration_of_its_sensor_or_of_none(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_accuracies_are_taken_where_they_are_stated(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "no column lon, lat, alt among the 0 of its first line"),
+        ("", "the file is empty"),
         ("lon,lat,alt\n", "holds no height"),
         ("lon,lat,alt\n5.44,43.25,-9999\n", "holds no height"),
         ("lon,lat\n5.44,43.25\n", "no column alt"),

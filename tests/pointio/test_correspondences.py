@@ -87,7 +87,7 @@ def test_geojson_points_that_are_no_places_on_wgs84_are_refused(tmp_path: Path, 
         ("a.json", b'{"type": "FeatureCollection", "features": [{}]}', "not a GeoJSON"),
         ("a.txt", b"LINE_OFF: 5\n", "neither a table"),
         ("a.bin", bytes(range(256)), "neither a table"),
-        ("a.csv", b"", "neither a table"),
+        ("a.csv", b"", "the file is empty"),
     ],
 )
 def test_what_is_no_table_is_refused_with_the_reason(tmp_path: Path, name: str, content: bytes, message: str) -> None:

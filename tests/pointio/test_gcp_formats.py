@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
+import sqlite3
+import struct
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import pytest
 import rasterio
+import shapely
 from rasterio.warp import transform
 
 from barpc.base.errors import InputError, plain
@@ -19,6 +24,7 @@ from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.pointio.gcp_formats import GCP_NAMES as NAMES_OF
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.tables import COLUMNS, degrees, guessed
+from barpc.report.geopackage import Layer, geopackage, point_shapes
 from barpc.scene import GroundPoints
 
 NAMES = ["left", "right"]
@@ -215,7 +221,7 @@ def test_the_flag_counts_before_the_file_and_that_is_said(tmp_path) -> None:
     "crs", ["EPSG:99999", "nonsense", "EPSG:5703", "", 'LOCAL_CS["Local",UNIT["metre",1]]', "\ud800"]
 )
 def test_what_is_no_reference_system_of_places_is_refused(tmp_path, crs) -> None:
-    with pytest.raises(InputError, match=r"no reference system of places|map coordinates\?"):
+    with pytest.raises(InputError, match=r"(no|as a) reference system|map coordinates\?"):
         one(tmp_path, EAST, NORTH, 1.0, ControlReference(crs))
 
 
@@ -382,30 +388,112 @@ def test_metashapes_files_of_an_image_each_go_with_its_reference(tmp_path) -> No
 # --- layers of a GIS --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("reader", ["pyogrio", "fiona"])
 @pytest.mark.parametrize(("driver", "file"), [("GPKG", "left.gpkg"), ("ESRI Shapefile", "left.shp")])
-def test_a_layer_of_points_is_read_by_either_library(tmp_path, monkeypatch, reader, driver, file) -> None:
+def test_a_layer_of_gdal_s_is_read(tmp_path, driver, file) -> None:
     fiona = pytest.importorskip("fiona", reason="fiona writes the layers")
-    pytest.importorskip(reader)
     schema = {"geometry": "3D Point", "properties": {"name": "str", "pixel": "float", "line": "float"}}
     with fiona.open(tmp_path / file, "w", driver=driver, crs="EPSG:32631", schema=schema) as layer:
         point = {"type": "Point", "coordinates": (EAST, NORTH, ALT)}
         layer.write({"type": "Feature", "geometry": point, "properties": {"name": "p", "pixel": COL, "line": ROW}})
-    monkeypatch.setitem(sys.modules, {"pyogrio": "fiona", "fiona": "pyogrio"}[reader], None)
-    found = read_gcps(tmp_path / file, NAMES)
+    is_the_point(read_gcps(tmp_path / file, NAMES))
+
+
+def is_the_point(found) -> None:
     assert found.names == ("p",)
     assert found.view.tolist() == [0]
     near(found, (LON, LAT, ALT))
     np.testing.assert_allclose(found.xy, [[COL, ROW]])
 
 
-@pytest.mark.parametrize("head", [b"SQLite format 3\0", b"\0\0\x27\x0a"])
-def test_without_a_library_a_layer_says_what_to_install(tmp_path, monkeypatch, head) -> None:
-    for name in ("pyogrio", "fiona"):
-        monkeypatch.setitem(sys.modules, name, None)
-    (tmp_path / "a.gpkg").write_bytes(head + bytes(100))
-    with pytest.raises(InputError, match="a GeoPackage or Shapefile, which pyogrio reads: pip install pyogrio"):
-        read_gcps(tmp_path / "a.gpkg", NAMES)
+def geopackage_of(rows=(("p", COL, ROW),), shapes=None) -> bytes:
+    shapes = point_shapes(np.array([[LON, LAT, ALT]] * len(rows))) if shapes is None else shapes
+    return geopackage([Layer("control", shapes, ["name TEXT", "pixel REAL", "line REAL"], rows)])
+
+
+UTM_PRJ = pyproj.CRS("EPSG:32631").to_wkt("WKT1_ESRI")
+
+
+def shapefile_of(folder: Path, kind: int = 11, rows: int = 1, prj: str = UTM_PRJ, deleted: bool = False) -> Path:
+    """A Shapefile by Esri's description of it (1998), its table by that of dBase III."""
+    content = struct.pack("<I4d", kind, EAST, NORTH, ALT, 0.0)
+    shapes = b"".join(struct.pack(">II", n + 1, len(content) // 2) + content for n in range(rows))
+    (folder / "left.shp").write_bytes(b"\0\0\x27\x0a" + bytes(96) + shapes)
+    fields = b"".join(
+        name.ljust(11, b"\0") + form + bytes(4) + bytes([20, 9 * (form == b"N")]) + bytes(14)
+        for name, form in ((b"name", b"C"), (b"pixel", b"N"), (b"line", b"N"))
+    )
+    row = b"".join(str(cell).encode().ljust(20) for cell in ("p", COL, ROW))
+    table = [(b"*" if deleted and n else b" ") + row for n in range(rows)]
+    head = struct.pack("<BBBBIHH20x", 3, 126, 1, 1, rows, 32 + len(fields) + 1, 61)
+    (folder / "left.dbf").write_bytes(head + fields + b"\r" + b"".join(table) + b"\x1a")
+    if prj:
+        (folder / "left.prj").write_text(prj, encoding="utf-8")
+    return folder / "left.shp"
+
+
+def test_a_geopackage_and_a_shapefile_are_read_without_gdal(tmp_path) -> None:
+    (tmp_path / "left.gpkg").write_bytes(geopackage_of())
+    is_the_point(read_gcps(tmp_path / "left.gpkg", NAMES))
+    is_the_point(read_gcps(shapefile_of(tmp_path), NAMES))
+    is_the_point(read_gcps(shapefile_of(tmp_path, rows=2, deleted=True), NAMES))
+    flat = read_gcps(shapefile_of(tmp_path, kind=1), NAMES)
+    near(flat, (LON, LAT, 0.0))
+
+
+def _changed(statement: str) -> bytes:
+    with closing(sqlite3.connect(":memory:")) as base:
+        base.deserialize(geopackage_of())
+        base.executescript(statement)
+        return base.serialize()
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (lambda: _changed("UPDATE control SET geom = NULL"), "a feature without a geometry"),
+        (lambda: _changed("UPDATE control SET geom = X'4750001100000000'"), "a feature without a geometry"),
+        (lambda: geopackage_of(shapes=[shapely.box(0, 0, 1, 1)]), "no point"),
+        (lambda: geopackage_of()[:5000], "damaged GeoPackage"),
+        (lambda: b"SQLite format 3\0" + bytes(100), "damaged GeoPackage"),
+        (lambda: _changed("DELETE FROM gpkg_geometry_columns"), "without a layer of points"),
+        (lambda: _changed("DROP TABLE gpkg_geometry_columns"), "no such table"),
+        (lambda: _changed("DROP TABLE control; CREATE VIEW control AS WITH RECURSIVE r(geom) AS (SELECT 1 UNION ALL "
+                          "SELECT geom + 1 FROM r) SELECT geom FROM r WHERE geom < 0"), "interrupted"),
+    ],
+)  # fmt: skip
+def test_a_geopackage_that_is_no_layer_of_points_is_said(tmp_path, monkeypatch, data, says) -> None:
+    monkeypatch.setattr("barpc.pointio.layers._TURN", 10_000)
+    (tmp_path / "left.gpkg").write_bytes(data())
+    with pytest.raises(InputError, match=rf"left\.gpkg: .*{says}"):
+        read_gcps(tmp_path / "left.gpkg", NAMES)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({"prj": "GEOGCS[damaged"}, "not read as a reference system"),
+        ({"prj": '\x01PROJCS["m'}, "not read as a reference system"),
+        ({"prj": 'PROJCS["m"]'}, "no reference system"),
+        ({"kind": 0}, "a feature without a geometry"),
+        ({"kind": 5}, "no point"),
+    ],
+)
+def test_a_shapefile_that_is_no_layer_of_points_is_said(tmp_path, how, says) -> None:
+    with pytest.raises(InputError, match=rf"left\.shp: .*{says}"):
+        read_gcps(shapefile_of(tmp_path, **how), NAMES)
+
+
+@pytest.mark.parametrize("end", [".dbf", ".prj"])
+def test_a_pipe_beside_a_shapefile_is_not_waited_for(tmp_path, end) -> None:
+    path = shapefile_of(tmp_path)
+    path.with_suffix(end).unlink()
+    os.mkfifo(path.with_suffix(end))
+    with pytest.raises(InputError, match=rf"left\{end}: a pipe"):
+        read_gcps(path, NAMES)
+    path.with_suffix(end).unlink()
+    if end == ".dbf":
+        with pytest.raises(InputError, match=r"without its left\.dbf"):
+            read_gcps(path, NAMES)
 
 
 # --- what is wrong is said --------------------------------------------------------------------------------

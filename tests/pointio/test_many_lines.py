@@ -90,6 +90,26 @@ def test_batches_say_what_lines_say(tmp_path: Path, delimiter: str, lines: int) 
         assert list(dict.fromkeys(numbers)) == list(range(len(column.different)))  # in the order of their first rows
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    "odd", ["1.5", " 1.5 ", "1_0", "+1", "1e400", "nan", "-inf", "0x10", "1,5", "", "\u0661", "1d5", "1 2"]
+)
+def test_numbers_read_at_once_are_those_of_single_cells(tmp_path: Path, delimiter: str, odd: str) -> None:
+    """Quotes make a reader of cells of it, whatever numpy takes for a number."""
+    found = []
+    for quote in ("", '"'):
+        cells = [(f"{quote}left{quote}", "t1", "1", "2.5"), (f"{quote}left{quote}", "t2", odd, "-3", "more")]
+        text = "\n".join(map(delimiter.join, [("image", "track", "col", "row"), *cells]))
+        (tmp_path / "a.csv").write_text(text, encoding="utf-8")
+        columns = {name: (name,) for name in ("image", "track", "col", "row")}
+        try:
+            _, table = read_table(tmp_path / "a.csv", columns, list(columns), texts=("image", "track"))
+            found.append([repr(table["col"].tolist()), table["row"].tolist(), table["track"].per_row()])
+        except InputError as error:
+            found.append([str(error)])
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("label", ["{}", "t{}", "0{}", "{}.0"])
 def test_tracks_are_told_by_their_labels_as_they_are_written(tmp_path: Path, label: str) -> None:
     """12, 012, +12 and 1_2 are four; they are numbered as they come."""

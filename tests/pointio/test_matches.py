@@ -68,7 +68,7 @@ def test_asp_pairs_that_share_a_keypoint_are_one_track(tmp_path):
         ("t.csv", "image,col,row,track\na,1,x,2\n", "line 2: expected image, col, row, track"),
         ("t.csv", "image,col,row,track\na,1,2,1\n", "no track is seen in two"),
         ("t.csv", "image,col,row,track\n", "no track is seen in two"),
-        ("t.csv", "", "among the 0 of its first line"),
+        ("t.csv", "", "the file is empty"),
         ("a__b.txt", "2 2\n1 2\n", "holds 1"),
         ("a__b.txt", "rubbish\n", "not an ASP text match file"),
         ("t.npz", "rubbish", "npz"),

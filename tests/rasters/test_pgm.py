@@ -68,7 +68,7 @@ def test_a_dem_is_made_ellipsoidal_with_it(tmp_path):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda d: b"", "no .pgm of 16-bit"),
+        (lambda d: b"", "the file is empty"),
         (lambda d: d.replace(b"P5", b"P2"), "no .pgm of 16-bit"),
         (lambda d: d.replace(b"\n65535\n", b"\n255\n"), "no .pgm of 16-bit"),
         (lambda d: d.replace(b"# Scale 0.003\n", b""), "state '# Offset' and '# Scale'"),

@@ -253,7 +253,7 @@ REFUSED = {
         "'http://x' in <SimpleSource>",
     ),
     "a service as SRS": ("<SRS>http://127.0.0.1:9/x</SRS>" + SIMPLE, "'http://127.0.0.1:9/x' in <SRS>"),
-    "an SRS that is none": ("<SRS>GEOGCS[nonsense]</SRS>" + SIMPLE, "coordinate system"),
+    "an SRS that is none": ("<SRS>GEOGCS[nonsense]</SRS>" + SIMPLE, "reference system"),
     "overviews elsewhere": (
         band(source("a.tif"), "<Overview><SourceFilename>b.tif</SourceFilename></Overview>"),
         "Overview",

@@ -19,11 +19,13 @@ from rasterio.io import MemoryFile
 
 import barpc
 from barpc.base.declarations import Options, declared
-from barpc.base.errors import BarpcWarning, InputError, Remark, UsageError
+from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
+from barpc.cameras import open_camera
 from barpc.cli import COMMANDS, cli
 from barpc.scene import Camera
-from barpc.verbs.images import camera_of, every
+from barpc.simulate import simulate_block
+from barpc.verbs.images import every
 from barpc.verbs.options import FLAG_NAMES, run_options
 from barpc.verbs.points import with_altitudes
 from tests.rpcio.conftest import make_rpc
@@ -140,7 +142,7 @@ def test_a_path_a_dataset_a_view_and_a_camera_are_one_image():
     assert len(barpc.info(f"{SAMPLES}/view_0[02].tif", alt=120.0)) == 2
     assert every(path for path in VIEWS) == list(map(str, VIEWS))
     with pytest.raises(InputError, match="3 is no image: give a path"):
-        camera_of(3)
+        open_camera(3)
 
 
 def test_a_dataset_in_memory_has_no_file_that_can_be_read():
@@ -213,6 +215,52 @@ def test_a_wrong_shape_names_the_axis_expected(call, words):
             call(model)
         with pytest.raises(ValueError):  # what numpy's users catch
             call(model)
+
+
+def test_what_is_masked_is_not_seen_and_complex_numbers_are_refused():
+    """Whatever its fill value, which is a number as any other."""
+    ground = np.ma.masked_array([GROUND, GROUND, GROUND], mask=[[False] * 3, [False, False, True], [True] * 3])
+    for given in (ground, list(ground)):
+        seen = barpc.project(VIEWS[0], given)
+        assert type(seen) is np.ndarray
+        np.testing.assert_array_equal(np.isnan(seen).any(axis=1), [False, True, True])
+        np.testing.assert_array_equal(seen[0], barpc.project(VIEWS[0], GROUND))
+    alt = np.ma.masked_equal([120.0, -9999.0], -9999.0)
+    np.testing.assert_array_equal(
+        np.isnan(barpc.project(VIEWS[0], [GROUND[:2]] * 2, alt=alt)).any(axis=1), [False, True]
+    )
+    np.testing.assert_array_equal(np.isnan(barpc.localize(VIEWS[0], [[5, 5]] * 2, alt=alt)).any(axis=1), [False, True])
+    image = np.ma.masked_array([[[5.0, 5.0], [6.0, 6.0]]], mask=[[[True, False], [False, False]]])
+    assert np.isnan(barpc.triangulate(VIEWS[:2], image)[0]).all()
+    model = barpc.open_camera(VIEWS[0]).model
+    calls = [
+        lambda: model.project(np.array(GROUND) + 1j), lambda: model.localize([1j, 2.0], 0.0),
+        lambda: model.localize([1.0, 2.0], 1j), lambda: barpc.project(VIEWS[0], [5.4, 43.3], alt=100 + 1j),
+        lambda: barpc.triangulate(VIEWS[:2], np.zeros((2, 2), complex)),
+        lambda: barpc.fit_rpc_points(np.ones((50, 3), complex), np.ones((50, 2)), size=(9, 9)),
+        lambda: barpc.Tracks([0, 1], [0, 0], np.ma.masked_array(np.ones((2, 2)), mask=[[1, 0], [0, 0]]), [1.0, 1.0]),
+        lambda: barpc.Tracks([0, 1], [0, 0], np.ones((2, 2)) + 1j, [1.0, 1.0]),
+    ]  # fmt: skip
+    for call in calls:
+        with pytest.raises(BarpcError, match="complex numbers"):
+            call()
+    holes = np.ma.masked_array(np.ones((50, 3)), mask=np.eye(50, 3))
+    with pytest.raises(BarpcError, match="3 of 50 are not finite"):
+        barpc.fit_rpc_points(holes, np.ones((50, 2)), size=(9, 9))
+
+
+def test_a_camera_is_opened_from_everything_that_info_takes():
+    camera = barpc.open_camera(VIEWS[0])
+    block = simulate_block(2, 20, seed=1)
+    with rasterio.open(VIEWS[0]) as dataset:
+        for given in (str(VIEWS[0]), dataset, camera, block.views[0], camera.model):
+            found = barpc.open_camera(given)
+            assert found.model == (block.views[0].sensor if given is block.views[0] else camera.model)
+            assert barpc.info(given, alt=100.0)["altitude_range_m"] == list(found.alt_range)
+    with pytest.raises(InputError, match="size given for a Camera"):
+        barpc.open_camera(camera, size=(9, 9))
+    with pytest.raises(InputError, match="is no image"):
+        barpc.open_camera(3)
 
 
 def test_longitude_and_latitude_exchanged_warn_and_right_ones_do_not():
