@@ -22,6 +22,7 @@ from barpc.rpcio import read_rpc, write_rpc
 from barpc.workspace import Workspace
 from tests.reliability.conftest import barpc
 from tests.reliability.trials import SAMPLES, crop
+from tests.sealing import files, seal
 
 SUMS = "SHA256SUMS"
 
@@ -53,24 +54,8 @@ def wrong(run: Path, root: str | None = None) -> set[tuple[str, str]]:
     return {(one.file, one.now) for one in prove(run, (), root) if one.now not in PASSED_STATES}
 
 
-def files(run: Path) -> list[str]:
-    """Every file of a run but its state."""
-    names = (path.relative_to(run).as_posix() for path in sorted(run.rglob("*")) if path.is_file())
-    return [name for name in names if not name.startswith(".barpc/")]
-
-
 def root_of(run: Path) -> str:
     return sha256((run / SUMS).read_bytes()).hexdigest()
-
-
-def settled(run: Path) -> None:
-    """What an adversary does who knows all: hashes of every file as it is now, in SHA256SUMS and in the state."""
-    first = manifest.read(run)[1][0]
-    layer = manifest.Layer(first.head, {n: sha256((run / n).read_bytes()).hexdigest() for n in files(run) if n != SUMS})
-    (run / SUMS).write_text(manifest.render([layer]))
-    state = json.loads((run / ".barpc/state.json").read_text())
-    state["outputs"] = {**layer.files, SUMS: root_of(run)}
-    (run / ".barpc/state.json").write_text(json.dumps(state))
 
 
 @pytest.mark.slow
@@ -142,7 +127,7 @@ def test_every_consistent_edit_is_found_by_the_root_alone(run, monkeypatch) -> N
         data, sums = (run / name).read_bytes(), (run / SUMS).read_bytes()
         state = (run / ".barpc/state.json").read_bytes()
         (run / name).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-        settled(run)
+        seal(run)
         assert wrong(run) == set(), name
         assert wrong(run, root) == {(SUMS, "changed")}, name
         for path, old in ((name, data), (SUMS, sums), (".barpc/state.json", state)):
@@ -217,7 +202,7 @@ def test_a_fault_that_stays_within_what_a_summary_says_is_named(run, name) -> No
     fault(run)
     assert expected <= wrong(run)
     assert barpc("verify", run).code == 3
-    settled(run)  # with all hashes made right, the root that was printed tells
+    seal(run)  # with all hashes made right, the root that was printed tells
     assert barpc("verify", run, "--expect", root).code == 3
 
 
@@ -435,7 +420,7 @@ def test_inputs_that_changed_are_told_from_those_that_moved(finished, run, tmp_p
     for one in summary["inputs"]:
         one["path"] = str(tmp_path / "gone" / Path(one["path"]).name)
     (run / "summary.json").write_text(json.dumps(summary))
-    settled(run)
+    seal(run)
     code, found = findings(run)
     assert code == 3
     assert {now for (kind, _), now in found.items() if kind == "input"} == {"missing"}
