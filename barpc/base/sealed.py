@@ -1,4 +1,4 @@
-"""A folder that a command has finished: its files by SHA256SUMS, what its state notes, and where its inputs are.
+"""Finished folders: files by SHA256SUMS, notes of the state, and places of inputs.
 
 An input is found by its content; a file of its name with another content is not it. Asked are, in this order: its path
 as seen from the folder, which may have been moved, or be a link; the same path as seen from where the folder was made;
@@ -38,7 +38,7 @@ CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(
 
 @dataclass(frozen=True, eq=False)
 class Sealed:
-    """A finished folder with its root and layers (without any nothing proves it), and what its state notes.
+    """A finished folder: its root, its layers (without any nothing proves it), and notes of its state.
 
     `noted`: SHA-256 of outputs; `made`: where it was made; `stamps`: of large files, by their paths from the folder.
     """

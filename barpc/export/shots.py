@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -15,6 +16,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
+from barpc.rasters.raster import sources_of
 from barpc.report.compare import is_own, written_rpc
 from barpc.report.finished import FinishedRun
 from barpc.report.ranking import sure_pairs
@@ -224,7 +226,11 @@ def _carrier(run: FinishedRun, view: ViewEntry) -> Path | None:
     """Return the raster with the corrected RPC that a run wrote for an image, in its own folder."""
     for name in (view.name + end for row in CARRIERS.values() for end in row.suffixes):
         if name in view.outputs and is_own(run.folder, name):
-            return run.sealed.file(name).absolute()
+            path = run.sealed.file(name).absolute()
+            with suppress(InputError):  # of a run that was moved without its images, whose VRTs show none
+                for source in sources_of(path):
+                    run.ask(source)
+                return path
     return None
 
 

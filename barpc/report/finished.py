@@ -1,4 +1,4 @@
-"""A finished run, opened: the one door for commands that read what `adjust` or `match` wrote, and the run's inputs."""
+"""The one door to a finished run: its summary, its tables, its cameras, and its inputs, as they were."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from barpc.base.atomic import STATE
 from barpc.base.errors import InputError
 from barpc.base.identity import recorded
 from barpc.base.manifest import LAST, SUMS
@@ -15,7 +16,7 @@ from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.sealed import Sealed
 from barpc.rasters.raster import sources_of
 from barpc.report.renamed import is_old
-from barpc.report.runfiles import FOLDER, PAGE_TABLES, TIE_TABLES, RunFiles, read_summary, read_tables, table_path
+from barpc.report.runfiles import PAGE_TABLES, TIE_TABLES, RunFiles, read_summary, read_tables, table_path
 from barpc.report.summary import InputEntry, Summary
 
 
@@ -42,6 +43,22 @@ class FinishedRun:
             sealed.file(LAST)
             return cls(sealed, read_summary(folder))
 
+    @classmethod
+    def refuse_edited(cls, folder: Path, files: Iterable[Path], of_images: bool) -> None:
+        """Raise InputError where files of a folder, if it is one of a run, are not as the run wrote them.
+
+        `of_images`: its images are to be read, and all of them, with the pixels that their VRTs show.
+        """
+        if not (os.path.lexists(folder / LAST) and any(os.path.lexists(folder / name) for name in (SUMS, STATE))):
+            return
+        run, names = cls.open(folder), {file.name for file in files}
+        if of_images:
+            names |= {name for view in run.summary.views for name in view.outputs if name.endswith((".vrt", ".tif"))}
+        for name in sorted(names & run.sealed.listed.keys()):  # others may lie there, too
+            path = run.sealed.file(name)
+            for source in sources_of(path) if of_images else ():
+                run.ask(source)
+
     @property
     def folder(self) -> Path:
         """The folder, as given."""
@@ -49,12 +66,12 @@ class FinishedRun:
 
     @cached_property
     def inputs(self) -> Mapping[str, InputEntry]:
-        """What the run read, by the path in its files."""
+        """Inputs by their paths in the files of the run."""
         return {one.path: one for one in self.summary.inputs or ()}
 
     def table(self, name: str) -> Path:
         """Return the path of a table; InputError where it was changed since."""
-        return self.sealed.file(f"{FOLDER}/{name}") if self.sealed.layers else table_path(self.folder, name)
+        return self.sealed.file(table_path(self.folder, name).relative_to(self.folder).as_posix())
 
     def tables(self, of_page: bool = False) -> RunFiles:
         """Read the tie points, `of_page`: also the outlines and pictures; InputError where they were changed since."""

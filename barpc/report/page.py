@@ -60,7 +60,7 @@ def report_html(summary: Summary, folder: Path | str) -> str:
 
 
 def page_of(files: RunFiles) -> str:
-    """Return the page of a run from what was read of it."""
+    """Return the page of a run from its files."""
     summary = files.summary
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
     if len(summary.views) > TABLE_ROWS_SHOWN:

@@ -74,7 +74,8 @@ def with_new_names(found: Any, path: Path) -> Any:
                 record[key] = values.get(kind, kind) + colon + image
     found["schema"] = SCHEMA
     warnings.warn(
-        f"{path}: has the names of release 0.3, which the next will not read, and nothing proves it: run the adjustment again",
+        f"{path}: has the names of release 0.3, which the next release will not read, and nothing proves it: run the "
+        "adjustment again",
         BarpcWarning,
         stacklevel=2,
     )

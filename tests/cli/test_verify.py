@@ -249,9 +249,9 @@ def test_a_report_that_is_made_again_is_the_same_file(run) -> None:
 
 
 def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> None:
-    roots, page = [root_of(run)], outputs.report_html
+    roots, page = [root_of(run)], outputs.page_of
     for text in ("<!-- another release -->", "<!-- one more -->"):
-        monkeypatch.setattr(outputs, "report_html", lambda summary, folder, text=text: page(summary, folder) + text)
+        monkeypatch.setattr(outputs, "page_of", lambda files, text=text: page(files) + text)
         assert barpc("report", run).code == 0
         roots.append(root_of(run))
     assert barpc("convert", SAMPLES[2], "-o", run, "--rpc-format", "rpb").code == 0
@@ -274,14 +274,14 @@ def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> 
 def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
     root = root_of(run)
     (run / "view_00_RPC.TXT").write_bytes((run / "view_01_RPC.TXT").read_bytes())
-    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "of another release")
+    monkeypatch.setattr(outputs, "page_of", lambda files: "of another release")
     assert barpc("report", run).code == 0
     assert root_of(run) != root
     assert wrong(run) == wrong(run, root) == {("view_00_RPC.TXT", "changed")}
     sums = (run / SUMS).read_text().replace("# barpc 0", "# barpc 9", 1)
     (run / SUMS).write_text(sums)
-    monkeypatch.setattr(outputs, "report_html", lambda summary, folder: "of one more")
-    assert barpc("report", run).code == 0
+    monkeypatch.setattr(outputs, "page_of", lambda files: "of one more")
+    assert barpc("report", run).code == 1
     assert (run / SUMS).read_text() == sums  # changed by somebody: nothing is built on it
     assert (SUMS, "changed") in wrong(run)
 
@@ -289,7 +289,7 @@ def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
 def test_a_command_that_is_killed_before_its_layer_is_said_and_heals(run, monkeypatch) -> None:
     root = root_of(run)
     with monkeypatch.context() as patch:
-        patch.setattr(outputs, "report_html", lambda summary, folder: "of another release")
+        patch.setattr(outputs, "page_of", lambda files: "of another release")
         with monkeypatch.context() as killed:
             killed.setattr(Workspace, "_add_layer", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
             assert barpc("report", run).code == 130
@@ -369,7 +369,6 @@ def test_files_of_a_project_that_was_moved_are_found_from_any_folder(finished, t
     monkeypatch.chdir(tmp_path)
     scene = read_scene(Path("elsewhere/project/out"))
     assert [shot.file for shot in scene.shots] == [str(project / "in" / f"view_0{k}.tif") for k in (0, 1)]
-    assert [shot.entry.rpc_source.path for shot in scene.shots] == [shot.file for shot in scene.shots]
     shutil.copytree(finished / "out", tmp_path / "alone")  # knows where it was made
     files_of_both = [shot.file for shot in read_scene(Path("alone")).shots]
     assert files_of_both == [str(finished / "in" / f"view_0{k}.tif") for k in (0, 1)]
@@ -385,9 +384,9 @@ def test_paths_of_a_run_of_an_older_release_are_as_it_wrote_them(finished, run, 
             view["rpc_source"].update(path=f"in/{Path(image).name}")
 
     edited(run, older)
+    seal(run)
     shots = read_scene(run).shots
     assert [shot.file for shot in shots] == images
-    assert [shot.entry.rpc_source.path for shot in shots] == ["in/view_00.tif", "in/view_01.tif"]
 
 
 def test_what_is_no_root_is_wrong_usage(run) -> None:
@@ -406,8 +405,6 @@ def test_a_run_of_an_older_release_is_one_line(run) -> None:
     assert len(said.err.splitlines()) == 1
     assert f"{run / SUMS}: missing" in said.err
     assert "release 0.3 or older" in said.err
-    assert barpc("report", run).code == 0
-    assert not (run / SUMS).exists()
     assert barpc("verify", run.parent / "nowhere").code == 1
 
 
