@@ -26,7 +26,7 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -40,19 +40,25 @@ from barpc.base import manifest
 from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Arrays, load_npz
-from barpc.base.manifest import SUMS
+from barpc.base.identity import Stamp
+from barpc.base.manifest import LAST, SUMS
 from barpc.base.memory import give_back, peak_memory
-from barpc.base.remote import is_url
-from barpc.base.safe_io import MAX_XML
+from barpc.base.sealed import (
+    CAREFUL,
+    NOTES,
+    STATE_FILE,
+    content_hash,
+    digest,
+    json_of_stamps,
+    noted_outputs,
+    read_state,
+)
 from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
 
-STATE_FILE, NOTES, LOCK, CACHE = "state.json", "outputs.jsonl", "lock", "cache"
-LAST = "summary.json"
-"""Output of a run that is written last: with it its folder is complete."""
+LOCK, CACHE = "lock", "cache"
 _FILES = (STATE_FILE, NOTES, LOCK)
-_CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
@@ -143,6 +149,7 @@ class Workspace:
         self._keep = frozenset(path.resolve() for path in keep)
         self._adds = adds
         self.outputs: dict[str, str] = {}
+        self._stamps: dict[str, Any] = {}  # of outputs and inputs, by their paths from the folder
         self._noted = False  # whether an output was on its way to its name
         self.stages: list[dict[str, Any]] = []
         self.worker_seconds = 0.0  # of CPU, spent for this run in other processes
@@ -160,9 +167,11 @@ class Workspace:
         shutil.rmtree(self.partial, ignore_errors=True)  # of a run that was killed
         self._earlier = noted_outputs(self.folder)  # again: another run may have ended in between
         # what is added to a finished run, or fails to be, leaves it finished: nothing else may replace its files
-        before = _read_state(self.folder) if adds else {}
+        before = read_state(self.folder) if adds else {}
         self._finished = before.get("status") == "done"
         self._home = str(before.get("folder", self.folder))
+        stamps = before.get("stamps")
+        self._stamps |= stamps if isinstance(stamps, dict) else {}
         stages = before.get("stages")
         self._before: list[Any] = stages if isinstance(stages, list) else []
         try:
@@ -177,7 +186,7 @@ class Workspace:
             raise OutputError(f"{self.folder}: is a file; give -o a folder")
         _refuse_odd(self.folder)
         present = {path.name for path in self.folder.iterdir()} if self.folder.is_dir() else set()
-        status = _read_state(self.folder).get("status")
+        status = read_state(self.folder).get("status")
         # without a state: nothing but our own folder is left by a run that was killed in its first moment
         unfinished = status in ("running", "failed") or (status is None and present <= {STATE})
         self._may_replace = overwrite or unfinished
@@ -298,12 +307,17 @@ class Workspace:
             self._refuse_foreign(name)
             if name not in self._named:
                 self._refuse_hiding([name])
-            sha = _content_hash(partial)
+            sha = content_hash(partial)
             if sha is None:
                 raise OutputError(f"{self.folder / name}: cannot be written (it is no regular file)")
             _append_record(self.folder, name, sha)
             self._noted = True
         self.outputs[name] = sha
+        self.note({name: Stamp.of((self.folder / name).lstat())})
+
+    def note(self, stamps: Mapping[str, Stamp]) -> None:
+        """Note the stamps of files, by their paths from the folder, which need not be hashed while they have them."""
+        self._stamps |= json_of_stamps(stamps)
 
     def write_text(self, name: str, text: str) -> Path:
         """Write a text output whole."""
@@ -350,6 +364,7 @@ class Workspace:
         told = "done" if self._finished else status
         stages = [*self._before, *self.stages]
         state = {"barpc": __version__, "status": told, "folder": self._home, "stages": stages, "outputs": outputs}
+        state["stamps"] = self._stamps
         with replacing(self.folder / STATE / STATE_FILE, overwrite=True, room=self.partial) as partial:
             partial.write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
         if status != "failed":
@@ -357,22 +372,6 @@ class Workspace:
 
 
 # --- which files are barpc's own --------------------------------------------------------------------------
-
-
-def _content_hash(path: Path) -> str | None:
-    """Return the sha256 of a regular file, no link; None for anything else, OSError where it cannot be read."""
-    if not stat.S_ISREG(path.lstat().st_mode):
-        return None
-    with open(os.open(path, os.O_RDONLY | _CAREFUL), "rb") as file:  # noqa: PTH123  (no link)
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _digest(path: Path) -> str | None:
-    """Hash as `_content_hash`; None also where there is nothing, or it cannot be read. No FIFO is waited for."""
-    try:
-        return _content_hash(path)
-    except (OSError, ValueError):
-        return None
 
 
 def _owns(folder: Path, name: str, sha: str) -> bool:
@@ -386,39 +385,9 @@ def _owns(folder: Path, name: str, sha: str) -> bool:
     try:
         inside = path.parent.resolve() == folder.resolve() / parts.parent
         below = [folder / parent for parent in parts.parents if str(parent) != "."]
-        return inside and not any((p / STATE).exists() for p in below) and _digest(path) == sha
+        return inside and not any((p / STATE).exists() for p in below) and digest(path) == sha
     except (OSError, ValueError):
         return False
-
-
-def _read_state(folder: Path) -> dict[str, Any]:
-    """Read state.json; nothing where it is missing, damaged, too large or no regular file."""
-    try:
-        state = json.loads(_bounded_text(folder / STATE / STATE_FILE))
-    except (ValueError, RecursionError):
-        return {}
-    return state if isinstance(state, dict) else {}
-
-
-def noted_outputs(folder: Path) -> dict[str, str]:
-    """Return the sha256 of every output as the commands in a folder noted it; none where its state was deleted.
-
-    Of two contents (a killed run's) it is that of the one there.
-    """
-    listed = _read_state(folder).get("outputs")
-    known: dict[str, dict[str, None]] = {}
-    pairs: list[Any] = list(listed.items()) if isinstance(listed, dict) else []
-    for line in _bounded_text(folder / STATE / NOTES).split("\n"):
-        with suppress(ValueError, RecursionError):  # the last line of a run that was killed
-            pairs.append(json.loads(line))
-    for pair in pairs:
-        if isinstance(pair, (list, tuple)) and [type(part) for part in pair] == [str, str]:
-            known.setdefault(pair[0], {})[pair[1]] = None
-    own = {}
-    for name, contents in known.items():
-        found = _digest(folder / name) if len(contents) > 1 else None
-        own[name] = found if found in contents else next(iter(contents))
-    return own
 
 
 def own_files(folder: Path) -> set[str]:
@@ -426,46 +395,11 @@ def own_files(folder: Path) -> set[str]:
     return {name for name, sha in noted_outputs(folder).items() if _owns(folder, name, sha)}
 
 
-def portable(path: str, folder: Path) -> str:
-    """Return a path relative to a run folder, with slashes, as its files hold it; a URL, or none, as it is."""
-    if not path or is_url(path):
-        return path
-    try:
-        return Path(os.path.relpath(Path(path).absolute(), folder.absolute())).as_posix()
-    except ValueError:  # on another drive
-        return path
-
-
-@dataclass(frozen=True)
-class Homes:
-    """Where `portable` paths start from: a run folder as it lies, and where it was made, if its state still says so."""
-
-    folder: Path
-    made: Path
-
-    @classmethod
-    def of(cls, folder: Path) -> Homes:
-        """Read the state of a run folder."""
-        return cls(folder, Path(str(_read_state(folder).get("folder", folder))))
-
-    def candidates(self, path: str) -> tuple[Path, Path]:
-        """Return where the file of a path may be."""
-        return self.folder / path, Path(os.path.normpath(self.made / path))
-
-    def located(self, path: str) -> str:
-        """Return the absolute path of a file; a URL, or none, as it is."""
-        if not path or is_url(path):
-            return path
-        here, there = self.candidates(path)
-        found = there if there.is_file() and not here.is_file() else here
-        return os.path.normpath(found.absolute())
-
-
 def _append_record(folder: Path, name: str, sha: str) -> None:
     path = folder / STATE / NOTES
     line = "\n" + json.dumps([name, sha]) + "\n"  # on a line of its own, whatever a killed run left
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | _CAREFUL, 0o666)
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | CAREFUL, 0o666)
         with open(descriptor, "ab") as file:  # noqa: PTH123  (no link)
             file.write(line.encode())
             file.flush()
@@ -496,13 +430,3 @@ def _is_odd(path: Path, found: os.stat_result) -> bool:
     # these are written to as they stand, and old releases of filelock empty what they open
     shared = path.name in (LOCK, NOTES) and found.st_nlink > 1
     return not stat.S_ISREG(found.st_mode) or shared or (path.name == LOCK and found.st_size > 0)
-
-
-def _bounded_text(path: Path) -> str:
-    try:
-        found = path.lstat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_XML:
-            return ""
-        return path.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return ""

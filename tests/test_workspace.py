@@ -18,15 +18,13 @@ from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
 from barpc.base.memory import peak_memory
+from barpc.base.sealed import noted_outputs
 from barpc.report.runfiles import table_path
 from barpc.workspace import (
-    Homes,
     Workspace,
     code_version,
     key_of,
-    noted_outputs,
     own_files,
-    portable,
     timed,
 )
 
@@ -683,28 +681,3 @@ def test_stages_and_the_place_of_a_run_outlast_what_is_added_to_it(tmp_path):
     with Workspace(tmp_path / "moved", adds=True):
         pass
     assert json.loads((tmp_path / "moved/.barpc/state.json").read_text())["stages"] == []
-
-
-def test_a_portable_path_is_that_of_its_file_from_wherever_the_folder_lies(tmp_path, monkeypatch):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in/a.tif").touch()
-    monkeypatch.chdir(tmp_path / "in")
-    with Workspace(tmp_path / "deep/run") as run:
-        run.write_text("a", "1")
-    folder = tmp_path / "deep/run"
-    for given in ("a.tif", "../in/a.tif", str(tmp_path / "in/a.tif")):
-        assert portable(given, folder) == "../../in/a.tif"
-    assert portable(str(folder / "x/y"), folder) == "x/y"
-    monkeypatch.chdir(tmp_path)
-    for seen in (folder, Path("deep/run")):
-        assert Homes.of(seen).located("../../in/a.tif") == str(tmp_path / "in/a.tif")
-    for same in ("", "https://a.org/a.tif", "s3://b/a.tif"):
-        assert portable(same, folder) == Homes.of(folder).located(same) == same
-    moved = folder.rename(tmp_path / "moved")  # alone: the file is where it was
-    assert Homes.of(moved).located("../../in/a.tif") == str(tmp_path / "in/a.tif")
-    (tmp_path / "b/c").mkdir(parents=True)
-    (tmp_path / "b/in").mkdir()
-    (tmp_path / "b/in/a.tif").touch()
-    both = moved.rename(tmp_path / "b/c/run")  # to where another lies: as a VRT would have it
-    assert Homes.of(both).located("../../in/a.tif") == str(tmp_path / "b/in/a.tif")
-    assert Homes.of(both).candidates("../../in/a.tif")[1] == tmp_path / "in/a.tif"

@@ -25,6 +25,8 @@ from barpc.base.errors import InputError
 from barpc.base.safe_io import SUMMARY, read_bytes
 
 SUMS = "SHA256SUMS"
+LAST = "summary.json"  # of a run: with it its folder is complete
+REPORT_FILE = "report.html"  # the one result that later commands make again
 _ENTRY = re.compile(r"(?:# )?([0-9a-f]{64})  ((?!/)[^\0-\x1f\\]+)")
 _AFTER = ", after "
 

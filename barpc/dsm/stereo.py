@@ -33,8 +33,7 @@ from barpc.cameras import open_camera
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import PRIOR_FILE
-from barpc.report.runfiles import read_summary, table_path
-from barpc.report.summary import Summary
+from barpc.report.finished import FinishedRun
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
@@ -307,14 +306,14 @@ class CameraErrors:
 class StereoBlock:
     """Views with their best cameras, their pairs, and the errors of the cameras where known.
 
-    `run`: the summary of their run.
+    `run`: theirs.
     """
 
     views: Sequence[View]
     groups: Groups
     source: str
     errors: CameraErrors | None = None
-    run: Summary | None = None
+    run: FinishedRun | None = None
 
 
 def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: str | None = None) -> StereoBlock:
@@ -339,13 +338,13 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
         if not shot.file:
             raise InputError(f"{folder}: {shot.name} has no pixels")
         grid, date = shot.name + CORRECTION, (shot.light.time or "")[:10]
-        camera = open_camera(folder / grid).model if grid in shot.entry.outputs else shot.rpc
+        camera = open_camera(scene.run.sealed.file(grid)).model if grid in shot.entry.outputs else shot.rpc
         views.append(View(shot.name, shot.file, shot.size, camera, scene.alt_range, date))
     ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
     worth = {
         (i, j): ties.get(frozenset((views[i].name, views[j].name)), 0.0) for i, j in combinations(range(len(views)), 2)
     }
-    there = None if minus is None else {view.name for view in read_summary(Path(minus)).views}
+    there = None if minus is None else {view.name for view in FinishedRun.open(minus).summary.views}
     parts = [[i for i, v in enumerate(views) if there is None or (v.name in there) == old] for old in (False, True)]
     if there is None:
         del parts[1]
@@ -356,9 +355,9 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
         )
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = [_ranked_pairs(views, worth, flagged, part) for part in parts]
-    errors = CameraErrors.of(BlockPrior.load(table_path(folder, PRIOR_FILE)), views)
+    errors = CameraErrors.of(BlockPrior.load(scene.run.table(PRIOR_FILE)), views)
     images = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
-    return StereoBlock(views, groups, images, errors, scene.summary)
+    return StereoBlock(views, groups, images, errors, scene.run)
 
 
 def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> StereoBlock:

@@ -51,9 +51,9 @@ from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.outputs import remake_report
 from barpc.pipeline.pictures import encoded
 from barpc.rasters.raster import BLOCK_SIZE, hashed, map_crs, open_raster
+from barpc.report.finished import FinishedRun
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key
-from barpc.report.summary import Summary
 from barpc.scene import View
 from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
@@ -124,7 +124,7 @@ def make_dsm(
             made = run.partial / "dsm.tif"
             found = grid.write(out, made, run, executor, progress)
             if folder is not None and block.run is not None and options.minus is None:
-                show_in_report(folder, block.run, block, grid.tiles, made, options.band)
+                show_in_report(block.run, block, grid.tiles, made, options.band)
             _publish(out, folder, options.overwrite, made)
     except NoSurfaceError:
         shutil.rmtree(room, ignore_errors=True)
@@ -292,8 +292,7 @@ def _common_ground(first: View, second: View, crs: CRS) -> Any:
 
 
 def show_in_report(
-    folder: Path,
-    run: Summary,
+    run: FinishedRun,
     block: StereoBlock,
     tiles: Sequence[tuple[tuple[int, int], Tile, Groups]],
     made: Path,
@@ -306,7 +305,7 @@ def show_in_report(
         with open_raster(made) as file:
             read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in tiles)
             tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
-        views = {i: _delivered(block.views[i], run.views[i].rpc_source) for pair in pairs for i in pair}
+        views = {i: _delivered(block.views[i], run, i) for pair in pairs for i in pair}
         before = surface_tile([(views[i], views[j]) for i, j in pairs], tile, band)
         shown: list[dict[str, object]] = []  # as `barpc.report.runfiles` reads them
         for cameras, (height, nmad) in (("delivered", before[:2]), ("corrected", after)):
@@ -315,20 +314,21 @@ def show_in_report(
             shown.append(row | encoded(shaded(height, tile.step)))
         seen = (block.views[i] for i in pairs[0])
         shown += [{"image": view.name, **encoded(draped(view, tile, after[0], band))} for view in seen]
-        text, name = json.dumps({"run": run_key(run), "shown": shown}), f"{FOLDER}/{SURFACE}"
-        with Workspace(folder, overwrite=True, names=[name], adds=True) as own:
+        text, name = json.dumps({"run": run_key(run.summary), "shown": shown}), f"{FOLDER}/{SURFACE}"
+        with Workspace(run.folder, overwrite=True, names=[name], adds=True) as own:
             own.write_text(name, text)
         if can_render():
-            remake_report(folder)
+            remake_report(run.folder)
     except (BarpcError, OSError) as error:
         logger.warning("the report does not show the surface: %s", error)
 
 
-def _delivered(view: View, source: Any) -> View:
-    """Return a view with the camera that came with its image, from its `source`."""
+def _delivered(view: View, run: FinishedRun, number: int) -> View:
+    """Return a view of a run with the camera that came with its image."""
+    source = run.summary.views[number].rpc_source
     if source is None:
         raise BarpcError(f"{view.name}: no file holds its delivered camera")
-    return replace(view, sensor=open_camera(view.path, camera=source.path).model)
+    return replace(view, sensor=open_camera(view.path, camera=run.input(source.path)).model)
 
 
 def draped(view: View, tile: Tile, height: F32, band: int) -> npt.NDArray[np.uint8]:

@@ -10,13 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from barpc.base.errors import InputError, OutputError
-from barpc.base.identity import fingerprint
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
 from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
 from barpc.export.pinholes import colmap, image_links
 from barpc.export.shots import Scene, read_scene, relative_link
-from barpc.workspace import Homes, Workspace
+from barpc.workspace import Workspace
 
 __all__ = ["TARGETS", "export_run"]
 
@@ -42,9 +41,9 @@ def export_run(
     files = TARGETS[target](scene, out.absolute())
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
     links = image_links(scene) if target == "colmap" else {}
-    homes = Homes.of(folder)
-    content = {homes.located(one.path): one.sha256 for one in scene.summary.inputs or ()} if links else {}
-    root = fingerprint(folder / SUMS).sha256 if (folder / SUMS).is_file() else ""  # none of an older release's run
+    read = scene.run.inputs
+    content = {shot.file: read[shot.entry.path].sha256 for shot in scene.shots if shot.entry.path in read}
+    known = {name: content[image] for name, image in links.items() if image in content}
     with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():
             with workspace.output(name) as partial:
@@ -52,7 +51,7 @@ def export_run(
         workspace.remove_stale()
         for name, image in links.items():
             _link_image(out / name, relative_link(image, (out / name).parent))
-        workspace.seal(root, {name: content[image] for name, image in links.items() if image in content})
+        workspace.seal(scene.run.sealed.root, known)
     return [out / name for name in files]
 
 
@@ -62,7 +61,7 @@ def _checked_scene(folder: Path, target: str, out: Path, alt_range: tuple[float,
     if alt_range is not None and not alt_range[0] < alt_range[1]:
         raise InputError(f"altitudes {alt_range}: the lower one first, in metres")
     plain_path(out.absolute())
-    scene = read_scene(folder, alt_range)
+    scene = read_scene(folder, alt_range, of_images=target != "points")
     if out.resolve() == folder.resolve():
         raise OutputError(f"{out}: the folder of the run; give the export one of its own")
     return scene

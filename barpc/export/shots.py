@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -15,9 +16,11 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
-from barpc.report.compare import written_rpc
+from barpc.rasters.raster import sources_of
+from barpc.report.compare import is_own, written_rpc
+from barpc.report.finished import FinishedRun
 from barpc.report.ranking import sure_pairs
-from barpc.report.runfiles import RunFiles, read_summary, read_tables
+from barpc.report.runfiles import RunFiles
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
@@ -25,7 +28,6 @@ from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
 from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid
 from barpc.sensor.rpc import RPC
-from barpc.workspace import Homes
 
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -76,14 +78,23 @@ class Shot:
 class Scene:
     """A run: its shots in order, its tie points (P, 3), lon, lat [deg], alt [m], and the altitudes that it spans."""
 
-    folder: Path
-    summary: Summary
+    run: FinishedRun
     shots: tuple[Shot, ...]
     points: Array
     tracks: IntArray
     alt_range: tuple[float, float]
     noise: float
     """Standard deviation of an observed coordinate [px], by what the adjustment left."""
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder, as given."""
+        return self.run.folder
+
+    @property
+    def summary(self) -> Summary:
+        """The run's summary."""
+        return self.run.summary
 
     @cached_property
     def origin(self) -> Array:
@@ -147,20 +158,22 @@ def relative_link(target: Path | str, folder: Path) -> str:
     return Path(os.path.relpath(absolute, folder.absolute())).as_posix()
 
 
-def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Scene:
+def read_scene(folder: Path, alt_range: tuple[float, float] | None = None, of_images: bool = True) -> Scene:
     """Read the scene of a run folder; altitudes [m] by its tie points unless they are given.
+
+    Without `of_images` these are not asked for, and nothing is known of their light.
 
     Raises
     ------
     InputError
-        No finished adjustment, without RPC files, or one whose files contradict each other.
+        No finished adjustment, without RPC files, or one whose files contradict each other or were changed since; with
+    `of_images`, an image that was.
     """
-    summary = read_summary(folder)
-    homes = Homes.of(folder)
-    summary = replace(summary, views=tuple(_with_absolute_paths(view, homes) for view in summary.views))
+    run = FinishedRun.open(folder)
+    summary = run.summary
     if summary.kind != "adjust":
         raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
-    files = read_tables(summary, folder)
+    files = run.tables()
     order = np.argsort(files.tracks, kind="stable")
     index, found = _positions_in(files.tracks[order], files.observations.track)
     counted = np.flatnonzero(found & files.observations.used)
@@ -173,7 +186,7 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
         _check_names(folder, view.name, view.path)
         if PurePath(view.name).name != view.name or view.name == "..":
             raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
-        rpc = written_rpc(folder, view)
+        rpc = written_rpc(run, view)
         if rpc is None:
             update = any(one.outputs for one in summary.views) and not view.outputs  # of a run that added images
             raise InputError(
@@ -181,21 +194,14 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None) -> Sc
                 + ", with --update" * update
             )
         rows = counted[starts[number] : starts[number + 1]]
-        light = read_acquisition(view.path, None if view.rpc_source is None else view.rpc_source.path)
+        file, light = str(run.sealed.located(view.path)), Acquisition()
+        if of_images:
+            file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
+            light = read_acquisition(file, source or None)
         seen = order[index[rows]], files.observations.xy[rows]
-        shots.append(Shot(view, rpc, view.path, _carrier(folder, view), light, *seen))
+        shots.append(Shot(view, rpc, file, _carrier(run, view), light, *seen))
     noise = _noise(files, counted)
-    return Scene(folder, summary, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
-
-
-def _with_absolute_paths(view: ViewEntry, homes: Homes) -> ViewEntry:
-    """Return the record of a view with absolute paths; release 0.3 wrote them so, or as seen from its folder."""
-    source = view.rpc_source
-    if PurePath(view.path).is_absolute():
-        return view
-    if source is not None:
-        source = replace(source, path=homes.located(source.path))
-    return replace(view, path=homes.located(view.path), rpc_source=source)
+    return Scene(run, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
 
 
 def _positions_in(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
@@ -216,12 +222,15 @@ def _scene_altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
     return float(np.floor(low - margin)), float(np.ceil(high + margin))
 
 
-def _carrier(folder: Path, view: ViewEntry) -> Path | None:
+def _carrier(run: FinishedRun, view: ViewEntry) -> Path | None:
     """Return the raster with the corrected RPC that a run wrote for an image, in its own folder."""
     for name in (view.name + end for row in CARRIERS.values() for end in row.suffixes):
-        path = (folder / name).absolute()
-        if name in view.outputs and path.is_file() and path.resolve().parent == folder.resolve():
-            return path
+        if name in view.outputs and is_own(run.folder, name):
+            path = run.sealed.file(name).absolute()
+            with suppress(InputError):  # of a run that was moved without its images, whose VRTs show none
+                for source in sources_of(path):
+                    run.ask(source)
+                return path
     return None
 
 

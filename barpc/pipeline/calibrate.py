@@ -16,7 +16,6 @@ from barpc import __version__
 from barpc.ba import Adjustment
 from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
 from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
-from barpc.base import manifest
 from barpc.base.atomic import refuse_existing, write_text
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, RpcError, listed, plain
@@ -26,10 +25,9 @@ from barpc.base.remote import is_url
 from barpc.base.safe_io import CALIBRATION, read_json
 from barpc.base.statistics import SURE
 from barpc.base.verb_options import CalibrateOptions
-from barpc.pipeline.earlier import Earlier, corrected_views, refuse_edited
+from barpc.pipeline.earlier import Earlier
 from barpc.report import Run
 from barpc.report.records import Record, column
-from barpc.report.runfiles import read_summary, read_tables, table_path
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
@@ -55,6 +53,7 @@ class _FinishedRun:
     """A finished run's information on a sensor, and the directions of its images' rows, clockwise from north [deg]."""
 
     folder: Path
+    root: str
     ties: SensorTies
     directions: Array
     images: int
@@ -119,14 +118,12 @@ _OpenedRun = tuple[Earlier, list[View], Sequence[SensorModel], list[str]]
 
 def _images_of(folder: Path) -> _OpenedRun:
     """Return a run, its images with their corrected cameras, and the sensors that they state."""
-    earlier, summary = Earlier.open(folder), read_summary(folder)
-    refuse_edited(folder, [table_path(folder, name) for name in ("observations.csv", "residuals.csv")])
-    names = {view.name for view in summary.views}
+    earlier = Earlier.open(folder)
+    names = {view.name for view in earlier.run.summary.views}
     images = [image for image in earlier.images if image.name in names]
-    gone = [image for image in images if image.choices is None or not (is_url(image.path) or Path(image.path).exists())]
-    if gone:
-        raise InputError(f"{gone[0].path}: an image of {folder} that cannot be opened any more; put it back")
-    views, sensors, sources = corrected_views(images, earlier.prior)
+    if gone := [image for image in images if image.choices is None]:
+        raise InputError(f"{gone[0].path or gone[0].name}: an image of {folder} whose camera came from no file")
+    views, sensors, sources = earlier.corrected(images, earlier.prior)
     return earlier, views, sensors, [source.sensor for source in sources]
 
 
@@ -148,7 +145,7 @@ def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
 def _finished_run(
     folder: Path, earlier: Earlier, views: list[View], sensors: Sequence[SensorModel], stated: list[str], name: str
 ) -> _FinishedRun:
-    tables = read_tables(read_summary(folder), folder)
+    tables = earlier.run.tables()
     own = [view.name for view, said in zip(views, stated, strict=True) if said in ("", name)]
     number = {view.name: i for i, view in enumerate(views)}
     used = [i for i, view in enumerate(views) if view.name in own]
@@ -163,9 +160,8 @@ def _finished_run(
     chosen = [views[i] for i in used]
     behind = [one.sensor if isinstance(one, Splined) else one for one in (sensors[i] for i in used)]
     ties = SensorTies.of(str(folder), chosen, tracks, behind, tables.points[:, :3])
-    return _FinishedRun(
-        folder, ties, np.array([_row_direction(v, s) for v, s in zip(chosen, behind, strict=True)]), len(used)
-    )
+    directions = np.array([_row_direction(v, s) for v, s in zip(chosen, behind, strict=True)])
+    return _FinishedRun(folder, earlier.run.sealed.root, ties, directions, len(used))
 
 
 def _row_direction(view: View, sensor: SensorModel) -> float:
@@ -177,7 +173,7 @@ def _row_direction(view: View, sensor: SensorModel) -> float:
 
 
 def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
-    roots = [manifest.read(one.folder)[0] for one in found]
+    roots = [one.root for one in found]
     twice = [one.folder for one, root in zip(found, roots, strict=True) if roots.count(root) > 1]
     if twice:
         raise InputError(f"{twice[0]}: is given twice")

@@ -23,29 +23,31 @@ import shapely
 from barpc.ba import BlockPrior
 from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.result import moved_px
-from barpc.base import manifest
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, fingerprint
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import is_url, location
 from barpc.base.safe_io import GEOJSON, parse_json, read_text
+from barpc.base.sealed import Sealed, portable
 from barpc.cameras import split_spec
 from barpc.pipeline.inputs import IMAGES, PRIOR_FILE, linked_names
 from barpc.pipeline.loading import Image, LoadedViews, image_path, load_views
 from barpc.pointio.names import unique_names
 from barpc.report import Run
+from barpc.report.finished import FinishedRun
 from barpc.report.outcome import Added
-from barpc.report.runfiles import table_path
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprints
 from barpc.tie.pairing.overlaps import Footprints, forests, overlapping_pairs, reach_of
-from barpc.workspace import Homes, portable
 
 logger = logging.getLogger(__name__)
 
 _OPENED_PER_NEIGHBOUR = 4  # times as many images as are matched are opened, the largest common areas: angles count, too
+
+
+CorrectedViews = tuple[list[View], Sequence[SensorModel], Sequence[Camera]]
 
 
 @dataclass(frozen=True)
@@ -71,31 +73,32 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Earlier:
-    """A finished run: its folder, its images and the prior of their cameras, in one order."""
+    """A finished run, its images and the prior of their cameras, in one order."""
 
-    folder: Path
+    run: FinishedRun
     images: tuple[Known, ...]
     prior: BlockPrior
 
     @classmethod
     def open(cls, folder: str | Path) -> Earlier:
         """Read a run folder; InputError where it is none, unfinished, of another release, or was changed since."""
-        folder = Path(folder)
-        if not (folder / "summary.json").exists():
-            raise InputError(f"{folder}: no summary.json, so no finished run; give the folder of one")
-        table, block = table_path(folder, IMAGES), table_path(folder, PRIOR_FILE)
-        if not block.exists():
-            raise InputError(f"{block}: missing, and later runs start from it: run the adjustment again")
-        if not table.exists():
-            raise InputError(f"{table}: missing, as of a run of another release: run the adjustment again")
-        refuse_edited(folder, (table, block))
+        run = FinishedRun.open(folder)
+        block, table = run.table(PRIOR_FILE), run.table(IMAGES)
+        if not (run.sealed.layers and block.exists()):
+            raise InputError(f"{block}: missing, or of another release, and later runs start from it: run the "
+                             "adjustment again")  # fmt: skip
         prior = BlockPrior.load(block)
         try:
             rows = parse_json(read_text(table, GEOJSON), GEOJSON.values)["images"]
-            images = {row["name"]: _parse_known(row, Homes.of(folder)) for row in rows}
-            return cls(folder, tuple(images[name] for name in prior.names), prior)
+            images = {row["name"]: _parse_known(row, run.sealed) for row in rows}
+            return cls(run, tuple(images[name] for name in prior.names), prior)
         except (msgspec.ValidationError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(f"{table}: damaged ({plain(error)}); run the adjustment again") from error
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder, as given."""
+        return self.run.folder
 
     @cached_property
     def number(self) -> dict[str, int]:
@@ -150,10 +153,40 @@ class Earlier:
                     f"{now}: give the same, or adjust all images together"
                 )
             if image is not None and _sha(inputs, str(source.path)) != image.camera_sha256:
-                raise InputError(
-                    f"{source.path}: is not the camera of {view.path} used by {self.folder} (it was changed "
-                    "since); put the former one back, or adjust all images together"
-                )
+                raise self._other_camera(view, source)
+
+    def _other_camera(self, view: View, source: Camera) -> InputError:
+        return InputError(
+            f"{source.path}: is not the camera of {view.path} used by {self.folder} (it was changed since); put the "
+            "former one back, or adjust all images together"
+        )
+
+    def found(self, image: Known) -> Known:
+        """Return an image with the places of its files now; InputError where no file has the content of one."""
+        choices, ask = image.choices, self.run.sealed.input
+        if choices is not None and "camera" in choices:
+            camera = ask(portable(choices["camera"], self.folder), image.camera_sha256)
+            choices = {**choices, "camera": camera}
+        return replace(image, path=ask(portable(image.path, self.folder), image.sha256, image.bytes), choices=choices)
+
+    def corrected(self, images: Sequence[Known], block: BlockPrior, hosts: Sequence[str] = ()) -> CorrectedViews:
+        """Return images of the run as delivered, their corrected cameras by a block, and where the delivered came from.
+
+        InputError where an image or its camera was changed since the run.
+        """
+        known = {image.path: image for image in map(self.found, images)}
+        specs = [image.spec for image in known.values()]
+        loaded = load_views(specs, min_views=1, distinct=False, hosts=hosts)
+        for view, source in zip(loaded.views, loaded.sources, strict=True):
+            sha = known[view.path].camera_sha256
+            if sha and str(source.path) != view.path and fingerprint(source.path).sha256 != sha:
+                raise self._other_camera(view, source)
+        views = [replace(view, name=known[view.path].name) for view in loaded.views]
+        number = {name: i for i, name in enumerate(block.names)}
+        rows = np.array([number[view.name] for view in views])
+        waves = block.waves(tuple(view.name for view in views))
+        unknowns = make_unknowns(views, block.model, block.drift, block.center[rows], waves)
+        return views, unknowns.corrected(block.params[rows], views), loaded.sources
 
     def moved(self, grown: BlockPrior) -> Array:
         """Return how far [px] the cameras of its images (n,) move, where a block has grown out of this."""
@@ -168,24 +201,18 @@ def _sha(inputs: Mapping[str, Input], path: str) -> str:
     return inputs[path].sha256 if path in inputs else ""
 
 
-def refuse_edited(folder: Path, files: Sequence[Path]) -> None:
-    """Raise InputError where files of a run folder have changed since the run wrote them."""
-    if not os.path.lexists(folder / manifest.SUMS):
-        raise InputError(f"{folder / manifest.SUMS}: missing, as of a run that was interrupted: run it again")
-    sums = {name: sha for layer in manifest.read(folder)[1] for name, sha in layer.files.items()}
-    for file in files:
-        if sums.get(file.relative_to(folder).as_posix()) != fingerprint(file).sha256:
-            raise InputError(f"{file}: was changed since the run wrote it (barpc verify {folder}): run it again")
-
-
-def _parse_known(row: Mapping[str, Any], homes: Homes) -> Known:
+def _parse_known(row: Mapping[str, Any], sealed: Sealed) -> Known:
     known = msgspec.convert(row, Known)
     if min(known.size) < 1:
         raise ValueError(f"{known.name}: no size")
     choices = known.choices
     if choices is not None and "camera" in choices:
-        choices = {**choices, "camera": homes.located(choices["camera"])}
-    return replace(known, path=homes.located(known.path), choices=choices)
+        choices = {**choices, "camera": _located(choices["camera"], sealed)}
+    return replace(known, path=_located(known.path, sealed), choices=choices)
+
+
+def _located(path: str, sealed: Sealed) -> str:
+    return path if not path or is_url(path) else str(sealed.located(path))
 
 
 def _outline_centre(outline: Sequence[tuple[float, float]]) -> tuple[float, float]:
@@ -224,7 +251,7 @@ def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier,
     given = load_views(fresh, **how)
     names = {image.name for image in old.values()}
     wanted = [i for i in _needed_images(given.views, options, earlier) if earlier.images[i].name not in names]
-    reached = [image for image in map(earlier.images.__getitem__, wanted) if _is_there(image, earlier.folder)]
+    reached = _present([earlier.images[i] for i in wanted], earlier)
     if not reached and not old:
         where = "its images there cannot be opened" if wanted else "none of its images meets the images given"
         raise InputError(f"{earlier.folder}: {where}, so there is nothing to add them to; give its images, too, or "
@@ -234,12 +261,21 @@ def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier,
     return _renamed(loaded, known, earlier)
 
 
-def _is_there(image: Known, folder: Path) -> bool:
-    if image.choices is not None and (is_url(image.path) or Path(image.path).is_file()):
-        return True
-    why = "no such file any more" if image.choices is not None else "its camera came from no file"
-    logger.warning("%s: an image of %s is not matched: %s; give its present path, too", image.path, folder, why)
-    return False
+def _present(images: Sequence[Known], earlier: Earlier) -> list[Known]:
+    """Return those of a run's images that are still there, with their places; InputError where one was changed."""
+    found, said = list[Known](), "%s: an image of %s is not matched: %s; give its present path, too"
+    for image in images:
+        try:
+            if image.choices is not None:
+                found.append(earlier.found(image))
+                continue
+            why = "its camera came from no file"
+        except InputError:
+            if os.path.lexists(image.path):
+                raise
+            why = "no such file any more"
+        logger.warning(said, image.path, earlier.folder, why)
+    return found
 
 
 def _needed_images(views: Sequence[View], options: RunOptions, earlier: Earlier) -> list[int]:
@@ -339,24 +375,9 @@ def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
 
 
 def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> CorrectedViews:
-    """Return the images that move beside those `done`, as `corrected_views` does."""
+    """Return the images that move beside those `done`, as `Earlier.corrected` does."""
     assert run.added is not None
     earlier: Earlier = run.earlier
     wanted = [earlier.images[earlier.number[name]] for name, _ in run.added.beyond if name not in done]
-    there = [image for image in wanted if _is_there(image, earlier.folder)]
-    return corrected_views(there, grown, hosts) if there else ([], (), ())
-
-
-CorrectedViews = tuple[list[View], Sequence[SensorModel], Sequence[Camera]]
-
-
-def corrected_views(images: Sequence[Known], block: BlockPrior, hosts: Sequence[str] = ()) -> CorrectedViews:
-    """Return images of a run as delivered, their corrected cameras by its block, and where the delivered came from."""
-    loaded = load_views([image.spec for image in images], min_views=1, distinct=False, hosts=hosts)
-    names = {image.path: image.name for image in images}
-    views = [replace(view, name=names[view.path]) for view in loaded.views]
-    number = {name: i for i, name in enumerate(block.names)}
-    rows = np.array([number[view.name] for view in views])
-    waves = block.waves(tuple(view.name for view in views))
-    unknowns = make_unknowns(views, block.model, block.drift, block.center[rows], waves)
-    return views, unknowns.corrected(block.params[rows], views), loaded.sources
+    there = _present(wanted, earlier)
+    return earlier.corrected(there, grown, hosts) if there else ([], (), ())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -18,9 +18,10 @@ from barpc.base.atomic import STATE
 from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.geodesy import Array
 from barpc.base.identity import fingerprint
-from barpc.base.manifest import SUMS, Layer
+from barpc.base.manifest import LAST, REPORT_FILE, SUMS, Layer
 from barpc.base.options import RunOptions
 from barpc.base.remote import is_url
+from barpc.base.sealed import Sealed
 from barpc.cameras import open_camera
 from barpc.fit import RpcFit
 from barpc.pipeline.executor import CachingExecutor, by_groups
@@ -28,8 +29,9 @@ from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, Written, grid_names
 from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
 from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
+from barpc.report.finished import FinishedRun
 from barpc.report.geopackage import geopackage
-from barpc.report.page import REPORT_FILE, REPORT_STAGE, can_render, report_html
+from barpc.report.page import REPORT_STAGE, can_render, page_of, report_html
 from barpc.report.records import json_form
 from barpc.report.runfiles import FOLDER, PICTURES, TABLES, gcps_geojson, map_layers, read_summary
 from barpc.report.summary import OutputEntry
@@ -41,7 +43,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
 from barpc.tie.tasks import Progress
-from barpc.workspace import LAST, Homes, Workspace, noted_outputs, own_files
+from barpc.workspace import Workspace, own_files
 
 MATCH_FILES = ("matches.csv", "matches.npz")
 GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
@@ -214,14 +216,8 @@ def prove(
     """
     if not os.path.lexists(folder / SUMS):
         read_summary(folder)
-        raise InputError(
-            f"{folder / SUMS}: missing: the run was interrupted, is of release 0.3 or older, or the file was removed; "
-            "without it nothing can be verified: run the adjustment again"
-        )
-    root, layers = manifest.read(folder)
-    noted, listed = noted_outputs(folder), {name: sha for layer in layers for name, sha in layer.files.items()}
-    # of what the first command wrote a later one makes the report again, and nothing else
-    listed |= {name: sha for name, sha in layers[0].files.items() if name != REPORT_FILE}
+    sealed = Sealed.open(folder)
+    root, layers, noted, listed = sealed.root, sealed.layers, sealed.noted, sealed.listed
     roots = {root, *(layer.after for layer in layers[1:])}
     tell = progress or (lambda *_: None)
     found = [*_roots(root, noted.get(SUMS, root), layers, expected)]
@@ -236,7 +232,7 @@ def prove(
             summary = read_summary(folder)
         except InputError as error:
             return [*found, Proved("input", LAST, MISSING, f"what it says of inputs: {error}")]
-        for number, one in enumerate(_inputs(summary, folder, places), start=1):
+        for number, one in enumerate(_inputs(summary, sealed, places), start=1):
             tell("verify inputs", number, len(summary.inputs or ()))
             found.append(one)
         found += _verify_cameras(summary, folder)
@@ -302,22 +298,18 @@ def _folder_files(folder: Path, parents: Set[str]) -> Iterator[tuple[str, Path |
         folders[:] = kept
 
 
-def _inputs(summary: Summary, folder: Path, places: Iterable[Path]) -> Iterator[Proved]:
-    homes = Homes.of(folder)
+def _inputs(summary: Summary, sealed: Sealed, places: Sequence[Path]) -> Iterator[Proved]:
     for one in summary.inputs or ():
         if is_url(one.path):
             yield Proved("input", one.path, NOT_ASKED, "on another host")
             continue
-        found = [_file_digest(path) for path in homes.candidates(one.path)]
-        if one.sha256 in found:
+        found = sealed.find(one.path, one.sha256, one.bytes, places, whole=True)
+        if found is None:
+            yield Proved("input", one.path, CHANGED if os.path.lexists(sealed.located(one.path)) else MISSING)
+        elif found in sealed.seen(one.path):
             yield Proved("input", one.path, SAME)
-            continue
-        elsewhere = (place / Path(one.path).name for place in (folder, folder.parent, *places))
-        moved = next((str(path) for path in elsewhere if _file_digest(path) == one.sha256), None)
-        if moved is not None:
-            yield Proved("input", one.path, MOVED, f"it is {moved}")
         else:
-            yield Proved("input", one.path, CHANGED if any(found) else MISSING)
+            yield Proved("input", one.path, MOVED, f"it is {found}")
 
 
 def _verify_cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
@@ -361,17 +353,16 @@ def remake_report(folder: Path | str) -> Path:
     Raises
     ------
     InputError
-        The folder holds no finished run.
+        The folder holds no finished run, or its summary or tables were changed since.
     OutputError
         There is a report.html that barpc did not write, or that was changed since.
     BarpcError
         jinja2 is not installed.
     """
-    folder = Path(folder)
-    summary = read_summary(folder)
+    run = FinishedRun.open(folder)
     if not can_render():
         raise BarpcError("the report needs jinja2: pip install 'barpc[report]'")
-    html = report_html(summary, folder)
-    with Workspace(folder, overwrite=True, names=[REPORT_FILE], adds=True) as workspace:
+    html = page_of(run.tables(of_page=True))
+    with Workspace(run.folder, overwrite=True, names=[REPORT_FILE], adds=True) as workspace:
         workspace.write_text(REPORT_FILE, html)
-    return folder / REPORT_FILE
+    return run.folder / REPORT_FILE

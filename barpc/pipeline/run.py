@@ -26,6 +26,7 @@ from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
 from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
+from barpc.base.sealed import portable
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.calibrate import calibrated, calibrations_of, common_errors, refuse_strange
@@ -68,7 +69,7 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work
-from barpc.workspace import Workspace, portable, timed
+from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
 
@@ -180,6 +181,8 @@ def adjust(
         run = replace(run, out_dir=str(out_dir), stages=workspace.stages)
         summary = _summed_up(run, images, inputs, workspace, work)
         workspace.remove_stale()
+        for one in chain.from_iterable(given.every() for given in inputs.values()):
+            workspace.note({portable(one.path, workspace.folder): one.stamp} if one.stamp is not None else {})
         root = workspace.seal()
     views = [replace(view, sensor=one) for view, one in zip(run.views, run.after or run.before, strict=True)]
     return AdjustResult(_as_given(views, images, options), run, summary, root)

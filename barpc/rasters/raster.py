@@ -198,17 +198,21 @@ def transformed(transform: Affine, x: Any, y: Any) -> tuple[Any, Any]:
 def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
-        if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
-            return identity.fingerprint(path)
         whole = identity.fingerprint(path)  # before it is read: what it shows is what was hashed
-        files = dict.fromkeys(source.file for source in read_vrt(Path(path)).sources)
-        found = replace(whole, parts=tuple(identity.fingerprint(file) for file in files))
+        found = replace(whole, parts=tuple(map(identity.fingerprint, sources_of(path))))
     except OSError as error:
         if isinstance(error, ImageError):
             raise
         raise ImageError(f"{path}: cannot be read ({error.strerror or error})") from error
     found.ask()
     return found
+
+
+def sources_of(path: PathOrUrl | str) -> tuple[PathOrUrl, ...]:
+    """Return the files that a VRT shows; none for another raster. ImageError where it cannot be read."""
+    if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
+        return ()
+    return tuple(dict.fromkeys(source.file for source in read_vrt(Path(path)).sources))
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[PathOrUrl, str]:

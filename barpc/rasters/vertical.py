@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -108,6 +109,7 @@ _OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
 """15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
 _IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
 GEOIDS = (*_OWN, *_IN_PROJ)
+WORDS = (NO_GEOID, ELLIPSOIDAL, *GEOIDS)
 
 
 def geoid_file(given: str | os.PathLike[str]) -> str:
@@ -136,6 +138,12 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
         f"geoid {name}: no {' or '.join(_IN_PROJ[name])} in PROJ's folders ({', '.join(map(str, folders)) or 'none'}); "
         f"get it by 'projsync --file {first}' or from https://cdn.proj.org/{first} and give its path, or take egm96"
     )
+
+
+def geoid_places() -> Iterator[Path]:
+    """Yield the folders in which geoids are that are given by their names."""
+    yield from (path.parent for path in _OWN.values())
+    yield from proj_folders()
 
 
 def proj_folders() -> list[Path]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,9 @@ from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
+from barpc.report.finished import FinishedRun
 from barpc.report.quality_checks import enu
 from barpc.report.records import json_form
-from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
 from barpc.report.summary.words import median, metres
@@ -38,8 +39,8 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     sentences.
     InputError where a folder holds no finished run, or they have no image in common.
     """
-    folders = (Path(folder_a), Path(folder_b))
-    runs = (read_summary(folders[0]), read_summary(folders[1]))
+    opened = FinishedRun.open(folder_a), FinishedRun.open(folder_b)
+    folders, runs = (opened[0].folder, opened[1].folder), (opened[0].summary, opened[1].summary)
     a, b = ({view.name: view for view in run.views} for run in runs)
     same = [name for name in a if name in b and not _other_file(a[name].path, b[name].path, runs)]
     if not same:
@@ -55,8 +56,8 @@ def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
     comparison = {
         "a": str(folder_a),
         "b": str(folder_b),
-        "views": [_view(folders, (a[name], b[name])) for name in same],
-        "moved_enu_m": _scene_motion(folders, [(a[name], b[name]) for name in same], runs[0].altitude_m),
+        "views": [_view(opened, (a[name], b[name])) for name in same],
+        "moved_enu_m": _scene_motion(opened, [(a[name], b[name]) for name in same], runs[0].altitude_m),
         "pairs": _compared_pairs(*runs),
         "only_a": [name for name in a if name not in same],
         "only_b": [name for name in b if name not in same],
@@ -91,8 +92,8 @@ def _other_file(path_a: str, path_b: str, runs: tuple[Summary, Summary]) -> bool
     return None not in content and content[0] != content[1]
 
 
-def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dict[str, Any]:
-    whole, relative = _rpc_difference(folders, views)
+def _view(runs: tuple[FinishedRun, FinishedRun], views: tuple[ViewEntry, ViewEntry]) -> dict[str, Any]:
+    whole, relative = _rpc_difference(runs, views)
     return {
         "name": views[0].name,
         "status": [view.status for view in views],
@@ -103,9 +104,9 @@ def _view(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> dic
     }
 
 
-def _rpc_difference(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntry]) -> list[float | None]:
+def _rpc_difference(runs: tuple[FinishedRun, FinishedRun], views: tuple[ViewEntry, ViewEntry]) -> list[float | None]:
     """Return the largest distance between both RPCs [px], and that without their mean shift; None: not known."""
-    first, second = map(written_rpc, folders, views)
+    first, second = map(written_rpc, runs, views)
     if first is None or second is None:
         return [None, None]
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
@@ -118,14 +119,14 @@ def _rpc_difference(folders: tuple[Path, Path], views: tuple[ViewEntry, ViewEntr
 
 
 def _scene_motion(
-    folders: tuple[Path, Path], views: Sequence[tuple[ViewEntry, ViewEntry]], altitude: float | None
+    runs: tuple[FinishedRun, FinishedRun], views: Sequence[tuple[ViewEntry, ViewEntry]], altitude: float | None
 ) -> Array | None:
     """Return the median motion (3,) of the ground from the first run to the second, east, north, up [m].
 
     Ground points of a grid in each image are projected with the RPCs of the first run, and intersected with those of
     the second, where two images or more show them.
     """
-    rpcs = [[written_rpc(folder, view) for folder, view in zip(folders, pair, strict=True)] for pair in views]
+    rpcs = [[written_rpc(run, view) for run, view in zip(runs, pair, strict=True)] for pair in views]
     both = [(pair[0].size, *found) for pair, found in zip(views, rpcs, strict=True) if None not in found]
     if len(both) < 2 or altitude is None:
         return None
@@ -145,16 +146,22 @@ def _scene_motion(
     return np.asarray(np.median(moved, axis=0)) if len(moved) else None
 
 
-def written_rpc(folder: Path, view: ViewEntry) -> RPC | None:
-    """Return the first RPC that can be read of those that a run wrote for a view, in its own folder."""
+def written_rpc(run: FinishedRun, view: ViewEntry) -> RPC | None:
+    """Return the first RPC of those that a run wrote for a view; InputError where it was changed since."""
     for name in view.outputs:
-        try:
-            path = (folder / name).resolve()
-            if path.parent == folder.resolve() and path.is_file():
+        if is_own(run.folder, name):
+            path = run.sealed.file(name)
+            with suppress(BarpcError, OSError):
                 return read_rpc(path)
-        except (BarpcError, OSError, ValueError):  # ValueError: a zero byte in the name
-            continue
     return None
+
+
+def is_own(folder: Path, name: str) -> bool:
+    """Return whether a name is one of a file right in a folder."""
+    try:
+        return (folder / name).resolve().parent == folder.resolve()
+    except (OSError, ValueError):  # a name that is too long, a zero byte
+        return False
 
 
 def _compared_pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:

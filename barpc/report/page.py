@@ -40,7 +40,6 @@ from barpc.report.summary.words import NAMED, largest
 from barpc.report.verdict import VERDICT_SENTENCES, sentences
 from barpc.scene import connected_groups
 
-REPORT_FILE = "report.html"
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 _POSITION = "east", "north", "up"  # motions of the scene as a whole
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
@@ -57,7 +56,12 @@ def report_html(summary: Summary, folder: Path | str) -> str:
 
     InputError where a table is missing or damaged.
     """
-    files = read_tables(summary, Path(folder))
+    return page_of(read_tables(summary, Path(folder)))
+
+
+def page_of(files: RunFiles) -> str:
+    """Return the page of a run from its files."""
+    summary = files.summary
     shown = [section for make in SECTIONS if (section := make(files)) is not None]
     if len(summary.views) > TABLE_ROWS_SHOWN:
         shown = [replace(section, folded=section.key not in _OPEN) for section in shown]

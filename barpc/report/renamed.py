@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from barpc.base.errors import BarpcWarning, InputError
+from barpc.base.safe_io import SUMMARY, read_json
 from barpc.report.summary import SCHEMA
 
 OLD_SCHEMA = 2
@@ -48,6 +49,12 @@ RENAMED_VALUES = {
 """Record and key -> its old values and the new ones; a colon and an image may follow."""
 
 
+def is_old(path: Path) -> bool:
+    """Return whether a summary.json is of schema 2, whose runs have no SHA256SUMS."""
+    found = read_json(path, SUMMARY)
+    return isinstance(found, dict) and type(found.get("schema")) is int and found["schema"] == OLD_SCHEMA
+
+
 def with_new_names(found: Any, path: Path) -> Any:
     """Return the parsed summary.json of schema 2 under the names of schema 3, changed in place; others untouched.
 
@@ -67,7 +74,8 @@ def with_new_names(found: Any, path: Path) -> Any:
                 record[key] = values.get(kind, kind) + colon + image
     found["schema"] = SCHEMA
     warnings.warn(
-        f"{path}: has the names of release 0.3, which the next release will not read: run the adjustment again",
+        f"{path}: has the names of release 0.3, which the next release will not read, and nothing proves it: run the "
+        "adjustment again",
         BarpcWarning,
         stacklevel=2,
     )

@@ -24,6 +24,7 @@ import shapely
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plain
 from barpc.base.geodesy import Array, feature_collection, geojson_feature
+from barpc.base.manifest import LAST
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import cell, from_cell
 from barpc.report.geopackage import Layer, point_shapes
@@ -264,7 +265,7 @@ class RunFiles:
     observations: ObservationTable
     points: Array
     tracks: IntArray
-    outlines: Sequence[Sequence[Array]]
+    outlines: Sequence[Sequence[Array]] = ()
     reliefs: Sequence[ReliefWindow] = ()
     draped: Sequence[Draped] = ()
     thumbnails: Sequence[Draped] = ()
@@ -282,9 +283,9 @@ def read_summary(folder: Path) -> Summary:
     Schema 2 is read under its new names, with a warning; keys of no record are named in one, and passed over.
     InputError where there is none, it does not parse, or has another release's schema.
     """
-    path = folder / "summary.json"
+    path = folder / LAST
     if not path.exists():
-        raise InputError(f"{folder}: no summary.json, so no finished run")
+        raise InputError(f"{folder}: no {LAST}, so no finished run; give the folder of one")
     found = with_new_names(read_json(path, SUMMARY), path)
     version = found.get("schema") if isinstance(found, dict) else None
     if version != SCHEMA:
@@ -318,14 +319,24 @@ def _unknown_keys(found: Any, read: Any, place: str = "") -> Iterator[str]:
                 yield place + key
 
 
-def read_tables(summary: Summary, folder: Path) -> RunFiles:
-    """Read the tables of a run folder for a given summary. InputError names a table that is missing or damaged."""
+TIE_TABLES = "observations.csv", "residuals.csv"
+PAGE_TABLES = *TIE_TABLES, "footprints.geojson", SURFACE, PICTURES
+
+
+def read_tables(summary: Summary, folder: Path, of_page: bool = True) -> RunFiles:
+    """Read the tables of a run folder for a given summary, of tie points and `of_page`: outlines and pictures.
+
+    InputError names a table that is missing or damaged.
+    """
     names = [view.name for view in summary.views]
-    outlines = _parsed(place := table_path(folder, "footprints.geojson"), read_text(place, GEOJSON), _parse_outlines)
-    if len(outlines) != len(names):
-        raise InputError(f"{place}: {len(outlines)} outlines of {len(names)} images")
-    observations = _parse_table(table_path(folder, "observations.csv"), partial(_parse_observations, names=names))
-    points, tracks = _parse_table(table_path(folder, "residuals.csv"), _parse_points)
+    ties, outlines_file = (table_path(folder, name) for name in TIE_TABLES), table_path(folder, PAGE_TABLES[2])
+    outlines = _parsed(outlines_file, read_text(outlines_file, GEOJSON), _parse_outlines) if of_page else None
+    if outlines is not None and len(outlines) != len(names):
+        raise InputError(f"{outlines_file}: {len(outlines)} outlines of {len(names)} images")
+    observations = _parse_table(next(ties), partial(_parse_observations, names=names))
+    points, tracks = _parse_table(next(ties), _parse_points)
+    if outlines is None:
+        return RunFiles(summary, observations, points, tracks)
     surface = table_path(folder, SURFACE)
     made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
     of_run = partial(_parse_surface, run=run_key(summary))

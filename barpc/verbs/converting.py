@@ -23,6 +23,7 @@ from barpc.fit.points import Sample, widened
 from barpc.pipeline.verify_outputs import Reading, unverified, verify, verify_grid
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster
+from barpc.report.finished import FinishedRun
 from barpc.rpcio import (
     CARRIERS,
     FORMATS,
@@ -305,7 +306,10 @@ def windows_of(
 
 def _cameras(files: Sequence[Path], rpcs: Path) -> list[Camera]:
     """Return the cameras of images in a file or a folder of RPCs, for images of that size."""
-    of = [open_camera(find_rpc(rpcs, file) if rpcs.is_dir() else rpcs) for file in files]
+    holders = [find_rpc(rpcs, file) if rpcs.is_dir() else rpcs for file in files]
+    if rpcs.is_dir():
+        FinishedRun.refuse_edited(rpcs, holders, of_images=False)
+    of = [open_camera(holder) for holder in holders]
     return [replace(camera, size=_image_size(file)) for camera, file in zip(of, files, strict=True)]
 
 

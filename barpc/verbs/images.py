@@ -85,6 +85,9 @@ def _matching_files(name: str) -> list[str]:
             if find_annotation(path):
                 return [name]
             raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
+        from barpc.report.finished import FinishedRun  # after all: most images are given by their names
+
+        FinishedRun.refuse_edited(path, map(Path, rasters), of_images=True)
         return rasters
     if os.path.lexists(name):
         return [name]

@@ -26,18 +26,20 @@ from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
 from barpc.base.verb_options import OrthoOptions
 from barpc.cameras import ImageLike, open_camera
-from barpc.export.shots import Scene, read_scene
+from barpc.export.shots import read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
 from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
+from barpc.rasters.vertical import WORDS, geoid_places
+from barpc.report.finished import FinishedRun
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
 from barpc.tie.tasks import Progress
 from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
-from barpc.workspace import Homes, Workspace
+from barpc.workspace import Workspace
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
 _FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
@@ -100,9 +102,10 @@ def ortho(
     if (run := run_folder(given)) is None:
         cameras, files = zip(*((open_camera(image), Path(place_of(image))) for image in every(given)), strict=True)
     else:
-        cameras, heights = _of_run(scene := read_scene(run))
-        files = tuple(Path(camera.path) for camera in cameras)
-        terrain = heights if terrain is None and alt is None else terrain
+        scene = read_scene(run)
+        files = tuple(Path(shot.file) for shot in scene.shots)
+        cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
+        terrain = _terrain_of(scene.run) if terrain is None and alt is None else terrain
         alt = scene.summary.altitude_m if alt is None else alt
     middles = [one.model.localize((np.array(one.extent) - 1) / 2, np.array(one.altitude)) for one in cameras]
     sides = [float(ground_sample_distance(one.rpc, at)[1]) for one, at in zip(cameras, middles, strict=True)]
@@ -118,17 +121,21 @@ def ortho(
     return done
 
 
-def _of_run(scene: Scene) -> tuple[tuple[Camera, ...], Dem | None]:
-    """Return the corrected cameras of a run, used at its altitudes, and the terrain that it was made with."""
-    given: Any = scene.summary.options or {}
-    at = Homes.of(scene.folder).located
+def _terrain_of(run: FinishedRun) -> Dem | None:
+    """Return the terrain that a run was made with; InputError where a DEM or geoid of it is not what it was."""
+    given: Any = run.summary.options or {}
     dems = [given["dem"]] if isinstance(given.get("dem"), str) else given.get("dem") or ()
-    taken = [
-        name and (at(name) if Path(at(name)).exists() else Path(name).name)
-        for name in map(given.get, ("geoid", "heights"))
-    ]
-    cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
-    return cameras, Dem.open([at(name) for name in dems], *taken) if dems else None
+    if not dems:
+        return None
+    said = [given.get("geoid"), given.get("heights")]
+    for k, name in enumerate(said):
+        word = name and Path(name).name.lower()  # which runs keep as a path, too
+        said[k] = word if word in WORDS else name and run.input(name, geoid_places())
+    terrain = Dem.open([run.input(name) for name in dems], *said)
+    for part in terrain.parts:
+        if part.geoid is not None:
+            run.ask(part.geoid.path)
+    return terrain
 
 
 @dataclass(frozen=True)

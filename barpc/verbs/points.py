@@ -223,9 +223,9 @@ def _altitudes_beside(path: Path) -> dict[str, float]:
 @lru_cache(maxsize=8)
 def _run_altitudes(folder: Path, _changed: int) -> dict[str, float]:
     """Return the files that a run wrote for its images into a folder, and the median altitude of its tie points [m]."""
-    from barpc.report.runfiles import read_summary  # with all that a run has to say: as long again as the cameras take
+    from barpc.report.finished import FinishedRun  # with all of it: as long again as the cameras take
 
-    summary = read_summary(folder)
+    summary = FinishedRun.open(folder).summary
     alt = summary.altitude_m
     return {} if alt is None else {name: alt for view in summary.views for name in view.outputs}
 

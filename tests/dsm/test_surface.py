@@ -13,6 +13,7 @@ import pytest
 import rasterio
 
 from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.sealed import Sealed
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.dsm import NoSurfaceError, make_dsm, stereo
@@ -20,6 +21,7 @@ from barpc.dsm import surface as surface_module
 from barpc.dsm.stereo import CORRECTION, PRIOR_FILE, Tile, _ranked_pairs, block_of_images
 from barpc.dsm.surface import _delivered, draped, show_in_report
 from barpc.pipeline import load_views
+from barpc.report.finished import FinishedRun
 from barpc.report.runfiles import run_key
 from barpc.rpcio import read_rpc
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
@@ -186,14 +188,18 @@ def test_pairs_with_a_flagged_image_come_after_the_others_and_a_line_says_so(ren
 
 
 def test_a_surface_by_the_delivered_cameras_is_by_those_that_came_with_the_images(rendered):
+
+    def of_source(source):
+        return SimpleNamespace(summary=SimpleNamespace(views=[SimpleNamespace(rpc_source=source)]), input=str)
+
     view = load_views(rendered.paths).views[0]
     moved = replace(view, sensor=view.sensor.crop(10.0, 0.0))
     at = np.array([5.0, 5.0])
     for now, path in ((view, rendered.paths[0]), (moved, rendered.paths[0])):
-        came = _delivered(now, SimpleNamespace(path=path)).sensor
+        came = _delivered(now, of_source(SimpleNamespace(path=path)), 0).sensor
         np.testing.assert_array_equal(came.localize(at, 100.0), view.sensor.localize(at, 100.0))
     with pytest.raises(BarpcError, match=f"{view.name}: no file holds its delivered camera"):
-        _delivered(view, None)
+        _delivered(view, of_source(None), 0)
 
 
 @pytest.mark.parametrize(("minus", "shown"), [(None, ["run/dsm.tif"]), ("date", [])])
@@ -211,7 +217,7 @@ def test_the_report_of_a_run_shows_its_surface_but_no_change_and_images_have_non
     monkeypatch.setattr(surface_module, "block_of_run", block)
     monkeypatch.setattr(surface_module, "block_of_images", block)
     monkeypatch.setattr(surface_module, "Grid", lambda block, options: SimpleNamespace(tiles=[], write=write))
-    monkeypatch.setattr(surface_module, "show_in_report", lambda folder, run, *rest: told.append(f"{run}/dsm.tif"))
+    monkeypatch.setattr(surface_module, "show_in_report", lambda run, *rest: told.append(f"{run}/dsm.tif"))
     assert make_dsm(tmp_path / "run", tmp_path / "dsm.tif", replace(OPTIONS, minus=minus)) == "surface"
     assert told == shown
     assert make_dsm(["a.tif", "b.tif"], tmp_path / "images.tif", OPTIONS) == "surface"
@@ -381,10 +387,11 @@ def run_of_shots(monkeypatch, tmp_path):
 
     def made(shots, pairs=(), minus=None, there=()):
         pairs = [SimpleNamespace(a=a, b=b, num_matches=num) for a, b, num in pairs]
-        scene = SimpleNamespace(shots=shots, alt_range=(5.0, 9.0), summary=SimpleNamespace(pairs=pairs))
+        opened = SimpleNamespace(sealed=SimpleNamespace(file=tmp_path.joinpath), table=tmp_path.joinpath)
+        scene = SimpleNamespace(shots=shots, alt_range=(5.0, 9.0), summary=SimpleNamespace(pairs=pairs), run=opened)
         earlier = SimpleNamespace(views=[SimpleNamespace(name=name) for name in there])
         monkeypatch.setattr(stereo, "read_scene", lambda folder, alts: scene)
-        monkeypatch.setattr(stereo, "read_summary", lambda folder: earlier)
+        monkeypatch.setattr(stereo.FinishedRun, "open", lambda folder: SimpleNamespace(summary=earlier))
         return stereo.block_of_run(tmp_path, None, minus)
 
     monkeypatch.setattr(stereo, "open_camera", lambda path: SimpleNamespace(model=path.name))
@@ -450,15 +457,17 @@ def test_the_report_shows_the_tile_with_most_heights_by_both_kinds_of_cameras(tm
         return before, np.full((4, 4), np.nan, np.float32), None
 
     monkeypatch.setattr(surface_module, "surface_tile", surface)
-    monkeypatch.setattr(surface_module, "_delivered", lambda view, source: f"{view.name}/{source}")
+    monkeypatch.setattr(
+        surface_module, "_delivered", lambda view, run, number: f"{view.name}/{run.summary.views[number].rpc_source}"
+    )
     monkeypatch.setattr(surface_module, "draped", lambda view, tile, height, band: np.full((4, 4), 9, np.uint8))
     monkeypatch.setattr(surface_module, "remake_report", remade.append)
     monkeypatch.setattr(surface_module, "can_render", lambda: True)
     folder = tmp_path / "run"
     with Workspace(folder):
         pass
-    given = (run, SimpleNamespace(views=views), tiles, tmp_path / "dsm.tif", 3)
-    show_in_report(folder, *given)
+    given = (FinishedRun(Sealed.unproved(folder), run), SimpleNamespace(views=views), tiles, tmp_path / "dsm.tif", 3)
+    show_in_report(*given)
     told = json.loads((folder / "tables/surface.json").read_text())
     assert told["run"] == run_key(run)
     one, two, *images = told["shown"]
@@ -470,9 +479,9 @@ def test_the_report_shows_the_tile_with_most_heights_by_both_kinds_of_cameras(tm
         assert row["size"] == [4, 4]
     assert remade == [folder]
     monkeypatch.setattr(surface_module, "can_render", lambda: False)
-    show_in_report(folder, *given)
+    show_in_report(*given)
     assert remade == [folder]
     monkeypatch.setattr(surface_module, "_delivered", _delivered)
     run.views[2].rpc_source = None
-    show_in_report(folder, *given)
+    show_in_report(*given)
     assert "the report does not show the surface: c: no file holds its delivered camera" in caplog.text

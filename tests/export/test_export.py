@@ -18,6 +18,7 @@ from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
+from tests.sealing import seal
 
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
@@ -135,6 +136,7 @@ def in_one_folder(run: Path, tmp_path: Path, folder: str = "/images") -> Path:
     for view in summary["views"]:
         view["path"] = f"{folder}/{view['name']}.tif"
     (copy / "summary.json").write_text(json.dumps(summary))
+    seal(copy)
     return copy
 
 
@@ -212,6 +214,7 @@ def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
     run = in_one_folder(southern, tmp_path)
     summary = (run / "summary.json").read_text()
     (run / "summary.json").write_text(summary.replace('.tif"', ' a.tif"'))
+    seal(run)
     with pytest.raises(InputError, match="space"):
         export_run(run, "colmap", tmp_path / "out")
 
@@ -310,6 +313,7 @@ def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
     summary = read(run / "summary.json")
     summary["views"][0]["path"] = str(out / "config.json")
     (run / "summary.json").write_text(json.dumps(summary))
+    seal(run)
     with pytest.raises(OutputError, match=r"config\.json: is an input and is never written"):
         export_run(run, "s2p", out)
 
@@ -328,6 +332,7 @@ def test_a_run_that_lies_about_names_writes_and_reads_nothing_outside(name, sout
     (run / "summary.json").write_text(text)
     table = (run / "tables/observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
     (run / "tables/observations.csv").write_text(table)
+    seal(run)
     with pytest.raises((InputError, OutputError)):
         export_run(run, "satnerf", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
@@ -341,6 +346,7 @@ def test_rpc_files_are_taken_from_the_run_s_own_folder_alone(southern, tmp_path)
     (run / "link_RPC.TXT").symlink_to(tmp_path / "elsewhere_RPC.TXT")
     view["outputs"] = {"link_RPC.TXT": {}, "..": {}}
     (run / "summary.json").write_text(json.dumps(summary))
+    seal(run)
     with pytest.raises(InputError, match="no RPC file"):
         export_run(run, "s2p", tmp_path / "out")
 
@@ -349,6 +355,7 @@ def test_a_run_without_an_adjustment_says_so(southern, tmp_path):
     run = shutil.copytree(southern, tmp_path / "run")
     text = (run / "summary.json").read_text()
     (run / "summary.json").write_text(text.replace('"kind": "adjust"', '"kind": "match"'))
+    seal(run)
     with pytest.raises(InputError, match="without corrected cameras"):
         export_run(run, "s2p", tmp_path / "out")
     with pytest.raises(InputError, match=r"no summary\.json"):

@@ -15,6 +15,7 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.sealed import Sealed
 from barpc.export import files as made_of
 from barpc.export import pinholes
 from barpc.export import shots as scene
@@ -45,6 +46,10 @@ def with_shot(of: Scene, **fields: Any) -> Scene:
 
 
 # --- the scene --------------------------------------------------------------------------------------------
+
+
+def with_summary(south: Scene, **values: Any) -> Scene:
+    return replace(south, run=replace(south.run, summary=replace(south.summary, **values)))
 
 
 def test_a_scene_holds_what_counts_of_its_run(south, southern):
@@ -150,7 +155,7 @@ def test_pairs_for_stereo_have_an_angle_between_two_and_fifty_degrees(south):
             replace(south.summary.pairs[0], a=a, b=b, convergence_deg=angle)
             for (a, b), angle in zip(names, angles, strict=False)
         ]
-        return pairs_of(replace(south, summary=replace(south.summary, pairs=tuple(of))))
+        return pairs_of(with_summary(south, pairs=tuple(of)))
 
     assert pairs(2.0, 50.0, 1.9, 50.1) == [("A", "B"), ("A", "C")]
     assert pairs(1.0, None) == [("A", "B"), ("A", "C")]  # better than none
@@ -161,14 +166,14 @@ def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, sou
     names = [f"{view.name}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
     for name in names:
         (tmp_path / name).write_text("x")
-    assert scene._carrier(tmp_path, view) is None  # the run says nothing of it
+    run = replace(south.run, sealed=Sealed.unproved(tmp_path))
+    assert scene._carrier(run, view) is None  # the run says nothing of it
     for name in names:
-        assert scene._carrier(tmp_path, replace(view, outputs={name: {}})) == tmp_path / name
+        assert scene._carrier(run, replace(view, outputs={name: {}})) == tmp_path / name
         (tmp_path / name).unlink()
-        assert scene._carrier(tmp_path, replace(view, outputs={name: {}})) is None
     (tmp_path.parent / "outside.vrt").write_text("x")
     (tmp_path / names[0]).symlink_to(tmp_path.parent / "outside.vrt")
-    assert scene._carrier(tmp_path, replace(view, outputs={names[0]: {}})) is None
+    assert scene._carrier(run, replace(view, outputs={names[0]: {}})) is None
 
 
 # --- for renderers ----------------------------------------------------------------------------------------
@@ -414,7 +419,7 @@ def test_points_are_written_with_their_covariance(south):
     ]  # fmt: skip
     alone = made_of.points(replace(south, shots=south.shots[:1]), OUT)["points.csv"]
     assert alone.decode().splitlines()[2].endswith(",,,,,,")  # what one image shows is not known
-    unknown = made_of.points(replace(south, summary=replace(south.summary, scene=None)), OUT)["points.csv"]
+    unknown = made_of.points(with_summary(south, scene=None), OUT)["points.csv"]
     assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
     assert isinstance(south.samples(south.shots[0]), Sampled)
 
@@ -444,7 +449,7 @@ def test_stereo_is_made_of_images_without_reservation_that_share_thirty_matches(
     rows = [replace(base, a="A", b="B"), replace(base, a="A", b="C", num_matches=900)]
 
     def of(*pairs):
-        return list(pairs_of(replace(south, summary=replace(south.summary, views=tuple(views), pairs=pairs))))
+        return list(pairs_of(with_summary(south, views=tuple(views), pairs=pairs)))
 
     assert of(*rows) == [("A", "B")]
     assert of(rows[1], replace(rows[0], num_matches=29)) == [("A", "C"), ("A", "B")]  # better than none

@@ -54,6 +54,7 @@ from tests.pointio.test_gcp_formats import SAME as GCP_FILES
 from tests.pointio.test_gcp_formats import geopackage_of, shapefile_of
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, make_rpc, write_image, yaml
+from tests.sealing import seal
 from tests.sensor import terrasar_files
 from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
@@ -290,6 +291,7 @@ def _beside_run(folder: Path) -> None:
 
 
 def _compare(path: Path) -> object:
+    seal(path.parent)
     with redirect_stdout(io.StringIO()):
         for pair in ((path.parent, _run()), (_run(), path.parent)):
             print_comparison(compare_runs(*pair))
@@ -315,6 +317,7 @@ def _report(path: Path) -> object:
 
 
 def _export(path: Path) -> object:
+    seal(path.parent)
     with tempfile.TemporaryDirectory() as folder:
         for target in ("satnerf", "cars", "stac", "points"):
             export_run(path.parent, target, Path(folder) / target)

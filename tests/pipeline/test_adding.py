@@ -185,9 +185,9 @@ def test_a_chain_of_runs_refuses_nothing_without_cause_and_says_nothing_false(
 
 BAD = {
     "no folder": (lambda run: shutil.rmtree(run), "no summary.json, so no finished run"),
-    "unfinished": (lambda run: (run / "summary.json").unlink(), "no summary.json, so no finished run"),
-    "without its block": (lambda run: (run / "tables/block.npz").unlink(), "block.npz: missing"),
-    "of another release": (lambda run: (run / "tables/images.json").unlink(), "images.json: missing, as of a run of"),
+    "unfinished": (lambda run: (run / "summary.json").unlink(), "summary.json: is gone since the run wrote it"),
+    "without its block": (lambda run: (run / "tables/block.npz").unlink(), "block.npz: is gone since"),
+    "of another release": (lambda run: (run / "tables/images.json").unlink(), "images.json: is gone since"),
     "an edited list": (
         lambda run: (run / "tables/images.json").write_text('{"images": []}'), "images.json: was changed since"
     ),
@@ -211,9 +211,10 @@ def test_a_run_that_cannot_be_gone_on_from_is_refused_in_a_line(
 
 def test_an_image_that_was_changed_since_is_refused(eleven: Path, archive: Path, tmp_path: Path) -> None:
     shutil.copytree(eleven, tmp_path / "all")
+    (tmp_path / "all/first/.barpc/state.json").unlink()  # where it was made, the images are as they were
     for name in ("view_0003", "view_0005"):
         shutil.copy(tmp_path / "all/view_0000.tif", tmp_path / f"all/{name}.tif")
-    with pytest.raises(InputError, match=r"changed since|same"):
+    with pytest.raises(InputError, match=r"is not the file that .*first was made of"):
         run(tmp_path / "all", ["view_0004"], "out", archive, add_to=str(tmp_path / "all/first"))
     assert not (tmp_path / "all/out/summary.json").exists()
 

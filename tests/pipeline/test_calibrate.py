@@ -373,7 +373,7 @@ def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Se
         made = scene([Look(12.0, 12.0), Look(12.0, 192.0)], line, rng, 250, size=SIZE)
         ties = SensorTies.of(f"run{i}", made.views, made.tracks, made.cameras, made.ground)
         directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
-        found.append(_FinishedRun(Path(f"run{i}"), ties, directions, 2))
+        found.append(_FinishedRun(Path(f"run{i}"), "", ties, directions, 2))
     assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
     learnt = learn([one.ties for one in found])
     with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):

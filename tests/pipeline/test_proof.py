@@ -24,7 +24,7 @@ POINTS = [[5.4, 43.2, alt] for alt in (60.0, 120.0, 250.0)]
 
 
 def noted(path: Path) -> Any:
-    return SimpleNamespace(path=str(path), sha256=sha256(path.read_bytes()).hexdigest())
+    return SimpleNamespace(path=str(path), bytes=path.stat().st_size, sha256=sha256(path.read_bytes()).hexdigest())
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_an_input_is_looked_for_in_the_run_beside_it_and_where_one_says(told, tm
         (place / "in.tif").unlink()
     path.unlink()
     assert prove(tmp_path / "out") == [Proved("input", str(path), MISSING)]
-    told.inputs = [SimpleNamespace(path=str(tmp_path / "old" / "in.tif"), sha256=sha256(b"one").hexdigest())]
+    told.inputs = [SimpleNamespace(path=str(tmp_path / "old" / "in.tif"), bytes=3, sha256=sha256(b"one").hexdigest())]
     path.write_bytes(b"one")  # beside the run
     (found,) = prove(tmp_path / "out")
     assert (found.now, found.note) == (MOVED, f"it is {path}")

@@ -176,6 +176,20 @@ def test_killed_between_any_two_outputs_the_same_command_finishes(step):
         assert found["killed"] >= found["outputs"] // step, name
 
 
+@posix
+@pytest.mark.nightly
+def test_commands_on_finished_runs_that_are_killed_at_random_end_with_the_same_bytes():
+    """Of `--add-to`, with `--update`, `ortho`, `dsm` beside and in its run, `calibrate`."""
+    command = [sys.executable, "-m", "tests.reliability.trials", "20", "--of-runs", "--seed", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    found = json.loads(done.stdout)
+    assert len(found) == 6
+    for name, one in found.items():
+        assert one["odd"] == [], name
+        assert one["identical"] == one["trials"] == 20, name
+        assert one["killed"] >= 5, name
+
+
 # -- verbs that write one file, or into a folder of images ---------------------------------------------
 
 

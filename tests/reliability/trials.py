@@ -4,6 +4,7 @@
 
     python -m tests.reliability.trials 50 --seed 1 --jobs 1
     python -m tests.reliability.trials --every-output 1        (kill between any two outputs, of every verb)
+    python -m tests.reliability.trials 20 --of-runs            (kill at random, commands that take a finished run)
 
 Everything is imported once; each run is a fork of this process, which itself never works on an image.
 """
@@ -21,6 +22,7 @@ import time
 import warnings
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -28,7 +30,9 @@ from rasterio.windows import Window
 
 import barpc.cli.adjust  # (imported before the forks)
 import barpc.cli.terminal
-import barpc.pipeline  # noqa: F401
+import barpc.dsm
+import barpc.pipeline.calibrate
+import barpc.verbs.orthoimages  # noqa: F401
 from barpc.cli import main as barpc_main
 from barpc.workspace import code_version
 
@@ -51,9 +55,10 @@ def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
-    """The final files of a run by name: all but its state."""
+    """The final files of a run by name: all but states, and folders of files on their way."""
     names = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
-    return {name: path.read_bytes() for name, path in names.items() if not name.startswith(".barpc/")}
+    own = {name: path for name, path in names.items() if "/.barpc" not in f"/{name}"}
+    return {name: path.read_bytes() for name, path in own.items()}
 
 
 def start(command: list[str], log: Path) -> int:
@@ -202,6 +207,61 @@ def at_every_output(step: int, folder: Path) -> dict[str, dict[str, int]]:
     return found
 
 
+def of_runs(trials: int, seed: int, folder: Path) -> dict[str, dict[str, Any]]:
+    """Kill commands that take finished runs at random, and give them again: how often, and how often all was right."""
+    from tests.pipeline import test_calibrate as sensor  # a scene that gives a calibration
+
+    (before := folder / "before").mkdir()
+    images = [str(crop(path, before / path.name, side=260)) for path in SAMPLES]
+    run, place, log = ["-q", "adjust", *images[:2], "-o", str(before / "run")], folder / "place", folder / "log.txt"
+    if code := finish(start(run, log)):
+        raise SystemExit(f"the first run ended with {code}: {log.read_text()}")
+    if not (pid := os.fork()):
+        rng, line = np.random.default_rng(5), sensor.Sensor.made("polynomials", 3, chips=4, size=sensor.SIZE)
+        for number in range(sensor.RUNS):
+            made = sensor.scene(sensor.any_looks(3, rng), line, rng, 300, size=sensor.SIZE)
+            sensor.run(sensor.files(made, before / f"scene{number}"))
+        os._exit(0)
+    if code := finish(pid):
+        raise SystemExit(f"the scenes of a sensor ended with {code}")
+    added = ["adjust", str(place / Path(images[2]).name), "--add-to", str(place / "run"), "-o", str(place / "added")]
+    runs = [str(place / f"scene{number}/adjusted") for number in range(sensor.RUNS)]
+    commands = {
+        "add-to": added,
+        "update": [*added, "--update"],
+        "ortho": ["ortho", str(place / "run"), "-o", str(place / "ortho")],
+        "dsm": ["dsm", str(place / "run"), "-o", str(place / "dsm.tif")],
+        "dsm in its run": ["dsm", str(place / "run"), "-o", str(place / "run/dsm.tif")],
+        "calibrate": ["calibrate", *runs, "-o", str(place / "s.cal")],
+    }
+    rng, found = np.random.default_rng(seed), {}
+    for name, words in commands.items():
+        command = ["-q", *words]
+        shutil.copytree(before, place)
+        began = time.monotonic()
+        if (code := finish(start(command, log))) not in (0, 3):
+            raise SystemExit(f"{name}, undisturbed, ended with {code}: {log.read_text()}")
+        seconds, truth = time.monotonic() - began, outputs(place)
+        killed = identical = 0
+        odd: set[str] = set()
+        for _ in range(trials):
+            shutil.rmtree(place)
+            shutil.copytree(before, place)
+            pid = start(command, log)
+            time.sleep(rng.uniform(0.0, seconds))
+            os.kill(pid, signal.SIGKILL)
+            cut = finish(pid) == -signal.SIGKILL
+            killed += cut
+            again = finish(start(command, log))  # 1: it had been finished, and is not written over
+            made = outputs(place)
+            odd |= {one for one in made | truth if made.get(one) != truth.get(one)}
+            odd |= {f"exit code {again}"} - ({"exit code 0", "exit code 1", "exit code 3"} if cut else {"exit code 1"})
+            identical += made == truth
+        shutil.rmtree(place)
+        found[name] = {"trials": trials, "killed": killed, "identical": identical, "odd": sorted(odd)}
+    return found
+
+
 def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -209,12 +269,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes of the killed runs")
     parser.add_argument("--every-output", type=int, metavar="STEP", help="kill at every STEP-th output instead")
+    parser.add_argument("--of-runs", action="store_true", help="kill commands that take finished runs instead")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if given.every_output:
             found = at_every_output(given.every_output, Path(folder))
             print(json.dumps(found))
             sys.exit(any(one["identical"] < one["killed"] for one in found.values()))
+        if given.of_runs:
+            found = of_runs(given.trials, given.seed, Path(folder))
+            print(json.dumps(found))
+            sys.exit(any(one["odd"] for one in found.values()))
         told = sweep(given.trials, given.seed, given.jobs, Path(folder))
         print(json.dumps(told))
         sys.exit(bool(told["odd"]) or not told["inputs_unchanged"])

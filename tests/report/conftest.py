@@ -20,6 +20,7 @@ from barpc.scene import View
 from barpc.sensor.geometry import camera_center
 from barpc.simulate import simulate_block
 from barpc.workspace import Workspace
+from tests.sealing import seal
 
 STAGE = {"stage": "adjustment", "seconds": 2.5, "cpu_seconds": 2.0, "peak_memory_mb": 150.0}
 
@@ -69,6 +70,7 @@ def written(run: Run, folder: Path) -> dict[str, Any]:
         summary = write_tables(workspace, run, summary)
         for view, fit in zip(run.views, run.fits, strict=bool(run.fits)):
             write_rpc(fit.rpc, folder / f"{view.name}_RPC.TXT", overwrite=True)
+    seal(folder)
     return json_form(summary)
 
 

@@ -6,6 +6,8 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,13 +20,19 @@ from barpc.report.compare import compare_runs, flat_options
 from barpc.report.records import json_form
 from barpc.rpcio import read_rpc, write_rpc
 from tests.rpcio.conftest import make_rpc
+from tests.sealing import seal
 
 from .made import a_pair, a_summary, a_view
 
 
+def compare(*folders: Path) -> dict[str, Any]:
+    """Two runs, which are as they were written: another test changes them."""
+    return compare_runs(*map(seal, folders))
+
+
 @pytest.mark.slow
 def test_a_run_does_not_differ_from_itself(block_run):
-    found = compare_runs(block_run.folder, block_run.folder)
+    found = compare(block_run.folder, block_run.folder)
     assert len(found["views"]) == 9
     for view in found["views"]:
         assert view["rpc_difference_px"] == 0
@@ -37,7 +45,7 @@ def test_a_shift_of_a_camera_is_found_and_told_from_a_change_of_its_shape(block_
     path = tmp_path / "other" / f"{block_run.views[3].name}_RPC.TXT"
     rpc = read_rpc(path)
     write_rpc(replace(rpc, image_offset=rpc.image_offset + [3.0, -4.0]), path, overwrite=True)
-    found = compare_runs(block_run.folder, tmp_path / "other")
+    found = compare(block_run.folder, tmp_path / "other")
     assert found["views"][3]["rpc_difference_px"] == pytest.approx(5.0, abs=1e-6)
     assert found["views"][3]["rpc_difference_without_shift_px"] < 1e-6
     assert "differ by up to 5 px (view_0003)" in " ".join(found["lines"])
@@ -52,9 +60,9 @@ def test_the_motion_of_the_scene_is_told_in_metres_from_the_first_run_to_the_sec
         rpc = read_rpc(path)
         by = np.array(motion) / metres_per_unit(rpc.ground_offset)
         write_rpc(replace(rpc, ground_offset=rpc.ground_offset + by), path, overwrite=True)
-    found = compare_runs(block_run.folder, tmp_path / "other")
+    found = compare(block_run.folder, tmp_path / "other")
     assert found["moved_enu_m"] == pytest.approx(motion, abs=0.02)
-    back = compare_runs(tmp_path / "other", block_run.folder)["moved_enu_m"]
+    back = compare(tmp_path / "other", block_run.folder)["moved_enu_m"]
     assert back == pytest.approx([-one for one in motion], abs=0.02)
     said = next(line for line in found["lines"] if line.startswith("The scene moved by "))
     if any(motion):
@@ -68,7 +76,7 @@ def test_of_rpcs_of_one_image_no_motion_of_the_scene_is_told(block_run, tmp_path
         shutil.copytree(block_run.folder, folder)
         text = json.dumps({**block_run.summary, "views": some, "pairs": []})
         (folder / "summary.json").write_text(text)
-        found = compare_runs(folder, folder)
+        found = compare(folder, folder)
         assert found["moved_enu_m"] is None
         assert "moved" not in " ".join(found["lines"])
 
@@ -80,14 +88,14 @@ def test_options_and_images_of_one_run_alone_are_named(block_run, tmp_path):
     gone = summary["views"].pop()["name"]
     summary["pairs"] = [pair for pair in summary["pairs"] if gone not in (pair["a"], pair["b"])]
     (tmp_path / "other/summary.json").write_text(json.dumps(summary))
-    found = compare_runs(block_run.folder, tmp_path / "other")
+    found = compare(block_run.folder, tmp_path / "other")
     assert found["options"] == [{"option": "adjust.drift", "values": [None, 1]}]
     assert found["only_a"] == [block_run.views[-1].name]
     assert "Option adjust.drift: None in A, 1 in B." in found["lines"]
 
 
 def test_runs_without_files_are_compared_by_their_errors(block_run, check_run):
-    found = compare_runs(check_run.folder, block_run.folder)
+    found = compare(check_run.folder, block_run.folder)
     assert all(view["rpc_difference_px"] is None for view in found["views"])
     assert np.median([view["rmse"][0] / view["rmse"][1] for view in found["views"]]) > 3
 
@@ -96,7 +104,7 @@ def test_runs_of_other_images_are_refused(block_run, antimeridian_run):
     first, second = (run.views[0].name for run in (block_run, antimeridian_run))
     said = rf"no image in common \({first} and others there, {second} here\)"
     with pytest.raises(InputError, match=said):
-        compare_runs(block_run.folder, antimeridian_run.folder)
+        compare(block_run.folder, antimeridian_run.folder)
 
 
 def test_the_verb_prints_tables_or_json(block_run, check_run):
@@ -104,7 +112,7 @@ def test_the_verb_prints_tables_or_json(block_run, check_run):
     text = CliRunner().invoke(cli, arguments, standalone_mode=False)
     assert "error A [px]  error B [px]" in text.output
     found = CliRunner().invoke(cli, [*arguments, "--json"], standalone_mode=False)
-    assert json.loads(found.output) == compare_runs(check_run.folder, block_run.folder)
+    assert json.loads(found.output) == compare(check_run.folder, block_run.folder)
 
 
 @pytest.fixture
@@ -118,7 +126,7 @@ def compared(tmp_path):
             (folder / "summary.json").write_text(json.dumps(json_form(summary)))
             for name, rpc in written.items():
                 write_rpc(rpc, folder / f"{name}_RPC.TXT")
-        return compare_runs(*folders)
+        return compare(*folders)
 
     return made
 
@@ -184,7 +192,7 @@ def test_options_of_one_run_alone_count_and_those_without_effect_do_not(tmp_path
         (tmp_path / name).mkdir()
         (tmp_path / name / "summary.json").write_text(json.dumps(json_form(summary)))
         both.append(tmp_path / name)
-    found = compare_runs(*both)
+    found = compare(*both)
     assert found["options"] == [
         {"option": "deep.y", "values": [2, None]},
         {"option": "z", "values": [None, {}]},
@@ -204,13 +212,13 @@ def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_
         summary["inputs"] = [{"path": view["path"], "bytes": 9, "sha256": digit * 64} for view in summary["views"]]
         summary["inputs"][0]["sha256"] = "0" * 64  # but for the first
         (tmp_path / name / "summary.json").write_text(json.dumps(summary))
-    found = compare_runs(tmp_path / "one", tmp_path / "two")
+    found = compare(tmp_path / "one", tmp_path / "two")
     assert [view["name"] for view in found["views"]] == ["view_0000"]
     assert found["only_a"] == found["only_b"] == [view.name for view in block_run.views[1:]]
     summary["inputs"][0]["sha256"] = "2" * 64
     (tmp_path / "two/summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match="are other files, so these runs have none in common: nothing to compare"):
-        compare_runs(tmp_path / "one", tmp_path / "two")
+        compare(tmp_path / "one", tmp_path / "two")
 
 
 def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, tmp_path):
@@ -223,8 +231,8 @@ def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, tmp_path
 
     one, deeper = of("one", "../srtm.tif"), of("two/deeper", "../../srtm.tif")
     other, moved = of("three/other", "../srtm.tif"), of("other/folder", "../../other.tif")
-    assert compare_runs(one, deeper)["options"] == []
-    assert compare_runs(one, other)["options"] == []  # a run that was moved
-    differ = compare_runs(one, moved)["options"]
+    assert compare(one, deeper)["options"] == []
+    assert compare(one, other)["options"] == []  # a run that was moved
+    differ = compare(one, moved)["options"]
     assert [row["option"] for row in differ] == ["gcp", "dem"]
     assert differ[1]["values"] == [str(tmp_path / "srtm.tif"), str(tmp_path / "other.tif")]

@@ -24,6 +24,7 @@ from barpc.report.page import report_html
 from barpc.report.runfiles import read_summary
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
+from tests.sealing import seal
 
 from .conftest import Finished, run_of_block, written
 
@@ -74,7 +75,7 @@ def look(folder: Path, summary: dict[str, Any]) -> bool:
     with contextlib.suppress(InputError):  # tables that do not go with it
         report_html(read, folder)
     with contextlib.suppress(InputError):  # no image in common
-        compare_runs(folder, folder)
+        compare_runs(seal(folder), folder)
     return True
 
 
@@ -131,6 +132,7 @@ def test_compare_opens_nothing_outside_the_folder(block_run, tmp_path, name):
     summary = deepcopy(block_run.summary)
     summary["views"][0]["outputs"] = {name.replace("/outside", f"{tmp_path}/outside", name[0] == "/"): {}}
     (folder / "summary.json").write_text(json.dumps(summary))
+    seal(folder)
     with contextlib.suppress(InputError):
         differences = [view["rpc_difference_px"] for view in compare_runs(folder, folder)["views"]]
         assert differences == [None, *[0.0] * 8]
@@ -141,6 +143,7 @@ def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, tmp_pat
     shutil.copytree(block_run.folder, folder)
     summary = {**block_run.summary, "headline": "of \udce9t\udce9"}
     (folder / "summary.json").write_text(json.dumps(summary))
+    seal(folder)
     assert "of \\udce9t\\udce9" in remake_report(folder).read_text()
 
 
