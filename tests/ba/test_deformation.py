@@ -1,0 +1,114 @@
+"""Control does not deform an image: what it asks for beyond what tie points show is refused, and said."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+
+from barpc import adjust, open_camera
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba.constraints.block import join, make_problem
+from barpc.ba.constraints.shape import MOST_SIGMAS, shape_change
+from barpc.base.geodesy import Array, metres_per_unit
+from barpc.rasters.dem import localize_on_terrain
+from barpc.report.quality_checks import deformation_reasons, dem_reasons
+from barpc.scene import Terrain, Tracks, View
+from barpc.sensor.corrected import Corrected
+from barpc.simulate import simulate_block
+
+LON, LAT, NOISE, SIZE = 5.4, 43.3, 0.05, (1200, 1200)
+UNIT = metres_per_unit(np.array([[LON, LAT, 200.0]]))[0, :2]
+
+
+def hills(seed: int, size: float = 40.0, level: float = 200.0) -> Terrain:
+    """Waves of 0.3 to 1.2 km, `size` [m] RMS, about a level [m]."""
+    rng = np.random.default_rng(seed)
+    number, (angle, phase) = 2 * np.pi / rng.uniform(300.0, 1200.0, 12), rng.uniform(0, 2 * np.pi, (2, 12))
+
+    def at(lon: Array, lat: Array) -> Array:
+        x, y = (np.asarray(lon) - LON) * UNIT[0], (np.asarray(lat) - LAT) * UNIT[1]
+        along = np.cos(angle) * x[..., None] + np.sin(angle) * y[..., None]
+        return np.asarray(level + size * np.sin(number * along + phase).sum(axis=-1) / np.sqrt(6.0))
+
+    return at
+
+
+SAMPLES = Path(__file__).parents[2] / "data_samples"
+GROUND = hills(1)
+DEMS: dict[str, Terrain] = {
+    "right": GROUND,
+    "20 m above": lambda lon, lat: GROUND(lon, lat) + 20.0,
+    "flat": lambda lon, lat: 200.0 + 0.0 * np.asarray(lon),
+    "sea level": lambda lon, lat: 0.0 * np.asarray(lon),
+    "tilted plane": lambda lon, lat: 200.0 + (np.asarray(lon) - LON) * UNIT[0] * 0.2,
+    "another place": hills(2),
+    "bent": lambda lon, lat: GROUND(lon, lat) + 40.0 * ((np.asarray(lat) - LAT) * UNIT[1] / 300.0) ** 2,
+}
+
+
+FALSE = "flat", "sea level", "tilted plane", "another place"
+"""DEMs that differ from the ground by more than three times their stated standard deviation, place by place."""
+
+
+@cache
+def ties(num_views: int) -> tuple[tuple[View, ...], Tracks]:
+    """Views, and tie points on the hills, as corrected cameras see them."""
+    block, rng = simulate_block(num_views, 10, seed=4, size=SIZE), np.random.default_rng(6)
+    sensors = [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
+    size = np.array(SIZE)
+    image = rng.uniform(0.02, 0.98, (700, 2)) * size
+    ground = localize_on_terrain(sensors[0], image, GROUND, (0.0, 500.0))
+    seen = np.stack([sensor.project(ground) for sensor in sensors])
+    inside = ((seen > 0) & (seen < size - 1.0)).all(axis=(0, 2))
+    seen = seen[:, inside] + rng.normal(0, NOISE, (num_views, int(inside.sum()), 2))
+    view, point = np.indices(seen.shape[:2])
+    return block.views, Tracks(view.ravel(), point.ravel(), seen.reshape(-1, 2), np.full(view.size, NOISE))
+
+
+def adjusted(num_views: int, dem: str | None) -> tuple[Adjustment, Array, list[str]]:
+    """The adjustment beside a DEM, the deformations in standard deviations, and what is said of it."""
+    views, tracks = ties(num_views)
+    found = adjust_tracks(views, tracks, AdjustOptions(), dem=None if dem is None else DEMS[dem])
+    unknowns = found.cameras.unknowns
+    problem = make_problem(
+        join(views, tracks, None, found.options), found.options, unknowns.center, None, unknowns.drift
+    )
+    sigmas, _ = shape_change(problem, found.params[:, : unknowns.in_waves.start], views)
+    return found, sigmas, [*deformation_reasons(found), *dem_reasons(found)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dem", [None, *DEMS])
+@pytest.mark.parametrize("num_views", [2, 3])
+def test_no_dem_deforms_an_image_and_a_false_one_is_named(num_views: int, dem: str | None) -> None:
+    found, sigmas, said = adjusted(num_views, dem)
+    assert (sigmas < MOST_SIGMAS).all()
+    assert bool(said) == (dem in FALSE)
+    assert (found.deformed is None) or dem in FALSE
+
+
+@pytest.mark.slow
+def test_a_drift_that_heights_alone_ask_for_is_held_to_what_tie_points_show(tmp_path) -> None:
+    """A pair sees nothing of a drift about its base: a flat DEM would deform images of hills by 130 px, 229 sigma."""
+    pair, dem = sorted(SAMPLES.glob("view_0[01].tif")), tmp_path / "flat.tif"
+    lon, lat = open_camera(pair[0]).model.localize(np.array([[500.0, 500.0]]), np.array([130.0]))[0, :2]
+    profile = {"driver": "GTiff", "width": 60, "height": 60, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(dem, "w", **profile, transform=from_origin(lon - 0.015, lat + 0.015, 5e-4, 5e-4)) as file:
+        file.write(np.full((60, 60), 130.0, dtype=np.float32), 1)
+    found = adjust(pair, dem=dem, geoid="none", out_dir=tmp_path / "out").adjustment
+    assert found is not None
+    assert found.deformed is not None
+    assert found.deformed.control == ("dem",)
+    assert found.deformed.sigmas > 100.0
+    (said,) = deformation_reasons(found)
+    assert "To follow the DEM, the shape of view_0" in said
+    for path, sensor in zip(pair, found.sensors, strict=True):
+        camera = open_camera(path)
+        corners = np.array([[x, y] for x in (0.0, camera.size[0]) for y in (0.0, camera.size[1])])
+        moved = sensor.project(camera.model.localize(corners, np.full(4, 150.0))) - corners
+        assert np.abs(moved - moved.mean(axis=0)).max() < 1.0
