@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from barpc.ba.constraints.shape import MOST_SIGMAS, shape_change
 from barpc.base.geodesy import Array, metres_per_unit
 from barpc.rasters.dem import localize_on_terrain
 from barpc.report.quality_checks import deformation_reasons, dem_reasons
-from barpc.scene import Terrain, Tracks, View
+from barpc.scene import GroundPoints, Terrain, Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
 
@@ -51,45 +53,83 @@ DEMS: dict[str, Terrain] = {
 }
 
 
+Moved = Callable[[Array, Array, Array], tuple[Array | float, ...]]
+GCPS: dict[str, Moved] = {
+    "right": lambda east, north, alt: (east, north, alt),
+    "shifted": lambda east, north, alt: (east + 50.0, north, alt),
+    "raised": lambda east, north, alt: (east, north, alt + 100.0),
+    "flat": lambda east, north, _alt: (east, north, 200.0),
+    "tilted": lambda east, north, alt: (east, north, alt + 0.2 * east),
+    "bent": lambda east, north, alt: (east, north, alt + 100.0 * (north / 300.0) ** 2),
+    "turned": lambda east, north, alt: (east - 0.05 * north, north + 0.05 * east, alt),
+}
 FALSE = "flat", "sea level", "tilted plane", "another place"
 """DEMs that differ from the ground by more than three times their stated standard deviation, place by place."""
 
 
-@cache
-def ties(num_views: int) -> tuple[tuple[View, ...], Tracks]:
-    """Views, and tie points on the hills, as corrected cameras see them."""
+def seen_by(num_views: int, count: int) -> tuple[tuple[View, ...], Array, Array]:
+    """Views, points (n, 3) on the hills, and where the true cameras see them (N, n, 2)."""
     block, rng = simulate_block(num_views, 10, seed=4, size=SIZE), np.random.default_rng(6)
     sensors = [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
-    size = np.array(SIZE)
-    image = rng.uniform(0.02, 0.98, (700, 2)) * size
+    image = rng.uniform(0.02, 0.98, (count, 2)) * SIZE
     ground = localize_on_terrain(sensors[0], image, GROUND, (0.0, 500.0))
     seen = np.stack([sensor.project(ground) for sensor in sensors])
-    inside = ((seen > 0) & (seen < size - 1.0)).all(axis=(0, 2))
-    seen = seen[:, inside] + rng.normal(0, NOISE, (num_views, int(inside.sum()), 2))
+    inside = ((seen > 0) & (seen < np.array(SIZE) - 1.0)).all(axis=(0, 2))
+    return block.views, ground[inside], seen[:, inside] + rng.normal(0, NOISE, (num_views, int(inside.sum()), 2))
+
+
+@cache
+def ties(num_views: int) -> tuple[tuple[View, ...], Tracks]:
+    """Views, and tie points on the hills."""
+    views, _, seen = seen_by(num_views, 700)
     view, point = np.indices(seen.shape[:2])
-    return block.views, Tracks(view.ravel(), point.ravel(), seen.reshape(-1, 2), np.full(view.size, NOISE))
+    return views, Tracks(view.ravel(), point.ravel(), seen.reshape(-1, 2), np.full(view.size, NOISE))
 
 
-def adjusted(num_views: int, dem: str | None) -> tuple[Adjustment, Array, list[str]]:
-    """The adjustment beside a DEM, the deformations in standard deviations, and what is said of it."""
+def gcps(num_views: int, count: int, moved: Moved) -> GroundPoints:
+    """GCPs that are said to be where `moved` puts them: from metres east, north, and altitude."""
+    _, ground, seen = seen_by(num_views, count)
+    east, north = ((ground[:, :2] - [LON, LAT]) * UNIT).T
+    place = np.column_stack(np.broadcast_arrays(*moved(east, north, ground[:, 2])))
+    place[:, :2] = [LON, LAT] + place[:, :2] / UNIT
+    view, point = np.indices(seen.shape[:2])
+    names, sigma = tuple(map(str, range(len(ground)))), np.full((len(ground), 3), 0.3)
+    return GroundPoints(names, place, sigma, point.ravel(), view.ravel(), seen.reshape(-1, 2), np.full(view.size, 0.1))
+
+
+def adjusted(num_views: int, **control: Any) -> tuple[Adjustment, Array]:
+    """The adjustment beside control, and the deformations of its images in standard deviations."""
     views, tracks = ties(num_views)
-    found = adjust_tracks(views, tracks, AdjustOptions(), dem=None if dem is None else DEMS[dem])
-    unknowns = found.cameras.unknowns
-    problem = make_problem(
-        join(views, tracks, None, found.options), found.options, unknowns.center, None, unknowns.drift
-    )
+    found = adjust_tracks(views, tracks, AdjustOptions(), **control)
+    unknowns, options = found.cameras.unknowns, found.options
+    problem = make_problem(join(views, tracks, None, options), options, unknowns.center, None, unknowns.drift)
     sigmas, _ = shape_change(problem, found.params[:, : unknowns.in_waves.start], views)
-    return found, sigmas, [*deformation_reasons(found), *dem_reasons(found)]
+    return found, sigmas
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dem", [None, *DEMS])
 @pytest.mark.parametrize("num_views", [2, 3])
 def test_no_dem_deforms_an_image_and_a_false_one_is_named(num_views: int, dem: str | None) -> None:
-    found, sigmas, said = adjusted(num_views, dem)
+    found, sigmas = adjusted(num_views, dem=None if dem is None else DEMS[dem])
     assert (sigmas < MOST_SIGMAS).all()
-    assert bool(said) == (dem in FALSE)
+    assert bool([*deformation_reasons(found), *dem_reasons(found)]) == (dem in FALSE)
     assert (found.deformed is None) or dem in FALSE
+
+
+@pytest.mark.landing(3)
+@pytest.mark.slow
+@pytest.mark.parametrize("num_views", [2, 3])
+@pytest.mark.parametrize("count", [60, 12, 6])
+@pytest.mark.parametrize("kind", GCPS)
+def test_no_gcps_deform_an_image_and_those_of_another_shape_are_not_used(num_views: int, count: int, kind: str) -> None:
+    """Points of a wrong datum move the scene; which of the others agree is not for tie points to bend to."""
+    found, sigmas = adjusted(num_views, gcps=gcps(num_views, count, GCPS[kind]))
+    assert (sigmas < MOST_SIGMAS).all()
+    assert found.deformed is None
+    assert found.control is not None
+    whole = kind in ("right", "shifted", "raised")
+    assert found.control.used.all() if whole else not found.control.used.all(), kind
 
 
 @pytest.mark.slow

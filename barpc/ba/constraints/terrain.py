@@ -324,9 +324,9 @@ def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]
     At the end, when cameras are adjusted: no more than a level and slopes are of these. Heights are known to
     `stated` [m].
     """
-    near = _middling(ground[:, 2] - dem)
-    if near.sum() < MANY:
+    if len(dem) < MANY:
         return float("nan"), True
+    near = _middling(ground[:, 2] - dem)
     at = (ground - ground[near].mean(axis=0))[near, :2] * metres_per_unit(ground[near].mean(axis=0))[:2]
     plane = np.column_stack([np.ones(len(at)), at / max(float(np.abs(at).max()), 1.0)])
     relief = dem[near] - plane @ _least_squares_fit(plane, dem[near])
