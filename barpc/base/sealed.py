@@ -134,8 +134,8 @@ class Sealed:
             there = self.located(path)
             now = f"is not the file that {self.folder} was made of" if os.path.lexists(there) else "is gone"
             raise InputError(
-                f"{there}: {now}, and no file of this name in {self.folder} or beside it is; put it back, or run the "
-                "adjustment again"
+                f"{there}: {now}, and no file of its name in {self.folder} or beside it has its content; put it back, "
+                "or run the adjustment again"
             )
         return str(found)
 

@@ -117,7 +117,7 @@ def test_an_input_is_the_file_of_its_content_in_the_first_place_that_has_it(made
         place.write_bytes(b"b")
     run, more = Sealed.open(moved), [tmp_path / "given"]
     assert run.find(path, sha(b"a"), 1, more) is None
-    with pytest.raises(InputError, match=r"in/a\.tif: is not the file that .*moved was made of, and no file of this"):
+    with pytest.raises(InputError, match=r"in/a\.tif: is not the file that .*moved was made of, and no file of its"):
         run.input(path, sha(b"a"), 1, more)
     for place in reversed(places):
         place.write_bytes(b"a")
@@ -125,7 +125,7 @@ def test_an_input_is_the_file_of_its_content_in_the_first_place_that_has_it(made
         assert run.find(path, sha(b"a"), 2, more) is None  # of another size
     for place in places:
         place.unlink()
-    with pytest.raises(InputError, match=r"in/a\.tif: is gone, and no file of this name"):
+    with pytest.raises(InputError, match=r"in/a\.tif: is gone, and no file of its name"):
         run.input(path, sha(b"a"), 1, more)
 
 

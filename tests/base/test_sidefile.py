@@ -312,6 +312,7 @@ DIRECT = {
     "rasters/raster.py": "images, checked there",
     "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
     "pointio/tables.py": "no file: lines that were read",
+    "base/sealed.py": "outputs, to hash them, and the state",
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",
     "cameras.py": "no file: a row of the table of openers",
@@ -342,7 +343,7 @@ def _opens(call: ast.Call) -> bool:
     if name in ARRAYS_OF_A_PATH:
         return owner == "np"
     writes = bool(words & {"w", "wb", "r+b"})
-    members = owner in ("archive", "ZipFile", "Dem", "HeightGrid", "Earlier")
+    members = owner in ("archive", "ZipFile", "Dem", "HeightGrid", "Earlier", "FinishedRun", "Sealed", "cls")
     return name in ("open", "read_text", "read_bytes") and not writes and not members
 
 

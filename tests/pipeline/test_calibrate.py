@@ -234,10 +234,10 @@ def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path)
     table = (archive[2] / "tables/observations.csv").read_text()
     refused("was changed since", copied("tables/observations.csv", table[: len(table) // 2]))
     refused("was changed since", copied("tables/residuals.csv", ""))
-    refused("is gone", copied("tables/images.json", None))
+    refused("is gone since", copied("tables/images.json", None))
     refused("missing", copied("SHA256SUMS", None))
     refused("was changed since", copied("summary.json", '{"schema": "barpc-summary-1"}'))
-    refused("no summary.json", copied("summary.json", None))
+    refused("is gone since", copied("summary.json", None))
     refused("the images state SIM1_PAN", archive[2], sensor="WV02_P")
 
 

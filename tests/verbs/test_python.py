@@ -293,6 +293,7 @@ def test_a_run_adjusted_again_has_its_new_altitude(tmp_path):
     import os
 
     from tests.report.conftest import run_of_block, written
+    from tests.sealing import seal
 
     folder = tmp_path / "run"
     written(run_of_block(3, 60, size=(900, 700)), folder)
@@ -303,6 +304,10 @@ def test_a_run_adjusted_again_has_its_new_altitude(tmp_path):
     assert before == summary["altitude_m"]
     (folder / "summary.json").write_text(json.dumps({**summary, "altitude_m": before + 5.0}))
     os.utime(folder / "summary.json", ns=(1, 1))
+    with pytest.warns(Remark, match="terrain height unknown"):  # somebody has edited it
+        assert barpc.info(camera)["center_alt_m"] != before + 5.0
+    seal(folder)
+    os.utime(folder / "summary.json", ns=(2, 2))
     assert barpc.info(camera)["center_alt_m"] == before + 5.0
 
 
