@@ -33,7 +33,7 @@ def test_a_pipe_or_a_device_has_no_hash(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
     for name in ("pipe", "link"):
-        assert refused(tmp_path / name) == f"{tmp_path / name}: not a regular file"
+        assert refused(tmp_path / name) == f"{tmp_path / name}: a pipe, not a file; an image is needed"
     (tmp_path / "zeros").symlink_to("/dev/zero")
-    assert "not a regular file" in refused(tmp_path / "zeros")
+    assert "a device, not a file" in refused(tmp_path / "zeros")
     assert "no such file" in refused(tmp_path / "missing")

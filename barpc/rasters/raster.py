@@ -198,6 +198,8 @@ def transformed(transform: Affine, x: Any, y: Any) -> tuple[Any, Any]:
 def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
+        if not isinstance(path, Remote):
+            read_head(path, IMAGE, 1)  # no pipe, no device, and there
         whole = identity.fingerprint(path)  # before it is read: what it shows is what was hashed
         found = replace(whole, parts=tuple(map(identity.fingerprint, sources_of(path))))
     except OSError as error:
