@@ -157,9 +157,12 @@ def solve_block(
 
 
 def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
-    """Return the block; solved again with the drift priors of the tie points alone where control deforms an image."""
+    """Return the block; solved again with the drift priors of the tie points alone where control deforms an image.
+
+    Where there are no tie points, control points that agree are all that shows a drift.
+    """
     heights, problem = found.heights, found.problem
-    if not heights.kinds:
+    if not heights.kinds or not (block.point < block.num_tracks).any():
         return found
     sigmas, px = shape_change(problem, found.final.params, block.views)
     if not sigmas.max() > MOST_SIGMAS:
@@ -170,9 +173,10 @@ def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
     view = int((sigmas - asked).argmax())
     if not sigmas[view] - asked[view] > MOST_SIGMAS:
         return found
-    outcome = Rounds(problem, block, start, heights, block.use, widest=np.array(free.prior.wide)).run()
+    heights = replace(heights, widest=free.prior.wide)
+    outcome = Rounds(problem, block, start, heights, block.use).run()
     deformed = Deformation(view, float(sigmas[view]), float(px[view]), heights.kinds)
-    return replace(finished(found, problem, block, outer, outcome), deformed=deformed)
+    return finished(replace(found, heights=heights, deformed=deformed), problem, block, outer, outcome)
 
 
 def _with_more_drift(

@@ -44,7 +44,7 @@ _FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
 _MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
 _ABSURD = 1e3  # px: no curve is larger
 _MOST_EDGES = 64  # focal planes have up to some thirty detectors, and 40 steps are learnt
-_ROUNDED = 1e-4  # of the largest variance: what five digits a number leave of eigenvalues that are zero
+_ROUNDING = 1e-4  # of the largest variance: what five digits a number leave of eigenvalues that are zero
 _FLAT = 30.0  # deg: rows that run within so much of each other are of one direction
 
 
@@ -246,7 +246,7 @@ def read_calibration(path: str | Path) -> Calibration:
     if schema != CALIBRATION_SCHEMA:
         raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({CALIBRATION_SCHEMA})")
     try:
-        file = _File.read(found)
+        file = _CalibrationFile.read(found)
         return Calibration(file.sensor, *file.curve(), str(path), fingerprint(path).sha256)
     except (ValueError, RpcError) as error:
         raise InputError(f"{path}: damaged ({plain(error)}); make it again (barpc calibrate)") from error
@@ -255,7 +255,7 @@ def read_calibration(path: str | Path) -> Calibration:
 _Pixels = Annotated[float, msgspec.Meta(gt=-_ABSURD, lt=_ABSURD)]
 
 
-class _File(Record):
+class _CalibrationFile(Record):
     """Fields of a calibration file, with their limits."""
 
     sensor: str = column("Sensor", min_length=1, max_length=200)
@@ -291,7 +291,7 @@ def _may_be_covariance(matrix: Array) -> bool:
     if not (np.isfinite(matrix).all() and (variance > 0.0).all() and (variance < _ABSURD**2).all()):
         return False
     try:
-        np.linalg.cholesky(matrix + _ROUNDED * variance.max() * np.eye(len(matrix)))
+        np.linalg.cholesky(matrix + _ROUNDING * variance.max() * np.eye(len(matrix)))
     except np.linalg.LinAlgError:
         return False
     return True

@@ -251,7 +251,7 @@ def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier,
     given = load_views(fresh, **how)
     names = {image.name for image in old.values()}
     wanted = [i for i in _needed_images(given.views, options, earlier) if earlier.images[i].name not in names]
-    reached = _present([earlier.images[i] for i in wanted], earlier)
+    reached = _still_there([earlier.images[i] for i in wanted], earlier)
     if not reached and not old:
         where = "its images there cannot be opened" if wanted else "none of its images meets the images given"
         raise InputError(f"{earlier.folder}: {where}, so there is nothing to add them to; give its images, too, or "
@@ -261,7 +261,7 @@ def join_earlier(images: Sequence[Image], options: RunOptions, earlier: Earlier,
     return _renamed(loaded, known, earlier)
 
 
-def _present(images: Sequence[Known], earlier: Earlier) -> list[Known]:
+def _still_there(images: Sequence[Known], earlier: Earlier) -> list[Known]:
     """Return those of a run's images that are still there, with their places; InputError where one was changed."""
     found, said = list[Known](), "%s: an image of %s is not matched: %s; give its present path, too"
     for image in images:
@@ -379,5 +379,5 @@ def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[s
     assert run.added is not None
     earlier: Earlier = run.earlier
     wanted = [earlier.images[earlier.number[name]] for name, _ in run.added.beyond if name not in done]
-    there = _present(wanted, earlier)
+    there = _still_there(wanted, earlier)
     return earlier.corrected(there, grown, hosts) if there else ([], (), ())

@@ -19,7 +19,7 @@ Feature = dict[str, Any]
 
 _ENVELOPES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}  # bytes before a geometry, by the flags
 _TURN, _MOST_TURNS = 10_000_000, 100  # steps of sqlite: a million points take 30 million
-_POINTS = {1: 2, 11: 3, 21: 2}  # shape types: coordinates that are read
+_POINT_TYPES = {1: 2, 11: 3, 21: 2}  # shape types: coordinates that are read
 _DBF_TEXTS = b"CNFDL"
 
 
@@ -100,9 +100,9 @@ def _points_of_shp(data: bytes) -> Iterator[list[float] | None]:
     at = 100
     while at + 12 <= len(data):
         words, kind = struct.unpack_from(">I", data, at + 4)[0], struct.unpack_from("<I", data, at + 8)[0]
-        if kind and kind not in _POINTS:
+        if kind and kind not in _POINT_TYPES:
             raise ValueError("no point")
-        yield list(struct.unpack_from(f"<{_POINTS[kind]}d", data, at + 12)) if kind else None
+        yield list(struct.unpack_from(f"<{_POINT_TYPES[kind]}d", data, at + 12)) if kind else None
         at += 8 + 2 * words
 
 

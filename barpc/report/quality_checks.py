@@ -380,10 +380,11 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
         )
         return
     if not terrain.agrees:
+        times = round(terrain.relief, 2) + 0.0
         yield (
-            f"The DEM has {terrain.relief:.2g} times the relief of the adjusted tie points: their heights and the "
-            "scene's position follow a DEM of another terrain, or without its own (water, filled or smoothed heights). "
-            "Leave it out, or give another."
+            f"The DEM has {times:g} times the relief of the adjusted tie points: their heights and the scene's place "
+            "follow a DEM of another terrain, or without its own (water, filled or smoothed heights). Leave it out, or "
+            "give another."
         )
     (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
     if level > SURELY:

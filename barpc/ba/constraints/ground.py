@@ -202,6 +202,8 @@ class PointConstraints:
     has_control: bool = False  # whether GCPs hold the scene's place
     relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
     placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
+    # (D + 1,) largest factors on the priors of drifts and turns: those of tie points alone; None: of all observations
+    widest: tuple[float, ...] | None = None
 
     def loose(self, sigma: float) -> PointConstraints:
         """Return the priors with GCPs known to `sigma` [m] only."""

@@ -65,8 +65,7 @@ class Rounds:
 
     Outliers are judged by their residuals less the smooth part of every view: a
     camera that the unknowns cannot follow yet does not make its tie points wrong. Where a solve with fewer unknowns
-    is `known`, it told them: robust rounds would let go of what the further unknowns are to follow. `widest` (D + 1,)
-    is by how much the priors of drifts and turns about the lines of sight may be widened.
+    is `known`, it told them: robust rounds would let go of what the further unknowns are to follow.
     """
 
     def __init__(
@@ -77,7 +76,6 @@ class Rounds:
         heights: PointConstraints,
         use: BoolArray,
         known: Outcome | None = None,
-        widest: Array | None = None,
     ) -> None:
         unknowns, options = problem.cameras.unknowns, heights.options
         residual, projected = problem.prepare(state.params, state.points)
@@ -97,7 +95,7 @@ class Rounds:
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         shown = None if earlier is None else earlier.shown
-        self.variances = replace(Variances.of(given, unknowns, options, control, block.views, shown), widest=widest)
+        self.variances = Variances.of(given, unknowns, options, control, block.views, shown, heights.widest)
         self.learnt: PriorTest | None = None  # with what the present priors were learnt
         # what the same unknowns ended with is gone on with: cut, accuracies, misfit
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns

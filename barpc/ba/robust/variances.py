@@ -158,12 +158,14 @@ class Variances:
         control: bool,
         views: Sequence[View] = (),
         shown: Array | None = None,
+        widest: tuple[float, ...] | None = None,
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
         learns = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
-        return cls(given, unknowns, learns, not control, stated, shown)
+        most = None if widest is None else np.array([*widest[: unknowns.drift], widest[-1]])
+        return cls(given, unknowns, learns, not control, stated, shown, most)
 
     @property
     def constants(self) -> int:
