@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
+from rasterio import Affine
 
 from barpc import adjust, open_camera
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
@@ -138,7 +138,7 @@ def test_a_drift_that_heights_alone_ask_for_is_held_to_what_tie_points_show(tmp_
     pair, dem = sorted(SAMPLES.glob("view_0[01].tif")), tmp_path / "flat.tif"
     lon, lat = open_camera(pair[0]).model.localize(np.array([[500.0, 500.0]]), np.array([130.0]))[0, :2]
     profile = {"driver": "GTiff", "width": 60, "height": 60, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(dem, "w", **profile, transform=from_origin(lon - 0.015, lat + 0.015, 5e-4, 5e-4)) as file:
+    with rasterio.open(dem, "w", **profile, transform=Affine(5e-4, 0.0, lon - 0.015, 0.0, -5e-4, lat + 0.015)) as file:
         file.write(np.full((60, 60), 130.0, dtype=np.float32), 1)
     found = adjust(pair, dem=dem, geoid="none", out_dir=tmp_path / "out").adjustment
     assert found is not None

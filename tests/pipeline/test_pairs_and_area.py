@@ -95,7 +95,7 @@ def test_a_view_goes_before_an_image_of_its_name_that_was_left_out(views, tmp_pa
         ("view_00 view_00.tif\n", "line 1: view_00 is paired with itself"),
         ("view_00 'view_01\n", "line 1: No closing quotation"),
         ("# nothing\n", "lists no pair"),
-        ("", "lists no pair"),
+        ("", "the file is empty"),
         ("\0 \0", "line 1"),
     ],
 )

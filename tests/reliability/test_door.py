@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import from_origin
+from rasterio import Affine
 
 from .conftest import Said, barpc, hashes
 from .trials import SAMPLES, crop
@@ -37,7 +37,7 @@ TIES = {*SCENE, "calibrate", "report"}
 def grid(path: Path, metres: float) -> Path:
     """Heights around the samples."""
     how = {"width": 40, "height": 40, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", driver="GTiff", transform=from_origin(5.2, 43.5, 0.01, 0.01), **how) as file:
+    with rasterio.open(path, "w", driver="GTiff", transform=Affine(0.01, 0.0, 5.2, 0.0, -0.01, 43.5), **how) as file:
         file.write(np.full((40, 40), metres, np.float32), 1)
     return path
 
