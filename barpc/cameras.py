@@ -17,6 +17,7 @@ from typing import Any
 
 from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
 from barpc.base.geodesy import EVERYWHERE as EVERYWHERE
+from barpc.base.manifest import LAST
 from barpc.base.remote import PathOrUrl, is_url, located, location
 from barpc.base.safe_io import IMAGE, read_head
 from barpc.pointio.correspondences import (
@@ -30,6 +31,7 @@ from barpc.pointio.correspondences import (
 from barpc.rasters.raster import driver_of, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.plausible import RasterFrame, doubts_of
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
@@ -115,9 +117,12 @@ def file_of(image: ImageLike) -> Any:
 def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Camera:
     """Open the camera of a file with the choices behind its name (see `open_camera`, `split_spec`).
 
-    `tags`: those of the raster `path`, where it is open already.
+    `dataset`: the raster `path`, where it is open already.
     """
-    texts, tags = dict(texts), choices.pop("tags", None)
+    if isinstance(path, Path) and (path / LAST).is_file():
+        raise InputError(f"{path}: the folder of a finished run, with adjusted cameras: give one of its images")
+    texts, dataset = dict(texts), choices.pop("dataset", None)
+    tags = None if dataset is None else dataset.tags()
     size, holder = (choices.pop(key, texts.pop(key, None)) for key in ("size", "camera"))
     file = path if holder is None else location(holder)
     opener = _opener_of(file, {**texts, **choices}, tags if holder is None else None)
@@ -125,13 +130,29 @@ def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Cam
     camera = opener.open(file, **{**read, **choices})
     if holder is not None:
         camera = _of_tile(camera, path)
-    if isinstance(size, str):
+    frame = None if dataset is None else _frame(dataset)
+    if frame is not None:
+        size = frame.size
+    elif isinstance(size, str):
         size = _parse_choice(_parse_size, "size", size, file)
     elif size is None:  # of the image's own pixels; those of a grid are not the image's
-        size = _raster_size(path) if holder is not None or opener.whole or camera.size is None else None
+        wanted = holder is not None or opener.whole or camera.size is None
+        frame = _raster_frame(path) if wanted else None
+        size = None if frame is None else frame.size
     if opener.whole and size not in (None, camera.size):
         raise InputError(f"{path}: is {size} px large, its physical model in {camera.path} of {camera.size}")
-    return camera if size is None else replace(camera, size=size)
+    return _doubted(camera if size is None else replace(camera, size=size), frame)
+
+
+def checked(camera: Camera, dataset: Any) -> Camera:
+    """Return a camera with the doubts that the open raster of its image raises."""
+    return _doubted(camera, _frame(dataset))
+
+
+def _doubted(camera: Camera, frame: RasterFrame | None) -> Camera:
+    if camera.size is None or not isinstance(camera.model, RPC):
+        return camera
+    return replace(camera, doubts=doubts_of(camera.model, camera.size, frame))
 
 
 def _opener_of(file: PathOrUrl, given: Mapping[str, Any], tags: Mapping[str, str] | None) -> Opener:
@@ -207,12 +228,16 @@ def _parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _raster_size(path: PathOrUrl) -> tuple[int, int] | None:
+def _raster_frame(path: PathOrUrl) -> RasterFrame | None:
     try:
         with open_raster(path) as dataset:
-            return int(dataset.width), int(dataset.height)
+            return _frame(dataset)
     except ImageError:
         return None
+
+
+def _frame(dataset: Any) -> RasterFrame:
+    return RasterFrame((int(dataset.width), int(dataset.height)), dataset.transform, dataset.crs)
 
 
 def _open_rpc(path: PathOrUrl, first_pixel: float | None = None, band: int = 1) -> Camera:

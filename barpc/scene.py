@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, RpcError
 from barpc.base.frozen import Frozen, Shown
 from barpc.base.geodesy import Array, HeightDatum
 from barpc.base.geodesy import BoolArray as BoolArray
@@ -25,6 +25,14 @@ SIGMA_RANGE = 1e-6, 1e9
 
 Terrain = Callable[[Array, Array], Array]
 """lon, lat (...) [deg] -> altitude (...) [m above the ellipsoid], NaN where it is unknown."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A reason why a camera is not that of its image: a sentence on the image; `refused`: the camera is of no use."""
+
+    sentence: str
+    refused: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +50,21 @@ class Camera(Shown):
     """The altitudes [m above the ellipsoid] that it is made for."""
     notes: tuple[str, ...] = ()
     """What the user should know."""
+    doubts: tuple[Doubt, ...] = ()
+    """Reasons why it is not the camera of its image, the worst first (`barpc.rpcio.plausible`)."""
     sensor: str = ""
     """The sensor and band that the metadata state (WV02_P, PHR1B_PAN); empty where they do not, or none were read."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the user should know, doubts included, in sentences."""
+        return (*self.notes, *(doubt.sentence for doubt in self.doubts))
+
+    def require_usable(self, image: PathOrUrl | str) -> None:
+        """Raise RpcError where it is of no use for its image."""
+        for doubt in self.doubts:
+            if doubt.refused:
+                raise RpcError(f"{image}: {doubt.sentence}: give the RPC of these pixels (IMAGE,camera=FILE)")
 
     def __repr__(self) -> str:
         place = self.path if len(str(self.path)) <= 50 else self.path.name

@@ -20,7 +20,10 @@ GEOID_HELP = (
     "Geoid of the heights of a DEM or of ground points: `egm96`, `egm2008`, the file of a grid, or `none` for "
     "ellipsoidal heights. Without: the one that their file names."
 )
-HEIGHTS_HELP = "Vertical datum of heights in files that state none: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid."
+HEIGHTS_HELP = (
+    "Vertical datum of heights in files that state none: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid; `flat`: "
+    "ellipsoidal, and ground points may all have one altitude."
+)
 MOST_POINTS = (TABLE.most or 0) // (5 * BYTES_PER_NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""
 

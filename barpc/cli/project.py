@@ -53,7 +53,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
     ground = verbs.with_altitudes(given, None, terrain)
     found = camera.model.project(ground)
     _print_points(("col", "row"), found, (6, 6))
-    if wrong := verbs.exchanged(camera, np.nan_to_num(ground)):
+    if wrong := verbs.far_outside(camera, np.nan_to_num(ground)):
         return tell_gate(f"{image}: {wrong}", [])
     return _tell_failures(found, "could not be projected")
 
@@ -77,6 +77,8 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
         at[without, 2] = verbs.altitude_of(camera, place_of(image), alt)
     ground = verbs.ground_at(camera, at[:, :2], at[:, 2], terrain)
     _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
+    if wrong := verbs.far_outside(camera, ground):
+        return tell_gate(f"{image}: {wrong}", [])
     return _tell_failures(ground, "have no ground point")
 
 

@@ -149,6 +149,8 @@ def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     heights, which are above the ellipsoid first, whatever the DEM counts from. Where the DEM has no height, there are
     no pixels; without a DEM all ground is at one altitude.
 
+    Exit code 3: the camera of an image may be another's; a line states the reason.
+
     \b
     Examples:
       barpc ortho adjusted --dem srtm.tif --geoid egm96 -o maps
@@ -160,7 +162,8 @@ def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
         done = orthoimages.ortho(images, out_dir, progress=progress, **given_flags(flags))
     lines = (f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}" for one in done)
     tell([{**asdict(one), "path": str(one.path)} for one in done], *lines)
-    return 0
+    doubts = [doubt for one in done for doubt in one.doubts]
+    return tell_gate("Cameras may not be those of their images.", doubts) if doubts else 0
 
 
 @click.command("dsm")

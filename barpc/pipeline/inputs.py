@@ -15,7 +15,7 @@ import numpy as np
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.declarations import declared
 from barpc.base.errors import InputError, listed
-from barpc.base.geodesy import Array, ecef_from_ground, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, fingerprint
 from barpc.base.options import RunOptions
 from barpc.base.remote import here, located, location
@@ -27,11 +27,11 @@ from barpc.pointio.matches import Links, read_links, tracks_of
 from barpc.pointio.names import ViewNames
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import hashed
-from barpc.rasters.vertical import ELLIPSOIDAL, NO_GEOID, geoid_file
+from barpc.rasters.vertical import ELLIPSOIDAL, FLAT, NO_GEOID, geoid_file, metres_of
 from barpc.report import Run
 from barpc.report.runfiles import table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
-from barpc.sensor.geometry import footprint, ground_sample_distance
+from barpc.sensor.geometry import footprint, ground_sample_distance, triangulate
 from barpc.tie import Matches
 from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped
@@ -82,7 +82,7 @@ def with_located(options: RunOptions) -> RunOptions:
         return path if here([found]) else os.fspath(versioned(found, IMAGE))
 
     geoid, heights = (None if name is None else geoid_file(name) for name in (options.geoid, options.heights))
-    geoid, heights = (path if path in (None, NO_GEOID, ELLIPSOIDAL) else at(path) for path in (geoid, heights))
+    geoid, heights = (path if path in (None, NO_GEOID, ELLIPSOIDAL, FLAT) else at(path) for path in (geoid, heights))
     dem, reference = (tuple(map(at, paths)) for paths in (options.dem, options.reference))
     return replace(options, dem=dem, geoid=geoid, heights=heights, reference=reference)
 
@@ -255,6 +255,9 @@ def _matches_inside(path: str | Path, views: Sequence[View], links: Links) -> Li
 _MAX_CAMERA_ERROR = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
 
+_LEAST_FOR_UNIT, _LEAST_MISFIT, _FEWER = 3, 3.0, 5.0
+"""Points in several images, metres that altitudes scatter by, and times less in another unit, that tell the unit."""
+
 _MISTAKES = {
     "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
     "names its columns": ((1, 0), (1, 1)),
@@ -330,7 +333,7 @@ def _with_altitudes(
     if not unknown.any():
         return points, []
     ground, sigma, count = points.lonlatalt.copy(), points.sigma.copy(), int(unknown.sum())
-    what = f"{count} of {len(unknown)} points have no altitude, or 0 as tools write for none"
+    what = f"{count} of {len(unknown)} points have no altitude, or a default (0, or one for all)"
     if dem is not None:
         height = dem(*ground[unknown, :2].T)
         known = unknown.copy()
@@ -370,11 +373,15 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     away = _distance(points, shown, (0, 1), (1, 1))
     yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"
     far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
+    size = np.array([view.size for view in views])[points.view]
+    beyond = (points.xy < -_IMAGE_MARGIN) | (points.xy > size - 1 + _IMAGE_MARGIN)
+    outside = _any(points, np.asarray(beyond.any(axis=1)))
     for what, (columns, *signs) in _MISTAKES.items():
         near = [_distance(points, shown, columns, sign) <= reach for sign in signs]
         mistaken = far & _any(points, np.asarray(np.any(near, axis=0)))
         yield mistaken, what
         far &= ~mistaken
+    yield outside, "outside its image: col from the left and row from the top, in pixels of this image"
     most = np.max(away[far[points.point]], initial=0.0) / 1e3
     yield far, f"as far as {most:,.0f} km from where the images show it, by their cameras"
     wild = (alt < low - _ALT_REACH) | (alt > high + _ALT_REACH)
@@ -382,6 +389,30 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     yield (
         _any(points, wild),
         f"altitudes far outside {ends}, where the cameras are used: metres above the ellipsoid are needed",
+    )
+    if what := _in_another_unit(points, views):
+        yield np.ones(len(points.names), dtype=bool), what
+
+
+def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:
+    """Return how the altitudes of points seen in several images fit these in another unit; empty where they do not."""
+    seen = triangulate(
+        [view.sensor for view in views], points.view, points.point, points.xy, alt=np.mean([v.altitude for v in views])
+    )
+    shown = np.full(len(points.names), np.nan)
+    shown[: len(seen.points)] = ground_from_ecef(seen.points)[:, 2]
+    known = np.isfinite(shown)
+    if known.sum() < _LEAST_FOR_UNIT:
+        return ""
+    shown, given = shown[known], points.lonlatalt[known, 2]
+    foot = metres_of("foot") or np.nan
+    as_given, feet, metres = (float(np.std(shown - times * given)) for times in (1.0, foot, 1.0 / foot))
+    if as_given < _FEWER * min(feet, metres) or as_given < _LEAST_MISFIT:
+        return ""
+    unit, left = ("feet", feet) if feet < metres else ("metres and not feet", metres)
+    return (
+        f"altitudes scatter by {as_given:.1f} m from where the images show the points, and by {left:.1f} m if they are "
+        f"in {unit}: name the unit in the column (alt_ft)"
     )
 
 

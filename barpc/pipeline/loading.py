@@ -23,7 +23,7 @@ from barpc.base.geodesy import ALTITUDES
 from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import PathOrUrl, here, located
 from barpc.base.safe_io import IMAGE, plain_path, versioned
-from barpc.cameras import open_split, split_spec
+from barpc.cameras import checked, open_split, split_spec
 from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
@@ -149,18 +149,19 @@ def _open_image(
             raise ImageError(f"{file}: has {dataset.count} band(s), no band {band}")
         tags = dataset.tags()
         if isinstance(image, View):
-            camera = Camera(image.sensor, file, "given", image.size, image.alt_range)
+            camera = checked(Camera(image.sensor, file, "given", image.size, image.alt_range), dataset)
             if image.size != size:
                 raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
         else:
             _, choices = split_spec(image, hosts)
             if "camera" in choices:  # as the image: no file has two names in a run
                 choices["camera"] = os.fspath(located(choices["camera"], hosts).absolute())
-            camera = open_split(file, choices, size=size, tags=tags)
+            camera = open_split(file, choices, dataset=dataset)
             if camera.format in ("grid", "correction") and "camera" not in choices:
                 raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
         taken = read_acquisition(file, camera.path)
         camera = replace(camera, sensor=taken.sensor)
+        camera.require_usable(file)
         day = (image.date if isinstance(image, View) else "") or taken.day(tags)
         view = View(name, os.fspath(file), size, camera.model, _altitudes_used(camera), day)
         ring = footprint(view.sensor, size, view.altitude)

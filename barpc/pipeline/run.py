@@ -31,6 +31,7 @@ from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.calibrate import calibrated, calibrations_of, common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
+from barpc.pipeline.exchanged import exchanged_cameras
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
 from barpc.pipeline.inputs import (
@@ -286,7 +287,7 @@ def check(
     Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
-    run = _with_ties(_with_views("check", images, options, work), options, work)
+    run = _with_own_cameras(_with_ties(_with_views("check", images, options, work), options, work), options, work)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
 
@@ -345,7 +346,7 @@ def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[st
 
 def _tied_and_adjusted(run: Run, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work) -> Run:
     with workspace.stage("tie points"):
-        run = _with_ties(run, options, work, dem)
+        run = _with_own_cameras(_with_ties(run, options, work, dem), options, work, dem)
     if options.stop_after == "matching":
         _write_asp_matches(run, workspace)
         return replace(run, kind="match")
@@ -471,6 +472,21 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return _with_ties(kept, options, work, terrain)
     detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
     return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
+
+
+def _with_own_cameras(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:
+    """Return the run; InputError where images fit each other's cameras, or with `keep_going` the run without them."""
+    found = exchanged_cameras(run.views, run.tracks)
+    if found is None:
+        return run
+    names = [view.name for view in run.views]
+    sentence = found.sentence(names)
+    others = frozenset(name for i, name in enumerate(names) if i not in found.views)
+    if not options.keep_going or len(others) < 2:
+        raise InputError(f"{sentence}: give each image its own RPC (IMAGE,camera=FILE)")
+    logger.warning("%s: left out", sentence)
+    kept = _only(run, others, {names[view]: sentence for view in found.views})
+    return _with_ties(kept, options, work, terrain)
 
 
 def _write_asp_matches(run: Run, workspace: Workspace) -> None:

@@ -24,7 +24,7 @@ from barpc.pointio.names import ViewNames
 from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
 from barpc.rasters.crs import crs_of
 from barpc.rasters.dem import HeightGrid, datum_of
-from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of, vertical_of
+from barpc.rasters.vertical import ELLIPSOID, FLAT, Vertical, geoid_of, vertical_of
 from barpc.scene import GroundPoints, IntArray
 
 
@@ -146,6 +146,9 @@ def _assembled(
 def _geolocated(place: Array, table: GcpTable, frame: ControlReference) -> tuple[Array, tuple[HeightDatum, ...], str]:
     """Return lon, lat, altitude [m above the ellipsoid; 0: none], their assumed datums, and remarks."""
     crs, vertical, words = frame.crs or table.crs, table.vertical, list[str]()
+    if frame.heights != FLAT and len(place) >= _ALIKE and place[0, 2] != 0.0 and (place[:, 2] == place[0, 2]).all():
+        words.append(f"all altitudes are {place[0, 2]:.10g}: a default, taken as none (--heights {FLAT} if measured)")
+        place = place * (1.0, 1.0, 0.0)
     if frame.crs and table.crs and frame.crs != table.crs:
         words.append(f"instead of the file's reference system {table.crs[:40]!r}")
     if crs:
@@ -179,6 +182,7 @@ def _lift(ground: Array, known: BoolArray, vertical: Vertical, by_person: str | 
             ground[known, 2] += HeightGrid.open(file).sample(*ground[known, :2].T)
 
 
+_ALIKE = 3  # points whose altitudes are the same to the last digit: no survey has them
 # --- reference systems ----------------------------------------------------------------------------------
 
 

@@ -20,6 +20,7 @@ from barpc.base.remote import location
 
 ELLIPSOID, UNKNOWN = "ellipsoid", "unknown"
 NO_GEOID, ELLIPSOIDAL = "none", "ellipsoidal"
+FLAT = "flat"  # ellipsoidal, of points that are all at the same altitude, where else that is taken for a default
 """Said in place of a geoid: heights are ellipsoidal."""
 _GEOID_NAMES = (("egm2008", "egm2008"), ("egm08", "egm2008"), ("egm96", "egm96"), ("egm84", "egm96"))
 _OTHERS = "egm96"  # of any other orthometric datum, from which it lies a metre or two
@@ -57,7 +58,7 @@ class Vertical:
         """Return the same with the user's geoid: a name or a file, `NO_GEOID`, or nothing (None)."""
         if geoid is None:
             return self
-        return replace(self, geoid=None if geoid.lower() in (NO_GEOID, ELLIPSOIDAL) else geoid, provenance=STATED)
+        return replace(self, geoid=None if geoid.lower() in (NO_GEOID, ELLIPSOIDAL, FLAT) else geoid, provenance=STATED)
 
 
 def metres_of(unit: str) -> float | None:
@@ -109,7 +110,7 @@ _OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
 """15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
 _IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
 GEOIDS = (*_OWN, *_IN_PROJ)
-WORDS = (NO_GEOID, ELLIPSOIDAL, *GEOIDS)
+WORDS = (NO_GEOID, ELLIPSOIDAL, FLAT, *GEOIDS)
 
 
 def geoid_file(given: str | os.PathLike[str]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from barpc.ba import Adjustment
 from barpc.ba.constraints.ground import KNOWN_BIAS
-from barpc.base.geodesy import DEFAULT, HeightDatum
+from barpc.base.geodesy import DEFAULT, STATED, HeightDatum
 from barpc.base.statistics import SURE, SURELY
 from barpc.report.summary.words import metres
 
@@ -19,6 +19,9 @@ _SIDE_SHARES = {"gcps": "gcps", "heights": "reference"}
 _FLAGS = ("--heights ellipsoidal", "--heights egm96"), ("--geoid none", "--geoid egm96")
 """Flags for ellipsoidal heights and for those above sea level: of points, of a DEM."""
 _UP = 2  # place of the scene's height among its motions, after east and north
+
+_AS_UNDULATION, _LEAST_UNDULATION = 3.0, 10.0
+"""How near a shift is to the geoid's height that it equals, and the least height that tells it from none [m]."""
 
 Evidence = list[tuple[float, float]]
 """Offsets of heights above others, and their standard deviations [m]."""
@@ -39,6 +42,12 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: f
         fits = SURELY**2 * len(offset)
         if other <= fits < taken and taken - other > 2.0 * SURE:
             yield _contradicted(one, offset[np.argmin(sigma)])
+        elif one.source == "gcps" and _is_undulation(one, adjustment, share):
+            yield (
+                f"{one.name} move the scene by {abs(one.otherwise):.0f} m in height, as far as the geoid is from the "
+                "ellipsoid here, and no farther aside than its standard deviation: their altitudes seem to be "
+                f"{'ellipsoidal' if one.converted else 'above sea level'}. {_cure(one)}"
+            )
         elif one.provenance == DEFAULT and not (taken <= fits and other - taken > 2.0 * SURE):
             ellipsoidal, geoid = _FLAGS[one.source == "heights"]
             if shifts := _shifts(one, adjustment, share, lean):
@@ -47,6 +56,22 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: f
                     f"if they are above sea level, the scene is {shifts}, and neither the cameras nor other heights "
                     f"show it. Give {ellipsoidal}, or {geoid}."
                 )
+
+
+def _cure(one: HeightDatum) -> str:
+    if one.provenance == STATED:
+        return "Their file states the opposite: check it."
+    flags = _FLAGS[one.source == "heights"]
+    return f"Give {flags[not one.converted]}, or {flags[one.converted]} to confirm the present datum."
+
+
+def _is_undulation(one: HeightDatum, adjustment: Adjustment, share: float) -> bool:
+    """Return whether control moves the scene by the height of the geoid, and by no camera error."""
+    gauge = adjustment.gauge
+    with np.errstate(all="ignore"):
+        up, aside = gauge.shift[_UP] / share, np.abs(gauge.shift[:_UP]) / gauge.delivered_sigma[:_UP]
+    far = abs(one.otherwise) > _LEAST_UNDULATION
+    return bool(far and abs(up + one.otherwise) <= _AS_UNDULATION and (aside <= 1.0).all())
 
 
 def _shifts(one: HeightDatum, adjustment: Adjustment, share: float, lean: float) -> str:
@@ -59,11 +84,11 @@ def _shifts(one: HeightDatum, adjustment: Adjustment, share: float, lean: float)
 
 def _contradicted(one: HeightDatum, offset: float) -> str:
     geoid = f"{metres(abs(one.otherwise))} {'above' if (one.otherwise > 0) != one.converted else 'below'}"
-    seems, flag = ("ellipsoidal" if one.converted else "above sea level"), _FLAGS[one.source == "heights"]
+    seems = "ellipsoidal" if one.converted else "above sea level"
     return (
         f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} the ground by the "
         f"delivered cameras, or by other heights, and the geoid lies {geoid} the ellipsoid here: they seem to "
-        f"be {seems}. Give {flag[not one.converted]}, or the opposite to confirm the present datum."
+        f"be {seems}. {_cure(one)}"
     )
 
 

@@ -51,9 +51,12 @@ def _reservations(view: ViewEntry, run: Run) -> Causes:
     adjustment = run.adjustment
     if adjustment is not None:
         yield from _failed(view, run, adjustment)
-    yield from _weakly_tied(view, run)
     if run.kind == "match":  # cameras are not judged
+        yield from _weakly_tied(view, run)
         return
+    for doubt in run.sources[run.number[view.name]].doubts if run.sources else ():
+        yield "other_pixels", {"doubt": doubt.sentence}
+    yield from _weakly_tied(view, run)
     if view.name in run.copies:
         yield "copy", {"other": run.copies[view.name]}
     if adjustment is not None:

@@ -151,8 +151,7 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
             f"The cameras are {common:.1f} times less accurate than stated: their standard deviations were widened, "
             "and with them the uncertainty of the scene's position."
         )
-    if _is_bent(found):
-        yield from _of_image_model(found)
+    yield from _of_image_model(found)
     if found.apart is not None and not found.apart.clear:
         error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"
         yield (
@@ -160,11 +159,6 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
             "them the rest agree, with all of them they do not. The tie points do not tell which: check the RPCs, or "
             "add an image."
         )
-
-
-def _is_bent(found: Adjustment) -> bool:
-    """Return whether tilts, twist and bending make heights at the scene's edge less certain than the scene's own."""
-    return bool(found.gauge.motion_sigma[_SHAPE].max() > found.gauge.sigma[2])
 
 
 def _of_image_model(found: Adjustment) -> Iterator[str]:
@@ -324,8 +318,6 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they shifted it by {enu(heights.motion)}."
         )
-    if not _is_bent(run.adjustment):
-        yield from _of_image_model(run.adjustment)
     yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:

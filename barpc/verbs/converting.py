@@ -195,7 +195,7 @@ def _copy(camera: Camera, image: Path, target: str, choices: ConvertOptions) -> 
         write_camera(camera.rpc, target, image, overwrite=choices.overwrite, size=camera.size)
     else:
         write_rpc(camera.rpc, target, format=choices.rpc_format, overwrite=choices.overwrite, size=camera.size)
-    return replace(_read_back(camera, camera.rpc, target), notes=camera.notes)
+    return replace(_read_back(camera, camera.rpc, target), notes=camera.remarks)
 
 
 def _read_back(camera: Camera, rpc: RPC, target: str) -> Converted:

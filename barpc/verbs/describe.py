@@ -118,7 +118,7 @@ def _describe(camera: Camera, alt: float, at: tuple[float, ...] | None) -> dict[
     """Return all figures of a camera as plain values."""
     report: dict[str, Any] = {
         "rpc": f"{camera.format} in {camera.path}",
-        "notes": list(camera.notes),
+        "notes": list(camera.remarks),
         "first_pixel": "its centre is (0, 0)",
         "altitude_range_m": list(camera.alt_range),
     }

@@ -19,7 +19,7 @@ from barpc.cameras import ImageLike, file_of, open_camera, read_points, split_sp
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit.points import terrain_range
 from barpc.rpcio import read_rpc, write_camera
-from barpc.scene import Camera
+from barpc.scene import Camera, Doubt
 from barpc.sensor import SensorModel
 from barpc.tie.tasks import Progress
 from barpc.verbs.converting import check_target
@@ -32,16 +32,17 @@ _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit as its file holds it, the tolerance [px] asked for, and whether the file was written."""
+    """A fit as its file holds it, the tolerance [px] asked for, whether it was written, and doubts on its camera."""
 
     fit: RpcFit
     tolerance: float
     written: bool = False
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def verdict(self) -> str:
-        """Reason why the fit misses the tolerance; empty where it meets it."""
-        return self.fit.verdict(self.tolerance)
+        """Reason why the fit misses the tolerance, or its camera is not its image's; empty without one."""
+        return self.fit.verdict(self.tolerance) or "; ".join(one.sentence for one in self.doubts)
 
 
 def fit(
@@ -71,7 +72,8 @@ def fit(
     Raises
     ------
     FitError
-        The RPC misses the tolerance, and nothing is written; with `keep_going`, or without `output`, it is returned.
+        The RPC misses the tolerance, or its camera may be another image's, and nothing is written; with `keep_going`,
+        or without `output`, it is returned.
     InputError, OutputError
         See `barpc.base.errors`.
 
@@ -105,9 +107,9 @@ def fitted(
     if output is not None:
         check_target(output, [place_of(source)], choices.overwrite)
     tell("fit", 0, 1)
-    found, size = _fit_source(source, of_fit, choices)
+    found, size, doubts = _fit_source(source, of_fit, choices)
     tell("fit", 1, 1)
-    done = Fitted(found, of_fit.tolerance)
+    done = Fitted(found, of_fit.tolerance, doubts=doubts)
     if output is None or (done.verdict and not choices.keep_going):
         return done
     return _write_rpc_file(done, os.fspath(place_of(source)), output, choices, size)
@@ -115,8 +117,8 @@ def fitted(
 
 def _fit_source(
     source: ImageLike | SensorModel, options: FitOptions, choices: RefitOptions
-) -> tuple[RpcFit, tuple[int, int] | None]:
-    """Return the fit, and the image's width and height, if known."""
+) -> tuple[RpcFit, tuple[int, int] | None, tuple[Doubt, ...]]:
+    """Return the fit, the image's width and height, if known, and the doubts on its camera."""
     spec = os.fspath(source) if isinstance(source, (str, os.PathLike)) else ""
     points, size = read_points(spec) if spec else (None, None)
     if points is not None:
@@ -127,11 +129,12 @@ def _fit_source(
             valid = f"{flat}: the RPC has no terms in height and is valid at that altitude only"
             warnings.warn(valid, Remark, stacklevel=4)
         ground, image, sigma = points.ground, points.image, points.sigma
-        return fit_rpc_points(ground, image, sigma=sigma, size=size, options=options, strict=False), size
+        return fit_rpc_points(ground, image, sigma=sigma, size=size, options=options, strict=False), size, ()
     camera = open_camera(source)
+    camera.require_usable(place_of(source))
     if spec and split_spec(spec)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
-    return _fit_camera(camera, options, choices), camera.size
+    return _fit_camera(camera, options, choices), camera.size, camera.doubts
 
 
 def _fit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> RpcFit:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import glob
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError, Remark
+from barpc.base.manifest import LAST
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.safe_io import IMAGE, read_head, unread
 from barpc.cameras import ImageLike, file_of, open_camera, split_spec
@@ -85,6 +87,10 @@ def _matching_files(name: str) -> list[str]:
             if find_annotation(path):
                 return [name]
             raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
+        if (path / LAST).is_file():
+            warnings.warn(
+                f"{name}: the folder of a finished run: its cameras are adjusted already", Remark, stacklevel=2
+            )
         from barpc.report.finished import FinishedRun  # after all: most images are given by their names
 
         FinishedRun.refuse_edited(path, map(Path, rasters), of_images=True)

@@ -54,13 +54,17 @@ _WGS84 = CRS.from_epsg(4326)
 
 @dataclass(frozen=True)
 class Ortho(Shown):
-    """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with."""
+    """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with.
+
+    `doubts`: reasons why the camera is not that of its image, in sentences.
+    """
 
     path: Path
     crs: str
     gsd: float
     size: tuple[int, int]
     heights: str
+    doubts: tuple[str, ...] = ()
 
 
 def ortho(
@@ -82,8 +86,8 @@ def ortho(
 
     Raises
     ------
-    InputError, FitError
-        A camera without an RPC, complex pixels, a DEM without heights under an image.
+    InputError, FitError, RpcError
+        A camera without an RPC, or not its image's; complex pixels; a DEM without heights under an image.
     OutputError
         A file that exists or cannot be written.
 
@@ -107,17 +111,20 @@ def ortho(
         cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
         terrain = _terrain_of(scene.run) if terrain is None and alt is None else terrain
         alt = scene.summary.altitude_m if alt is None else alt
+    for camera, file in zip(cameras, files, strict=True):
+        camera.require_usable(file)
     middles = [one.model.localize((np.array(one.extent) - 1) / 2, np.array(one.altitude)) for one in cameras]
     sides = [float(ground_sample_distance(one.rpc, at)[1]) for one, at in zip(cameras, middles, strict=True)]
     grid = map_crs(choices.crs, middles[0]), float(choices.gsd or 0.0) or float(f"{min(sides):.2g}")
     names, done = [f"{name}.tif" for name in unique_names(files)], list[Ortho]()
     with Workspace(out_dir, overwrite=choices.overwrite, keep=files, names=names, adds=True) as workspace:
         for name, camera, file in zip(names, cameras, files, strict=True):
+            doubts = tuple(f"{file.name}: {one.sentence}." for one in camera.doubts)
             warp = _Warp.of(camera, file, terrain, alt, grid, workspace.partial)
             warp.write(rough := workspace.partial / "rough.tif", file, progress)
             with workspace.output(name) as partial, rasterio.Env(**GDAL_OPTIONS):
                 rasterio.shutil.copy(rough, partial, driver="COG", **_COG)
-            done.append(Ortho(workspace.folder / name, grid[0].to_string(), grid[1], warp.size, warp.words))
+            done.append(Ortho(workspace.folder / name, grid[0].to_string(), grid[1], warp.size, warp.words, doubts))
     return done
 
 

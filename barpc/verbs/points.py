@@ -56,7 +56,7 @@ def project(
     Warns
     -----
     BarpcWarning
-        Points outside an image that covers them with longitude and latitude exchanged.
+        Points farther off the image than its size, or that it covers with longitude and latitude exchanged.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def project(
     """
     camera, terrain = open_camera(image), terrain_of(dem, geoid)
     points = with_altitudes(ground, alt, terrain)
-    if wrong := exchanged(camera, np.nan_to_num(points.reshape(-1, 3))):
+    if wrong := far_outside(camera, np.nan_to_num(points.reshape(-1, 3))):
         warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
     return camera.model.project(points)
 
@@ -102,6 +102,8 @@ def localize(
     -----
     Remark
         An altitude was assumed.
+    BarpcWarning
+        Points farther off the image than its size.
 
     Examples
     --------
@@ -112,8 +114,12 @@ def localize(
     camera, terrain, points = open_camera(image), terrain_of(dem, geoid, alt), as_image(at)
     if terrain is None:
         level = altitude_of(camera, place_of(image)) if alt is None else alt
-        return camera.model.localize(points, as_numbers(level, "altitudes"))
-    return ground_at(camera, points.reshape(-1, 2), 0.0, terrain).reshape(*points.shape[:-1], 3)
+        found = camera.model.localize(points, as_numbers(level, "altitudes"))
+    else:
+        found = ground_at(camera, points.reshape(-1, 2), 0.0, terrain).reshape(*points.shape[:-1], 3)
+    if wrong := far_outside(camera, found.reshape(-1, 3)):
+        warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
+    return found
 
 
 def triangulate(images: Sequence[ImageLike | SensorModel], at: npt.ArrayLike) -> tuple[Array, Array]:
@@ -238,6 +244,18 @@ def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None)
 
 
 # --- coordinates in another order -------------------------------------------------------------------------
+
+
+def far_outside(camera: Camera, ground: Array) -> str:
+    """Return a remark on points (N, 3) farther off an image than its size, where no camera was fitted; else empty."""
+    if wrong := exchanged(camera, ground):
+        return wrong
+    if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
+        return ""
+    off = ~_on_image(camera, ground) & np.isfinite(camera.model.project(ground)).all(axis=1)
+    if not (count := int(off.sum())):
+        return ""
+    return f"{count} of {len(off)} points lie farther off the image than its size, where its camera is not made for"
 
 
 def exchanged(camera: Camera, ground: Array) -> str:

@@ -116,6 +116,8 @@ CAUSES = {
         "check for clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
     "one_rpc_misses": Cause("failed", "RPC fit misses its tolerance",
         "one RPC does not fit the corrected camera to {tolerance:g} px", "lower --drift, or use its grid (--grids)"),
+    "other_pixels": Cause("doubtful", "RPC of other pixels", "{doubt}",
+        "give the RPC of these pixels (IMAGE,camera=FILE)"),
     "contradicted": Cause("doubtful", "contradicts the others",
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
         "check that the RPC belongs to this image (IMAGE,camera=FILE names another), and for clouds, water, change"),
