@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
+
+import numpy as np
 
 from barpc.base.errors import ImageError, RpcFormatError
 from barpc.base.safe_io import parse_xml
@@ -29,6 +32,8 @@ from barpc.rpcio.text import (
     rpc_from_fields,
 )
 from barpc.sensor.rpc import RPC
+
+_HEIGHT_DEFAULT = "HEIGHT_DEFAULT"  # of GDAL's RPC domain: the altitude of the scene's ground [m]
 
 
 def _xml_root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
@@ -159,13 +164,18 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
     """Return the RPC in GDAL's metadata domain; other keys are passed over."""
     fields = {key: listed_numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
-    return rpc_from_fields(fields, name, options)
+    rpc = rpc_from_fields(fields, name, options)
+    if _HEIGHT_DEFAULT not in items:
+        return rpc
+    level = next(iter(listed_numbers(items[_HEIGHT_DEFAULT], name, _HEIGHT_DEFAULT)), np.nan)
+    return replace(rpc, height_default=level) if np.isfinite(level) else rpc
 
 
 def rpc_domain(rpc: RPC) -> str:
     """Return the `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
+    fields = fields_from_rpc(rpc, direct=True)
+    fields |= {} if rpc.height_default is None else {_HEIGHT_DEFAULT: [rpc.height_default]}
     rows = [
-        f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>'
-        for key, values in sorted(fields_from_rpc(rpc, direct=True).items())
+        f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>' for key, values in sorted(fields.items())
     ]
     return "\n".join(['  <Metadata domain="RPC">', *rows, "  </Metadata>"])

@@ -54,6 +54,7 @@ class RPC(Pointwise):
     direct : (4, 20), optional
         The localisation RPC: numerator and denominator of the longitude, then of the latitude, in RPC00B order with the
         column for L and the row for P, normalised alike. `localize` inverts `coeffs` instead, which is exact.
+    height_default : float or None, altitude of the ground [m], where the file states it (HEIGHT_DEFAULT of GDAL)
 
     Raises
     ------
@@ -77,6 +78,7 @@ class RPC(Pointwise):
     err_bias: float | None = None
     err_rand: float | None = None
     direct: Array | None = None
+    height_default: float | None = None
     _map: Rational = field(init=False, repr=False)
     _memory: ClassVar[int] = 27  # monomials, normalised coordinates, polynomials
 

@@ -193,7 +193,8 @@ def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: De
 
 
 def altitude_of(camera: Camera, image: PathOrUrl, given: float | None = None) -> float:
-    """Return the altitude of an image's ground [m]: as given, of the tie points of its run, else the camera's middle.
+    """Return the altitude of an image's ground [m]: as given, of the tie points of its run, as its RPC states it, else
+    the middle of the camera's.
 
     Where nothing is known of the ground a Remark says so, and what that may be worth.
     """
@@ -203,6 +204,9 @@ def altitude_of(camera: Camera, image: PathOrUrl, given: float | None = None) ->
         known = _altitudes_beside(path.absolute()).get(path.name) if isinstance(path, Path) else None
         if known is not None:
             return known
+    stated = camera.model.height_default if isinstance(camera.model, RPC) else None
+    if stated is not None:
+        return stated
     warnings.warn(f"{image}: {_unknown(camera)}; give --alt or --dem", Remark, stacklevel=3)
     return camera.altitude
 
