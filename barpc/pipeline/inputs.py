@@ -162,7 +162,7 @@ def hash_inputs(
 
     `seen` holds the files that were opened so far. A matcher of the user's goes by its name, with all its files.
     """
-    images = [view.path for view in run.views]
+    images = [view.path for view in (*run.views, *(one.view for one in run.carried))]
     rasters = dict.fromkeys([*images, *reference_names(options)])
     given = (os.fspath(path.absolute()) for path in input_files(options) if path.is_file())
     others = dict.fromkeys([*seen, *given])

@@ -29,6 +29,7 @@ from barpc.base.safe_io import plain_path
 from barpc.base.sealed import portable
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
+from barpc.pipeline.acquisitions import one_each
 from barpc.pipeline.calibrate import calibrated, calibrations_of, common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
 from barpc.pipeline.exchanged import exchanged_cameras
@@ -186,6 +187,7 @@ def adjust(
             workspace.note({portable(one.path, workspace.folder): one.stamp} if one.stamp is not None else {})
         root = workspace.seal()
     views = [replace(view, sensor=one) for view, one in zip(run.views, run.after or run.before, strict=True)]
+    views += [replace(one.view, sensor=one.fit.rpc) for one in run.carried if one.fit is not None]
     return AdjustResult(_as_given(views, images, options), run, summary, root)
 
 
@@ -256,6 +258,7 @@ def _portable_run(run: Run, folder: Path) -> Run:
         run,
         views=tuple(replace(view, path=at(view.path)) for view in run.views),
         sources=tuple(replace(source, path=at(source.path)) for source in run.sources),
+        carried=tuple(replace(one, view=replace(one.view, path=at(one.view.path))) for one in run.carried),
         left_out=tuple((at(path), reason.replace(path, at(path))) for path, reason in run.left_out),
         options=replace(options, overwrite=False, **{key: at(value) for key, value in given.items() if value}),
     )
@@ -322,6 +325,18 @@ def _with_views(
         workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     run = Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier)
+    kept, carried = one_each(run.views, run.sources, options.tie.band, frozenset(earlier.number if earlier else ()))
+    run = replace(
+        run,
+        views=tuple(run.views[i] for i in kept),
+        sources=tuple(run.sources[i] for i in kept),
+        carried=carried,
+    )
+    if len(kept) < least:
+        one = carried[0]
+        raise InputError(
+            f"{one.view.name}: a band of {one.lead}, of one acquisition: give an image taken from elsewhere"
+        )
     run = replace(run, calibrated=calibrations_of(options.calibration, run.views, run.sources))
     if earlier is None or options.update:
         return run
@@ -332,12 +347,14 @@ def _with_views(
 def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[str], set[Path]]:
     """Return the files that a run writes and those that it keeps; what is in the way is refused before any work."""
     views = [view for view in run.views if view.name not in run.unwritten]
+    views += [one.view for one in run.carried]
     if options.stop_after == "matching":
         require_pair_names([view.name for view in views])
     if options.images == "vrt" and options.stop_after == "all":
         for view in views:
             plain_source(view.path)
-    inputs = (*(view.path for view in run.views), *(source.path for source in run.sources))
+    inputs = [*(view.path for view in run.views), *(source.path for source in run.sources)]
+    inputs += [path for one in run.carried for path in (one.view.path, one.source.path)]
     keep = {*here(inputs), *input_files(options)}
     names = output_names(views, options, folder)
     refuse_shadows(folder, names)
@@ -526,7 +543,12 @@ def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple
 def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
-    return replace(run, fits=tuple(_fits(run.views, run.cameras, run.adjustment, options, work)))
+    number = run.number
+    sensors = [one.camera(run.cameras[number[one.lead]]) for one in run.carried]
+    views = [*run.views, *(one.view for one in run.carried)]
+    fits = _fits(views, [*run.cameras, *sensors], run.adjustment, options, work)
+    carried = [replace(one, fit=fit) for one, fit in zip(run.carried, fits[len(run.views) :], strict=True)]
+    return replace(run, fits=tuple(fits[: len(run.views)]), carried=tuple(carried))
 
 
 def _fits(
@@ -577,10 +599,15 @@ def _written(run: Run, options: RunOptions, workspace: Workspace, work: Work) ->
     assert run.adjustment is not None
     every = zip(run.views, run.fits, run.cameras, strict=True)
     fitted = [one for one in every if one[0].name not in run.unwritten]
+    number = run.number
+    for band in run.carried:
+        assert band.fit is not None
+        fitted.append((band.view, band.fit, band.camera(run.cameras[number[band.lead]])))
     written = write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
     beyond = write_grids(workspace, fitted, options, work.executor, work.progress)
     names = [*written[0], *(name for one in beyond for name in one)]
     for sentence in unverified([workspace.folder / name for name in names]):
         logger.warning(sentence)
     found = {one[0].name: {**w, **more} for one, w, more in zip(fitted, written, beyond, strict=True)}
-    return replace(run, written=tuple(found.get(view.name, {}) for view in run.views))
+    carried = tuple(replace(band, written=found[band.view.name]) for band in run.carried)
+    return replace(run, written=tuple(found.get(view.name, {}) for view in run.views), carried=carried)

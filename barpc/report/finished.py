@@ -53,7 +53,8 @@ class FinishedRun:
             return
         run, names = cls.open(folder), {file.name for file in files}
         if of_images:
-            names |= {name for view in run.summary.views for name in view.outputs if name.endswith((".vrt", ".tif"))}
+            outputs = [view.outputs for view in run.summary.views] + [one.outputs for one in run.summary.carried or ()]
+            names |= {name for files in outputs for name in files if name.endswith((".vrt", ".tif"))}
         for name in sorted(names & run.sealed.listed.keys()):  # others may lie there, too
             path = run.sealed.file(name)
             for source in sources_of(path) if of_images else ():

@@ -20,7 +20,7 @@ from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
-from barpc.sensor.image_corrections import Calibrated
+from barpc.sensor.image_corrections import Calibrated, ImageAffine, ImageCorrected
 from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.report import FINE_STRUCTURE
@@ -69,6 +69,23 @@ class Added:
 
 
 @dataclass(frozen=True, eq=False)
+class Carried:
+    """An image that has the camera of another, up to a scale and a shift in the image, and gets its correction."""
+
+    view: View
+    source: Camera
+    lead: str  # name of the view whose correction it gets
+    step: Array  # (2,) pixels of this image a pixel of the lead's
+    start: Array  # (2,) place of the lead's first pixel in this image [px]
+    fit: RpcFit | None = None
+    written: Mapping[str, Mapping[str, float | str]] = field(default_factory=dict)  # as of a `Run`
+
+    def camera(self, lead: SensorModel) -> SensorModel:
+        """Return the camera of this image by that of its lead."""
+        return ImageCorrected(lead, ImageAffine(self.start, np.diag(self.step - 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
 class Run:
     """The results of a run.
 
@@ -102,6 +119,7 @@ class Run:
     unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
     added: Added | None = None
     calibrated: Mapping[str, Calibration] = field(default_factory=dict)  # view -> what its sensor does in every image
+    carried: tuple[Carried, ...] = ()  # other bands of its images, which get their corrections
 
     @property
     def known(self) -> frozenset[str]:

@@ -84,6 +84,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     reasons += [LeftOutEntry(path, reason).reason_text for path, reason in run.left_out]
     whole, points = [*_block_reasons(run, views)], [*_ground_reasons(run)]
     reasons += whole + points
+    bands = [*_carried_lines(run)]
     words = {"adjust": _adjusted_lines, "check": _checked_lines, "match": _matched_lines}[run.kind]
     num_bad = len(bad) + len(run.left_out)
     more = "the block needs" if whole else "ground points need" * bool(points)
@@ -91,9 +92,19 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
         "status": "bad" if num_bad else "look" if reasons else "good",
         "passed": not (num_bad or reasons),
         "headline": _headline(run, len(views), num_bad, len(look), more),
-        "verdict": [*words(run, views), *reasons],
+        "verdict": [*words(run, views), *bands, *reasons],
         "reasons": reasons,
     }
+
+
+def _carried_lines(run: Run) -> Iterator[str]:
+    """Yield the images that get the correction of another one of their acquisition."""
+    led: dict[str, list[str]] = {}
+    for one in run.carried:
+        led.setdefault(one.lead, []).append(one.view.name)
+    gets = "gets its correction" if run.kind == "adjust" else "was left out"
+    for lead, names in led.items():
+        yield f"{listed(names)}: of one acquisition with {lead} (the same RPC up to scale and shift), and {gets}."
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:

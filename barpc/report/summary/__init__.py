@@ -89,6 +89,15 @@ class TablesEntry(Record):
     complete: bool = column("Whether these are all")
 
 
+class CarriedEntry(Record):
+    """An image of the same acquisition as another one, whose correction it gets."""
+
+    name: str = column("Name of the image")
+    path: str = column("Its file")
+    lead: str = column("The view whose correction it gets")
+    outputs: Mapping[str, Mapping[str, float | str | None]] = column("Files with its camera, as of a view")
+
+
 class StageEntry(Record):
     """A stage of the run."""
 
@@ -123,6 +132,7 @@ class Summary(Record):
     next: tuple[StepEntry, ...] = column("Next steps, at most one of a kind", default=())
     control_test: ControlTestEntry | None = column("Test of the residuals of control", default=None)
     reference: ReferenceEntry | None = column("A reference orthoimage, where one was given", default=None)
+    carried: tuple[CarriedEntry, ...] | None = column("Images that get the correction of another", default=None)
     inputs: tuple[InputEntry, ...] | None = column("Every input file, for `barpc verify`", default=None)
     outputs: tuple[OutputEntry, ...] | None = column(
         "Every output file but this, the report and its pictures", default=None
@@ -181,6 +191,10 @@ def measure_run(run: Run, views: tuple[ViewEntry, ...], verdict: Mapping[str, An
         control_test=ground_points.measure_control(run),
         check_points=ground_points.measure_check_points(run),
         reference=ground_points.measure_reference(run),
+        carried=tuple(
+            CarriedEntry(one.view.name, one.view.path, one.lead, json_form(one.written)) for one in run.carried
+        )
+        or None,
         stages=tuple(StageEntry.read(stage) for stage in run.stages),
         options=json_form(run.options),
         versions={"python": platform.python_version(), **_versions()},
