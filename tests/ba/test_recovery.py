@@ -164,8 +164,8 @@ def test_drift_is_corrected_as_if_there_were_none(seeds):
     assert np.mean(price) <= 1.4  # three more unknowns a view cost a quarter, drift or not
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", rest_slow([1, 2, 3], mark=pytest.mark.nightly))
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
     drifting = simulate_block(10, 3000, seed=seed, drift=20e-6)
     plain = solve(drifting, drift=0)

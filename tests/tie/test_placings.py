@@ -71,6 +71,7 @@ def test_a_picture_that_lies_otherwise_is_named_and_how(render, tmp_path, how: s
 
 
 @pytest.mark.slow
+@pytest.mark.landing(3)
 @pytest.mark.parametrize("how", LAID)
 def test_so_it_is_among_real_images(triplet, ventoux, tmp_path, how: str) -> None:
     views = [triplet[0], laid(triplet[1], how, tmp_path), triplet[2]]
