@@ -53,9 +53,7 @@ def project(image: str, numbers: tuple[float, ...], points: str | None, alt: flo
     ground = verbs.with_altitudes(given, None, terrain)
     found = camera.model.project(ground)
     _print_points(("col", "row"), found, (6, 6))
-    if wrong := verbs.far_outside(camera, np.nan_to_num(ground)):
-        return tell_gate(f"{image}: {wrong}", [])
-    return _tell_failures(found, "could not be projected")
+    return _tell_failures(found, "could not be projected", image, verbs.far_outside(camera, ground))
 
 
 @click.command("localize", context_settings=_NUMBERS)
@@ -77,9 +75,7 @@ def localize(image: str, numbers: tuple[float, ...], points: str | None, alt: fl
         at[without, 2] = verbs.altitude_of(camera, place_of(image), alt)
     ground = verbs.ground_at(camera, at[:, :2], at[:, 2], terrain)
     _print_points(("lon", "lat", "alt"), ground, (10, 10, 4))
-    if wrong := verbs.far_outside(camera, ground):
-        return tell_gate(f"{image}: {wrong}", [])
-    return _tell_failures(ground, "have no ground point")
+    return _tell_failures(ground, "have no ground point", image, verbs.far_outside(camera, ground))
 
 
 @click.command("triangulate", context_settings=_NUMBERS)
@@ -185,7 +181,8 @@ def _print_points(names: Sequence[str], values: Array, digits: Sequence[int]) ->
         echo(",".join(line))
 
 
-def _tell_failures(points: Array, what: str) -> int:
-    """Return the exit code of a verb on points; where some came out without a value, it is said on stderr."""
+def _tell_failures(points: Array, what: str, image: str = "", wrong: str = "") -> int:
+    """Return the exit code of a verb on points; those without a value, and what is `wrong`, are said on stderr."""
     count = int((~np.isfinite(points).all(axis=1)).sum())
-    return tell_gate(f"{count} of {len(points)} points {what}", []) if count else 0
+    reasons = [f"{count} of {len(points)} points {what}"] * bool(count) + [f"{image}: {wrong}"] * bool(wrong)
+    return tell_gate("; ".join(reasons), []) if reasons else 0

@@ -107,7 +107,7 @@ def _shown(view: View, lead: View, step: Array, start: Array) -> bool:
 def _same_scene(lead: View, view: View, step: Array, start: Array, band: int) -> bool:
     """Return whether both images show the same where their cameras say so: an RPC may be copied to another image."""
     if not (lead.path and view.path):
-        return True
+        return False
     low = np.maximum(start, 0.0)
     high = np.minimum(start + (np.array(lead.size) - 1.0) * step, np.array(view.size) - 1.0)
     side = np.minimum(high - low, _SIDE).astype(np.int64)
@@ -131,7 +131,7 @@ def _same_scene(lead: View, view: View, step: Array, start: Array, band: int) ->
 
 
 def _edges(picture: Array) -> Array:
-    """Return the strength of edges, without its mean, fading to the border."""
+    """Return the strength of edges less its mean, weighted to 0 at the border."""
     strength = np.hypot(ndi.sobel(picture, 0), ndi.sobel(picture, 1))
     faded = (strength - strength.mean()) * np.outer(*(np.hanning(side) for side in strength.shape))
     return np.asarray(faded)

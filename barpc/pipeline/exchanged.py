@@ -38,10 +38,10 @@ class Exchange:
         """Return the finding in words; `names`: of all views."""
         own = [names[view] for view in self.views]
         fit = listed([f"{names[v]} fits the RPC of {names[c]}" for v, c in zip(self.views, self.cameras, strict=True)])
-        who = f"{' and '.join(own)} fit each other's RPC, not their own" if len(own) == 2 else f"{fit}, not its own"
+        who = f"{' and '.join(own)} fit each other's RPC" if len(own) == 2 else fit
         return (
-            f"{who}: matches scatter by {self.scatter:.2g} px across epipolar lines, with these RPCs exchanged by "
-            f"{self.exchanged:.2g} px"
+            f"{who} and not the one given: matches scatter by {self.scatter:.2g} px across epipolar lines, with these "
+            f"RPCs exchanged by {self.exchanged:.2g} px"
         )
 
 

@@ -396,12 +396,15 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
 
 def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:
     """Return how the altitudes of points seen in several images fit these in another unit; empty where they do not."""
+    several = np.bincount(points.point, minlength=len(points.names)) > 1
+    if several.sum() < _LEAST_FOR_UNIT:
+        return ""
     seen = triangulate(
         [view.sensor for view in views], points.view, points.point, points.xy, alt=np.mean([v.altitude for v in views])
     )
     shown = np.full(len(points.names), np.nan)
     shown[: len(seen.points)] = ground_from_ecef(seen.points)[:, 2]
-    known = np.isfinite(shown)
+    known = np.isfinite(shown) & several
     if known.sum() < _LEAST_FOR_UNIT:
         return ""
     shown, given = shown[known], points.lonlatalt[known, 2]

@@ -39,7 +39,7 @@ class RasterFrame:
 
 def doubts_of(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None = None) -> tuple[Doubt, ...]:
     """Return the reasons why an RPC is not that of an image of a size [px], and of a geotransform, if it has one."""
-    found = (_another_size(rpc, size), _another_ground(rpc, size), _another_map(rpc, size, frame))
+    found = (_another_map(rpc, size, frame), _another_ground(rpc, size), _another_size(rpc, size))
     return tuple(sorted((one for one in found if one is not None), key=lambda one: not one.refused))
 
 
@@ -104,9 +104,10 @@ def _another_map(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None) -> 
     if frame is None or frame.crs is None:
         return None
     corners, side = _corners(size), float(max(size))
-    east, north = frame.transform * (corners.T + 0.5)
+    a, b, c, d, e, f = frame.transform[:6]
+    col, row = corners.T + 0.5
     try:
-        lon, lat = warp_points(frame.crs, CRS.from_epsg(4326), east, north)
+        lon, lat = warp_points(frame.crs, CRS.from_epsg(4326), a * col + b * row + c, d * col + e * row + f)
     except RasterioError:
         return None  # a reference system of no place on Earth
     levels = rpc.ground_offset[2] + np.linspace(-1.0, 1.0, _LEVELS) * rpc.ground_scale[2]
@@ -115,7 +116,7 @@ def _another_map(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None) -> 
     shift = off.mean(axis=1, keepdims=True)
     shape = np.abs(off - shift).max(axis=(1, 2))
     best = int(np.argmin(np.where(np.isfinite(shape), shape + 1e-3 * np.abs(shift).max(axis=(1, 2)), np.inf)))
-    on_axes = frame.transform.b == frame.transform.d == 0.0
+    on_axes = b == d == 0.0
     most, far = (limits[0 if on_axes else 1] * side for limits in (_MAP_SHAPE, _MAP_SHIFT))
     if shape[best] <= max(most, _LEAST_SHAPE) and np.abs(shift[best]).max() <= far:
         return None

@@ -87,13 +87,12 @@ def _matching_files(name: str) -> list[str]:
             if find_annotation(path):
                 return [name]
             raise InputError(f"{name}: a folder without images ({', '.join(_ENDS)}){unread(path)}")
-        if (path / LAST).is_file():
-            warnings.warn(
-                f"{name}: the folder of a finished run: its cameras are adjusted already", Remark, stacklevel=2
-            )
         from barpc.report.finished import FinishedRun  # after all: most images are given by their names
 
         FinishedRun.refuse_edited(path, map(Path, rasters), of_images=True)
+        if (path / LAST).is_file():
+            said = "the folder of a finished run: its cameras are adjusted already"
+            warnings.warn(f"{name}: {said}", Remark, stacklevel=2)
         return rasters
     if os.path.lexists(name):
         return [name]

@@ -56,7 +56,7 @@ def project(
     Warns
     -----
     BarpcWarning
-        Points farther off the image than its size, or that it covers with longitude and latitude exchanged.
+        Points beyond the image by more than its size, or that it covers with longitude and latitude exchanged.
 
     Examples
     --------
@@ -65,7 +65,7 @@ def project(
     """
     camera, terrain = open_camera(image), terrain_of(dem, geoid)
     points = with_altitudes(ground, alt, terrain)
-    if wrong := far_outside(camera, np.nan_to_num(points.reshape(-1, 3))):
+    if wrong := far_outside(camera, points.reshape(-1, 3)):
         warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
     return camera.model.project(points)
 
@@ -103,7 +103,7 @@ def localize(
     Remark
         An altitude was assumed.
     BarpcWarning
-        Points farther off the image than its size.
+        Points beyond the image by more than its size.
 
     Examples
     --------
@@ -251,15 +251,17 @@ def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None)
 
 
 def far_outside(camera: Camera, ground: Array) -> str:
-    """Return a remark on points (N, 3) farther off an image than its size, where no camera was fitted; else empty."""
-    if wrong := exchanged(camera, ground):
+    """Return a remark on points (N, 3) beyond an image by more than its size, empty where there are none."""
+    if wrong := exchanged(camera, np.nan_to_num(ground)):
         return wrong
     if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
         return ""
-    off = ~_on_image(camera, ground) & np.isfinite(camera.model.project(ground)).all(axis=1)
+    known = np.isfinite(ground).all(axis=1)
+    off = np.zeros(len(ground), dtype=bool)
+    off[known] = ~_on_image(camera, ground[known]) & np.isfinite(camera.model.project(ground[known])).all(axis=1)
     if not (count := int(off.sum())):
         return ""
-    return f"{count} of {len(off)} points lie farther off the image than its size, where its camera is not made for"
+    return f"{count} of {len(off)} points lie beyond the image by more than its size: its camera is not made for them"
 
 
 def exchanged(camera: Camera, ground: Array) -> str:

@@ -154,8 +154,10 @@ def test_exchanged_coordinates_are_recognised(image, tmp_path, capsys):
     assert run("project", image, 43.1995, 5.4005, 200) == 3
     assert "longitude and latitude exchanged" in capsys.readouterr().err
     assert run("project", image, 5.4005, 43.1995, 200) == 0
-    assert run("project", image, 15.4005, 43.1995, 200) == 0  # far off, and no better the other way round
-    assert "exchanged" not in capsys.readouterr().err
+    assert run("project", image, 15.4005, 43.1995, 200) == 3  # far off, and no better the other way round
+    said = capsys.readouterr().err
+    assert "1 of 1 points lie beyond the image by more than its size" in said
+    assert "exchanged" not in said
     assert run("info", image, "--at", 43.1995, 5.4005, 200) == 1
     assert "exchanged" in capsys.readouterr().err
     box = (43.1993, 5.3995, 43.2, 5.4005)
@@ -264,5 +266,7 @@ def test_exchanged_coordinates_are_recognised_whatever_the_rpc_does_far_out(name
         assert run("project", camera, lat, lon, alt) == 3
         assert "on it with longitude and latitude exchanged" in capsys.readouterr().err
         assert run("project", camera, lon, lat, alt) == 0
-        assert run("project", camera, lon + 10.0, lat, alt) == 0
-        assert "exchanged" not in capsys.readouterr().err
+        assert run("project", camera, lon + 10.0, lat, alt) == 3
+        said = capsys.readouterr().err
+        assert "1 of 1 points lie beyond the image by more than its size" in said
+        assert "exchanged" not in said

@@ -156,7 +156,8 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
         return a_fit(verdict=lambda tolerance: wide if alts == (-500.0, 9000.0) else "")
 
     ground = SimpleNamespace(all_ground=(-500.0, 9000.0))
-    camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5))
+    usable = {"doubts": (), "require_usable": lambda _: None}
+    camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5), **usable)
     monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
     monkeypatch.setattr(fit, "open_camera", lambda _: camera)
     assert run("fit", source) == 0

@@ -481,7 +481,7 @@ def test_an_altitude_of_zero_is_none_and_holds_an_image_sideways_alone(tmp_path,
     for name in ("lonlatalt", "sigma"):
         np.testing.assert_array_equal(getattr(found, name)[~some], getattr(POINTS, name)[~some])
     assert found.left_out == (
-        f"{path}: {count} of 6 points have no altitude, or 0 as tools write for none: {count} constrain the images "
+        f"{path}: {count} of 6 points have no altitude, or a default (0, or one for all): {count} constrain the images "
         "horizontally only; give their altitudes, or --dem",
     )
 
@@ -496,7 +496,7 @@ def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path, capl
     np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(options.adjust.dem_sigma, 5.0 * 5**0.5))
     assert found.sigma[1, 2] == 0.3
     assert found.left_out == ()
-    assert "5 of 6 points have no altitude, or 0 as tools write for none: the DEM's are taken" in caplog.text
+    assert "5 of 6 points have no altitude, or a default (0, or one for all): the DEM's are taken" in caplog.text
     east = float(np.median(POINTS.lonlatalt[:, 0]))
     found = load_gcps([str(path)], VIEWS, options, Plane(east))  # type: ignore[arg-type]
     assert found is not None

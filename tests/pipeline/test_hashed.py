@@ -22,7 +22,9 @@ AT = Remote("https://a.org/x.tif", 10, "one")
 
 
 def run_of(*paths: str | Path) -> Any:
-    return SimpleNamespace(views=[SimpleNamespace(path=p if isinstance(p, Remote) else str(p)) for p in paths])
+    return SimpleNamespace(
+        carried=(), views=[SimpleNamespace(path=p if isinstance(p, Remote) else str(p)) for p in paths]
+    )
 
 
 def digest(path: Path) -> str:

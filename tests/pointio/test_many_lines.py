@@ -142,7 +142,9 @@ def test_many_ground_points_are_those_of_a_plain_reader(tmp_path: Path) -> None:
     for _ in range(3000):
         point, image = rng.randrange(1000), rng.choice(("left", "right", "elsewhere"))
         stated = [rng.choice(("", "2.5")), rng.choice(("", "3")), rng.choice(("", "0.25"))]
-        rows.append([rng.choice((f"p{point}", "")), str(point / 500), "43", "100", str(point), "7", image, *stated])
+        rows.append(
+            [rng.choice((f"p{point}", "")), str(point / 500), "43", str(100 + point), str(point), "7", image, *stated]
+        )
     with (tmp_path / "g.csv").open("w", newline="") as file:
         csv.writer(file).writerows([head, *rows])
     found = read_gcps(tmp_path / "g.csv", ["left", "right"])
@@ -150,7 +152,7 @@ def test_many_ground_points_are_those_of_a_plain_reader(tmp_path: Path) -> None:
     first = list({(row[0], row[1]): row for row in reversed(seen)}.items())
     first = sorted(((key, seen.index(row)) for key, row in first), key=lambda pair: pair[1])
     assert found.names == tuple(key[0] or f"gcp_{n}" for n, (key, _) in enumerate(first, 1))
-    assert found.lonlatalt.tolist() == [[float(key[1]), 43.0, 100.0] for key, _ in first]
+    assert found.lonlatalt.tolist() == [[float(key[1]), 43.0, 100.0 + round(500 * float(key[1]))] for key, _ in first]
     flat = [float(seen[i][7] or 1) for _, i in first]
     assert found.sigma.tolist() == [[s, s, float(seen[i][8] or 1)] for s, (_, i) in zip(flat, first, strict=True)]
     number = {key: n for n, (key, _) in enumerate(first)}
