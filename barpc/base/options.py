@@ -22,7 +22,7 @@ GEOID_HELP = (
 )
 HEIGHTS_HELP = (
     "Vertical datum of heights in files that state none: `ellipsoidal`, `egm96`, `egm2008`, a geoid's grid; `flat`: "
-    "ellipsoidal, and ground points may all have one altitude."
+    "ellipsoidal, all points alike."
 )
 MOST_POINTS = (TABLE.most or 0) // (5 * BYTES_PER_NUMBER)
 """Control points of a fit: as many as a table of them may hold, five numbers each."""

@@ -16,11 +16,13 @@ from barpc.base.errors import listed
 from barpc.base.statistics import robust_spread
 from barpc.report.outcome import PairTies, pair_ties
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.geometry import convergence_angle, epipolar_offset
 
 _SCATTER = 0.1  # px across epipolar lines: less does not matter
 _FEWER = 5.0  # times less scatter with the cameras exchanged: 10 to 360 of three public sets, 1 of right cameras
 _MATCHES = 100  # of a pair
+_LEAST_ANGLE = 0.5  # deg between rays: along nearer ones no epipolar line is told
+_MOST_LEFT = 1.0  # px of scatter with the cameras exchanged
 _MOST_TRIED = 20  # images, those that scatter most, that are tried in pairs
 _FEW = 4  # images of which every order is tried
 
@@ -47,7 +49,7 @@ class Exchange:
 
 def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
     """Return the exchange of cameras that brings the matches of views to their epipolar lines; None without one."""
-    pairs = pair_ties(tracks)
+    pairs = [ties for ties in pair_ties(tracks) if _converges(views, ties)]
     as_given = [_scatter(views, tracks, ties, ties.views) for ties in pairs]
     worst = sorted((k for k in range(len(pairs)) if as_given[k] > _SCATTER), key=lambda k: -as_given[k])
     suspects = sorted([*dict.fromkeys(view for k in worst for view in pairs[k].views)][:_MOST_TRIED])
@@ -66,13 +68,19 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
         for k in met:  # the first pair that gains nothing ends most trials
             i, j = pairs[k].views
             after.append(_scatter(views, tracks, pairs[k], (moved.get(i, i), moved.get(j, j))))
-            if not _FEWER * after[-1] < max(as_given[k], _SCATTER):
+            if not _FEWER * after[-1] < min(max(as_given[k], _SCATTER), _FEWER * _MOST_LEFT):
                 break
         else:
             found = Exchange(tuple(moved), tuple(moved.values()), float(np.median(before)), float(np.median(after)))
             if best is None or found.exchanged < best.exchanged:
                 best = found
     return best
+
+
+def _converges(views: Sequence[View], ties: PairTies) -> bool:
+    first, second = (views[view] for view in ties.views)
+    at = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
+    return bool(convergence_angle(first.sensor, second.sensor, at) > _LEAST_ANGLE)
 
 
 def _scatter(views: Sequence[View], tracks: Tracks, ties: PairTies, cameras: tuple[int, int]) -> float:
