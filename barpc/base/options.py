@@ -321,7 +321,7 @@ class RunOptions(Options):
     )
     update: bool = option(
         False,
-        "With `add_to`: also write changed cameras of that run.",
+        "With `add_to`: adjust all cameras together, and write those of that run that change; else they are held.",
     )
     calibration: tuple[str, ...] = option(
         (),

@@ -44,6 +44,7 @@ from barpc.tie.pairing.overlaps import Footprints, forests, overlapping_pairs, r
 
 logger = logging.getLogger(__name__)
 
+_WORSE = 1.2  # times the RMS of check tie points: 1.01 of real and simulated images, by chance 1.1
 _OPENED_PER_NEIGHBOUR = 4  # times as many images as are matched are opened, the largest common areas: angles count, too
 
 
@@ -194,7 +195,8 @@ class Earlier:
         alt = np.array([image.altitude for image in self.images])
         places = np.column_stack([lonlat, alt])
         side = [np.sqrt(_outline_area(image) / (image.size[0] * image.size[1])) for image in self.images]
-        return moved_px(self.prior, grown, ecef_from_ground(places), np.array(side))
+        before = replace(self.prior, params=self.prior.as_written)
+        return moved_px(before, grown, ecef_from_ground(places), np.array(side))
 
 
 def _sha(inputs: Mapping[str, Input], path: str) -> str:
@@ -369,9 +371,18 @@ def added(run: Run, earlier: Earlier, grown: BlockPrior, floor: float) -> Added:
     ranked = [(earlier.images[i].name, float(moved[i])) for i in np.argsort(-moved, kind="stable")]
     beyond = tuple(one for one in ranked if one[1] > floor)
     met, name = len(run.known), earlier.folder.resolve().name
-    here = {view.name for view in run.views} - run.unwritten
-    written = bool(run.fits) and (getattr(run.options, "update", False) or all(one in here for one, _ in beyond))
-    return Added(name, len(earlier.images), met, beyond, ranked[0], floor, written)
+    updated = run.joint is None
+    return Added(name, len(earlier.images), met, beyond, ranked[0], floor, updated, _contradicted(run, floor))
+
+
+def _contradicted(run: Run, floor: float) -> tuple[str, float, float] | None:
+    """Return the image whose check tie points contradict cameras held most, with their RMS held and free [px]."""
+    if run.joint is None or run.adjustment is None:
+        return None
+    held, free = run.adjustment.held_out_rms, run.joint.held_out_rms
+    worse = np.where(held > _WORSE * free, held - free, 0.0)
+    most = int(np.argmax(np.nan_to_num(worse)))
+    return (run.adjustment.names[most], float(held[most]), float(free[most])) if worse[most] > floor else None
 
 
 def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> CorrectedViews:

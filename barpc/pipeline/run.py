@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, adjust_tracks, block_prior
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
@@ -218,15 +218,15 @@ def _with_block(
     options = run.options
     assert isinstance(options, RunOptions)
     with _stage_progress(workspace, "block", work.progress):
-        block = block_prior(run.adjustment)
+        block = block_prior(run.joint or run.adjustment)
+        if run.earlier is not None:
+            run = replace(run, added=added(run, run.earlier, block, options.adjust.noise_floor))
+            block = _as_written(run, block)
         with workspace.output(f"{FOLDER}/{PRIOR_FILE}") as partial:
             block.save(partial)
         text = images_table(run, images, inputs, workspace.folder, block)
         workspace.write_text(f"{FOLDER}/{IMAGES}", text)
-    if run.earlier is None:
-        return run
-    run = replace(run, added=added(run, run.earlier, block, options.adjust.noise_floor))
-    if options.update and options.stop_after == "all":
+    if run.earlier is not None and options.update and options.stop_after == "all":
         views, sensors, sources = movers(run, block, {view.name for view in run.views}, options.allow_remote)
         used = calibrations_of(options.calibration, views, sources, some=True)
         sensors = calibrated(sensors, [used.get(view.name) for view in views])
@@ -237,6 +237,22 @@ def _with_block(
             write_views(workspace, fitted, options.images, options.rpc_formats, work.executor, work.progress)
             write_grids(workspace, fitted, options, work.executor, work.progress)
     return run
+
+
+def _as_written(run: Run, block: BlockPrior) -> BlockPrior:
+    """Return a block that has grown out of an earlier one with the unknowns of the cameras that are written."""
+    assert run.adjustment is not None
+    assert run.added is not None
+    prior, number = run.earlier.prior, {name: i for i, name in enumerate(block.names)}
+    moved = {name for name, _ in run.added.beyond} if run.joint is None else set()
+    written = block.params.copy()
+    for name, before in zip(prior.names, prior.as_written, strict=True):
+        if name not in moved:
+            written[number[name]] = before
+    for i, name in enumerate(run.adjustment.names):
+        if name in number and name not in run.unwritten:
+            written[number[name]] = run.adjustment.params[i]
+    return replace(block, written=written)
 
 
 def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
@@ -423,20 +439,27 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
             "the images: check its position and the DEM's, or use a finer one"
         )
     altimetry = load_altimetry(options.altimetry, run.views, options.heights)
-    adjustment = adjust_tracks(
-        run.views,
-        replace(run.tracks, xy=run.undistorted(run.tracks.view, run.tracks.xy)),
-        _with_rounding(run, options.adjust),
-        None if gcps is None else replace(gcps, xy=run.undistorted(gcps.view, gcps.xy)),
-        dem,
-        centers=np.array([center.ecef for center in centers]),
-        prior=None if run.earlier is None else run.earlier.prior,
-        known=None if run.earlier is None else np.ones(len(run.tracks), dtype=bool),  # at best some are new
-        reference=_undistorted_reference(run),
-        altimetry=altimetry,
-        keep_largest=options.keep_going,
-        common=common_errors(run),
-    )
+
+    def solved(options: AdjustOptions, prior: BlockPrior | None) -> Adjustment:
+        return adjust_tracks(
+            run.views,
+            replace(run.tracks, xy=run.undistorted(run.tracks.view, run.tracks.xy)),
+            options,
+            None if gcps is None else replace(gcps, xy=run.undistorted(gcps.view, gcps.xy)),
+            dem,
+            centers=np.array([center.ecef for center in centers]),
+            prior=prior,
+            known=None if prior is None else np.ones(len(run.tracks), dtype=bool),  # at best some are new
+            reference=_undistorted_reference(run),
+            altimetry=altimetry,
+            keep_largest=keep_going,
+            common=common_errors(run),
+        )
+
+    chosen, keep_going = _with_rounding(run, options.adjust), options.keep_going
+    adjustment = solved(chosen, None if run.earlier is None else run.earlier.prior)
+    if run.earlier is not None and not options.update:
+        run, adjustment = _with_earlier_held(run, adjustment, chosen, solved)
     refuse_strange(run, adjustment)
     ground = [ground_from_ecef(adjustment.points)]  # none without tie points
     control = None if run.reference is None else run.reference.control
@@ -444,6 +467,22 @@ def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
     datums = [] if dem is None else [*dem.datums(np.concatenate(ground))]
     datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
     return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
+
+
+def _with_earlier_held(
+    run: Run, joint: Adjustment, options: AdjustOptions, solved: Callable[[AdjustOptions, BlockPrior], Adjustment]
+) -> tuple[Run, Adjustment]:
+    """Return the adjustment of new images to the cameras of the earlier run as they are written, and the run with the
+    one that moves them all.
+
+    What is known of the place and shape of the scene is that of the latter, as the cameras held are not exact.
+    """
+    prior: BlockPrior = run.earlier.prior
+    old = {*run.earlier.number}
+    fixed = tuple(dict.fromkeys((*options.fixed, *(view.name for view in run.views if view.name in old))))
+    held = solved(replace(options, fixed=fixed), replace(prior, params=prior.as_written))
+    gauge = replace(joint.gauge, shift=held.gauge.shift)
+    return replace(run, joint=joint), replace(held, gauge=gauge, datum=joint.datum)
 
 
 def _undistorted_reference(run: Run) -> Reference | None:

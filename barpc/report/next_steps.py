@@ -45,7 +45,7 @@ def next_steps(summary: Summary, added: Added | None = None) -> tuple[StepEntry,
     `added` is the effect of its images on those of an earlier run, where they were added to one.
     """
     use = {"adjust": _hand_over, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
-    if added is not None and added.beyond and not added.updated:
+    if added is not None and added.contradicted is not None:
         use = partial(_update, added)
     return (*use(summary), *_improve(summary), *_review(summary))
 
@@ -73,12 +73,9 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
 
 
 def _update(added: Added, summary: Summary) -> Iterator[StepEntry]:
-    """Yield the update of an earlier run, without which its cameras and the new ones, if written, do not agree."""
-    if not any(view.outputs for view in summary.views):
-        return
-    name, far = added.largest
-    words = f"those of {added.run} change by up to {far:.2f} px ({name})"
-    yield StepEntry("use", f"Run again with --update before old and new cameras are used together: {words}.")
+    """Yield the update of an earlier run whose cameras, as they are written, and the new ones do not agree."""
+    if any(view.outputs for view in summary.views):
+        yield StepEntry("use", f"Run again with --update: cameras of {added.run} and new ones do not agree.")
 
 
 def _adjust_checked(summary: Summary) -> Iterator[StepEntry]:

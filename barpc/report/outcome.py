@@ -62,10 +62,12 @@ class Added:
     run: str  # name of its folder
     images: int  # that it has
     met: int  # of these, tied to new ones
-    beyond: tuple[tuple[str, float], ...]  # those that should move by more than the floor, and by how much [px]
-    largest: tuple[str, float]  # the one that should move farthest, and by how much [px]
+    beyond: tuple[tuple[str, float], ...]  # those that move by more than the floor with all cameras free [px]
+    largest: tuple[str, float]  # the one that moves farthest, and by how much [px]
     floor: float  # [px]
-    updated: bool  # whether the cameras of those that should move are written
+    updated: bool  # whether the cameras of those that move are written; else all were held
+    contradicted: tuple[str, float, float] | None = None
+    """An image whose check tie points contradict cameras held: RMS as written and with all cameras free [px]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +120,7 @@ class Run:
     earlier: Any = None  # the finished run that images are added to, as the pipeline has it
     unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
     added: Added | None = None
+    joint: Adjustment | None = None  # with the cameras of the earlier run free, where `adjustment` holds them
     calibrated: Mapping[str, Calibration] = field(default_factory=dict)  # view -> what its sensor does in every image
     carried: tuple[Carried, ...] = ()  # other bands of its images, which get their corrections
 

@@ -133,6 +133,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             *_of_same_ground(run, found),
             *_of_solution(run, found),
         )
+    yield from _of_earlier(run.added)
     yield from deformation_reasons(found)
     yield from dem_reasons(found)
     yield from datum_reasons(run.datums, found, common_lean(views))
@@ -357,13 +358,29 @@ def _added_lines(added: Added, num: int) -> Iterator[str]:
     old = counted(added.images, "image")
     yield f"{new} added to the {old} of {added.run}; {added.met} of these have new tie points."
     name, far = added.largest
+    if not added.updated:
+        moves = f"they move by up to {far:.2f} px ({name}) where --update adjusts all together"
+        yield f"The cameras of {added.run} were held as they are written; {moves}."
+        return
     if not added.beyond:
         yield f"Their cameras stay valid: the largest change, of {name}, is {far:.3f} px (limit: {added.floor:g} px)."
         return
     some = listed([f"{one} ({px:.2f} px)" for one, px in added.beyond], NAMED)
-    do = "their new cameras are written here" if added.updated else "--update writes their new cameras"
     many = counted(len(added.beyond), "image")
-    yield f"The cameras of {many} of {added.run} change by more than {added.floor:g} px: {some}; {do}."
+    yield (
+        f"The cameras of {many} of {added.run} change by more than {added.floor:g} px: {some}; their new cameras are "
+        "written here."
+    )
+
+
+def _of_earlier(added: Added | None) -> Iterator[str]:
+    """Yield the contradiction between new images and cameras of an earlier run that were held."""
+    if added is not None and added.contradicted is not None:
+        name, held, free = added.contradicted
+        yield (
+            f"Check tie points of {name} have residuals of {held:.3f} px with the cameras of {added.run} as they are "
+            f"written, and of {free:.3f} px with all cameras free: they contradict each other. --update adjusts all."
+        )
 
 
 def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:

@@ -269,15 +269,14 @@ def test_nothing_is_handed_over_of_a_run_that_wrote_nothing():
     assert not next_steps(a_summary([a_view("A"), a_view("B")], [a_pair()]))
 
 
-@pytest.mark.parametrize("updated", [False, True])
+@pytest.mark.parametrize("contradicted", [None, ("A", 0.3, 0.1)])
 @pytest.mark.parametrize("moved", [(), (("old", 4.385),)])
-def test_new_cameras_are_used_with_old_ones_that_they_fit(moved, updated):
+def test_new_cameras_are_used_with_old_ones_that_they_fit(moved, contradicted):
     """A run that added A; `old` is an image of the earlier run."""
-    added = Added("first", 3, 3, moved, ("old", 4.385), 0.02, updated)
+    added = Added("first", 3, 3, moved, ("old", 4.385), 0.02, updated=False, contradicted=contradicted)
     (use,) = next_steps(a_summary([a_view("A", outputs={"A.vrt": {}})]), added)
-    if moved and not updated:
-        assert use.text.startswith("Run again with --update before old and new cameras are used together: ")
-        assert use.text.endswith("those of first change by up to 4.38 px (old).")
+    if contradicted:
+        assert use.text == "Run again with --update: cameras of first and new ones do not agree."
         assert not use.commands
     else:
         assert use.text == "Hand over A.vrt."

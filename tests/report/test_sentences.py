@@ -733,9 +733,9 @@ def test_matches_at_whole_pixels_are_told_unless_as_many_are_sharper(whole, shar
 @pytest.mark.parametrize(
     ("beyond", "updated", "said_of_them"),
     [
-        ((), False, "Their cameras stay valid: the largest change, of C, is 0.012 px (limit: 0.02 px)."),
-        ((("C", 1.234),), False, "The cameras of 1 image of first change by more than 0.02 px: C (1.23 px); --update "
-         "writes their new cameras."),
+        ((), True, "Their cameras stay valid: the largest change, of C, is 0.012 px (limit: 0.02 px)."),
+        ((("C", 1.234),), False, "The cameras of first were held as they are written; they move by up to 0.01 px (C) "
+         "where --update adjusts all together."),
         ((("C", 1.234), ("B", 0.5)), True, "The cameras of 2 images of first change by more than 0.02 px: C (1.23 px), "
          "B (0.50 px); their new cameras are written here."),
     ],
@@ -744,6 +744,15 @@ def test_added_images_leave_the_cameras_of_a_run_or_ask_them_to_move(beyond, upd
     lines = said(run_of(added=Added("first", 11, 2, beyond, ("C", 0.0123), 0.02, updated)))
     at = lines.index("1 image added to the 11 images of first; 2 of these have new tie points.")
     assert lines[at + 1] == said_of_them
+
+
+def test_images_that_contradict_cameras_held_need_a_look():
+    change = Added("first", 11, 2, (), ("C", 0.0123), 0.02, updated=False, contradicted=("A", 0.3, 0.1))
+    (why,) = block_verdict(run_of(added=change), views())["reasons"]
+    assert why == (
+        "Check tie points of A have residuals of 0.300 px with the cameras of first as they are written, and of 0.100 "
+        "px with all cameras free: they contradict each other. --update adjusts all."
+    )
 
 
 @pytest.mark.parametrize(("as_stated", "error"), [(True, "wrong tie points or an RPC"), (False, "an RPC")])

@@ -30,7 +30,7 @@ from barpc.scene import IntArray
 PRIOR_KIND = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
 _CSR = ("data", "indices", "indptr")  # of release 0.3
-_LEARNT = ("told", "shown")
+_LEARNT = ("told", "shown", "written")
 _SCENE = ("by_unknown", "own", "radius")
 _FACTOR_BYTES = 1e8  # bytes of the factor of a whole block, which is read twice: the rest goes to a temporary file
 
@@ -74,6 +74,8 @@ class BlockPrior:
         What the corrections of all views show of the priors given (`barpc.ba.robust.variances.Variances.shown`).
     rest : Rest or None
         The block that these views are only some of.
+    written : (n, q) or None
+        Values of the cameras that are written; None: `params`.
     """
 
     names: tuple[str, ...]
@@ -89,6 +91,12 @@ class BlockPrior:
     told: Array | None = None
     shown: Array | None = None
     rest: Rest | None = None
+    written: Array | None = None
+
+    @property
+    def as_written(self) -> Array:
+        """Values (n, q) of the cameras that are written."""
+        return self.params if self.written is None else self.written
 
     def waves(self, names: tuple[str, ...]) -> AdditionalParameters | None:
         """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
@@ -149,7 +157,7 @@ class BlockPrior:
             shown = file.get("shown")
             if shown is not None and len(shown) == 3 + known[1]:  # of release 0.3, which learnt nothing of turns
                 shown = np.vstack([shown, np.zeros(shown.shape[1])])
-            prior = cls(names, *known, layout, radars, scene, file.get("told"), shown)
+            prior = cls(names, *known, layout, radars, scene, file.get("told"), shown, written=file.get("written"))
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
         if not prior._is_whole():
@@ -176,6 +184,7 @@ class BlockPrior:
             and all(_is_square_finite(array) for array in arrays.values())
             and bool((diagonal > 0).all())
             and self._layout.is_whole(n, q)
+            and (self.written is None or (self.written.shape == (n, q) and bool(np.isfinite(self.written).all())))
             and (self.scene is None or _is_scene(self.scene, n * q))
             and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
             and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_counted(self.shown)))
@@ -223,6 +232,7 @@ class BlockPrior:
             scene=scene,
             told=None if self.told is None else self.told[views],
             rest=rest,
+            written=None if self.written is None else self.written[views],
         )
 
     def _eliminated(self, views: IntArray) -> tuple[Rest, Array]:
@@ -286,6 +296,7 @@ class BlockPrior:
             scene=scene,
             told=told,
             shown=later.shown,
+            written=None,
         )
 
 
