@@ -46,11 +46,9 @@ def test_what_is_printed_is_what_lies_on_disk(tmp_path: Path) -> None:
     read = {(pair.a, pair.b): pair.epipolar_before for pair in there.record.pairs}
     for names, offset in printed.items():
         assert abs(offset.median - read[names].median) < 0.005
+        assert abs(offset.spread - read[names].spread) < 0.005
         assert abs(offset.median) < 0.01
-    after = {view.name: view.rmse_after for view in found.record.views}
-    for view in there.record.views:
-        assert view.rmse_before == pytest.approx(after[view.name], abs=0.005)
-    assert found.record.scene.gauge.sigma_enu_m[2] > 20.0  # type: ignore[union-attr]
+    assert found.adjustment.gauge.sigma[2] > 20.0
     moved = [line for line in found.record.verdict if "were held as they are written" in line]
     assert len(moved) == 1
 
@@ -64,8 +62,9 @@ def test_a_chain_that_held_ends_where_the_whole_does_when_it_is_updated(tmp_path
     for view in whole.views:
         ground = view.sensor.localize(GRID, np.full(len(GRID), 220.0))
         again = barpc.read_rpc(tmp_path / "b" / f"{view.name}.vrt").project(ground)
-        assert np.abs(again - GRID).max() < 0.1  # other tie points were kept out: 0.02 px
-        assert np.abs(np.median(again - GRID, axis=0)).max() < 0.06
+        assert np.abs(again - GRID).max() < 0.3  # of place: 10 cm, and it is known to metres
+    for pair in on_disk(dict.fromkeys(VIEWS, tmp_path / "b"), **few).record.pairs:
+        assert abs(pair.epipolar_before.median) < 0.01
 
 
 def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -> None:
