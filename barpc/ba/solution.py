@@ -24,11 +24,12 @@ from barpc.ba.solving.solve import State
 from barpc.ba.solving.structure import Structure
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
+_FAR_OFF = 150.0  # m: no camera is delivered so
 _TREND = MUCH_NOISE * NOISE_FLOOR  # px: another model is tried
 _SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
 MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
@@ -122,7 +123,7 @@ def solve_block(
     observations of `outer`.
     """
     problem = make_problem(block, options, centers, prior)
-    state, given = first_state(problem, block, options, dem)
+    state, given = first_state(_placed(problem, block), block, options, dem)
     heights = given.loose(UNCONSTRAINED_SIGMA) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
@@ -154,6 +155,26 @@ def solve_block(
     if free is not None and found.heights.has_control:
         found = _without_distorting_control(found, free, block, outer, options)
     return found if prior is not None else _held_in_shape(found, block, outer)
+
+
+def _placed(problem: Problem, block: Block) -> Problem:
+    """Return the problem with cameras translated by what a reference found them to be off, where that is much.
+
+    From hundreds of metres away no step from the delivered cameras lowers the cost.
+    """
+    unknowns = problem.cameras.unknowns
+    if block.reference is None or not unknowns.translates or problem.joint_prior is not None:
+        return problem
+    offset = np.nan_to_num(block.reference.offset)
+    offset[np.linalg.norm(offset, axis=1) < _FAR_OFF] = 0.0
+    if not offset.any():
+        return problem
+    ground = ground_from_ecef(unknowns.center)
+    east, north, _ = np.moveaxis(enu_basis(ground), 1, 0)
+    mean = problem.camera_prior.mean.copy()
+    start = 3 * unknowns.rotates
+    mean[:, start : start + 3] -= offset[:, :1] * east + offset[:, 1:] * north
+    return replace(problem, camera_prior=replace(problem.camera_prior, mean=mean))
 
 
 def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:

@@ -373,15 +373,16 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     away = _distance(points, shown, (0, 1), (1, 1))
     yield _any(points, ~np.isfinite(away)), "no ground is seen at the position in the image"
     far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
-    size = np.array([view.size for view in views])[points.view]
-    beyond = (points.xy < -_IMAGE_MARGIN) | (points.xy > size - 1 + _IMAGE_MARGIN)
-    outside = _any(points, np.asarray(beyond.any(axis=1)))
+    beyond = _beyond(points, views, points.xy)
+    if beyond.any():
+        beyond &= ~_beyond(points, views, _projected(points, views))
+    outside = _any(points, beyond)
     for what, (columns, *signs) in _MISTAKES.items():
         near = [_distance(points, shown, columns, sign) <= reach for sign in signs]
         mistaken = far & _any(points, np.asarray(np.any(near, axis=0)))
         yield mistaken, what
         far &= ~mistaken
-    yield outside, "outside its image: col from the left and row from the top, in pixels of this image"
+    yield outside, "outside its image, and inside it by the camera: col from the left, row from the top, in its pixels"
     most = np.max(away[far[points.point]], initial=0.0) / 1e3
     yield far, f"as far as {most:,.0f} km from where the images show it, by their cameras"
     wild = (alt < low - _ALT_REACH) | (alt > high + _ALT_REACH)
@@ -392,6 +393,22 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     )
     if what := _in_another_unit(points, views):
         yield np.ones(len(points.names), dtype=bool), what
+
+
+def _beyond(points: GroundPoints, views: Sequence[View], xy: Array) -> BoolArray:
+    """Return which places (M, 2) [px] of the observations lie outside their images."""
+    size = np.array([view.size for view in views])[points.view]
+    return np.asarray(((xy < -_IMAGE_MARGIN) | (xy > size - 1 + _IMAGE_MARGIN)).any(axis=1))
+
+
+def _projected(points: GroundPoints, views: Sequence[View]) -> Array:
+    """Return where the cameras of the observations show their points (M, 2) [px], altitudes within their ranges."""
+    ground, xy = points.lonlatalt[points.point].copy(), np.empty_like(points.xy)
+    for v in np.unique(points.view):
+        rows = points.view == v
+        ground[rows, 2] = np.clip(ground[rows, 2], *views[v].alt_range)
+        xy[rows] = views[v].sensor.project(ground[rows])
+    return xy
 
 
 def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:

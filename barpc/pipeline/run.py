@@ -482,7 +482,7 @@ def _with_earlier_held(
     fixed = tuple(dict.fromkeys((*options.fixed, *(view.name for view in run.views if view.name in old))))
     held = solved(replace(options, fixed=fixed), replace(prior, params=prior.as_written))
     gauge = replace(joint.gauge, shift=held.gauge.shift)
-    return replace(run, joint=joint), replace(held, gauge=gauge, datum=joint.datum)
+    return replace(run, joint=joint), replace(held, gauge=gauge, datum=joint.datum, covariance=joint.covariance)
 
 
 def _undistorted_reference(run: Run) -> Reference | None:

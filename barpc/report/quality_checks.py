@@ -19,7 +19,7 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import PEAK
+from barpc.tie.reference import FAR_RADIUS, PEAK
 
 MIN_TIE_POINTS = 30  # Of a view, used or rejected: they tell a standard deviation to an eighth, 1 / sqrt(2 n)
 GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
@@ -316,7 +316,7 @@ def reference_reasons(run: Run, stated: float) -> Iterator[str]:
     if found.control is None:
         whys = "the DEM under it is of another place, or it is too old or too coarse"
         if all(view.peak < PEAK for view in found.views):
-            whys = "another place, too old, or without texture"
+            whys = f"another place, too old, without texture, or cameras more than {FAR_RADIUS / 1e3:g} km off"
         yield f"The reference {found.refusal}: {whys}. It was not used."
     used = [view for view in found.views if view.points]
     if wide := [f"{view.name} ({metres(view.scatter)})" for view in used if view.scatter > found.step]:

@@ -1,7 +1,8 @@
 """Control from a reference orthoimage: it and an image, brought onto one grid on the ground, are matched densely.
 
 An image is projected through its camera and the terrain onto a local grid, at the coarser of the two resolutions. First
-many blocks vote together for one shift of the whole camera, within `VOTE_RADIUS` metres; how far the peak stands above
+many blocks vote together for one shift of the whole camera, within `VOTE_RADIUS` metres, or, where nothing is found
+there, `FAR_RADIUS`; how far the peak stands above
 the rest of the sum says whether this is the same place. With the camera moved so, points on a regular grid on the
 ground, the same for all views, are looked for one by one (`barpc.tie.patches.channels`), and those are kept that agree.
 """
@@ -28,11 +29,11 @@ from barpc.tie.patches.oriented import HALF, PatchTile
 from barpc.tie.pixels import CELL, SPAN, FloatImage
 from barpc.tie.tasks import HERE, Work
 
-VOTE_RADIUS = 150.0  # m: how far a camera may be off
+VOTE_RADIUS, FAR_RADIUS = 150.0, 1000.0  # m: how far a camera may be off; where nothing is found within the first
 PEAK = 6.5  # a vote whose peak has fewer standard deviations is none: other places reach 5.1
 _SEARCH = 6, 5.0  # px and m: what the vote and the terrain leave, together
 _VOTE_RESOLUTION, _BLOCKS = 2.0, 8  # of the first vote: m a pixel, at least; blocks along a side
-_VOTE_REFINEMENT = 4.0  # times, the second vote
+_VOTE_REFINEMENT = 4.0  # times, from one vote to the next
 _MIN_PICTURE_SHARES = 0.5, 0.3  # of a block and of the reference around it
 _MIN_AGREEING_POINTS = TieOptions().min_matches  # points that agree in a view
 _DECOY_MARGIN = 0.1  # by which a correlation beats its decoy's
@@ -218,7 +219,12 @@ class _ReferenceWork:
     def vote(self) -> list[tuple[float, Array]]:
         """Return, for every view, the peak of its vote and the camera's error (2,) [m]."""
         coarse = max(self.step, _VOTE_RESOLUTION)
-        found = self._votes([np.zeros(2)] * len(self.views), coarse, VOTE_RADIUS, "reference: vote")
+        none = [np.zeros(2)] * len(self.views)
+        found = self._votes(none, coarse, VOTE_RADIUS, "reference: vote")
+        # at the border of what was tried it is the flank of a peak beyond
+        found = [(0.0 if np.abs(at).max() > VOTE_RADIUS - 2.0 * coarse else z, at) for z, at in found]
+        if any(z < PEAK for z, _ in found):
+            found = self._from_far(found, coarse)
         if coarse == self.step:
             return found
         near = [shift for _, shift in found]
@@ -226,6 +232,16 @@ class _ReferenceWork:
             near, max(self.step, coarse / _VOTE_REFINEMENT), _VOTE_REFINEMENT * coarse, "reference: second vote"
         )
         return [(z, shift) for (z, _), (_, shift) in zip(found, again, strict=True)]
+
+    def _from_far(self, found: list[tuple[float, Array]], coarse: float) -> list[tuple[float, Array]]:
+        """Return the votes, of views without a peak around where a vote within `FAR_RADIUS` has one."""
+        some = replace(self, views=tuple(v for v, (z, _) in zip(self.views, found, strict=True) if z < PEAK))
+        step = _VOTE_REFINEMENT * coarse
+        far = some._votes([np.zeros(2)] * len(some.views), step, FAR_RADIUS, "reference: far vote")
+        again = some._votes([shift for _, shift in far], coarse, 2.0 * step, "reference: vote")
+        # the places of one peak are few: both must tell
+        better = iter((z, at) if min(z, y) >= PEAK else None for (y, _), (z, at) in zip(far, again, strict=True))
+        return [one if one[0] >= PEAK else next(better) or one for one in found]
 
     def _votes(self, moved: Sequence[Array], step: float, reach: float, stage: str) -> list[tuple[float, Array]]:
         px, tasks, ends = int(np.ceil(reach / step)), [], [0]
@@ -259,7 +275,9 @@ class _ReferenceWork:
 
     def search(self, votes: Sequence[tuple[float, Array]], accuracy: Accuracy) -> ReferenceControl:
         """Return the control from points searched in every view with a significant vote."""
-        places, heights = self._lattice([view for view, (z, _) in zip(self.views, votes, strict=True) if z >= PEAK])
+        told = [(view, moved) for view, (z, moved) in zip(self.views, votes, strict=True) if z >= PEAK]
+        far = max([VOTE_RADIUS, *(float(np.linalg.norm(moved)) for _, moved in told)])
+        places, heights = self._lattice([view for view, _ in told], far)
         reach = int(np.ceil(_SEARCH[0] + _SEARCH[1] / self.step))
         tiles = [
             self._tiles(view, moved, places, heights, reach) if z >= PEAK else []
@@ -296,8 +314,10 @@ class _ReferenceWork:
         offset = np.array([r.offset if r.points else (np.nan, np.nan) for r in reports])
         return Reference(points, np.array([sigma, sigma, bias]), offset, (2 * HALF + 1) * self.step)
 
-    def _lattice(self, views: Sequence[View]) -> tuple[Array, Array]:
-        """Return the places (n, 2) [deg] on a grid over views, where the reference is, and their heights (n,)."""
+    def _lattice(self, views: Sequence[View], far: float) -> tuple[Array, Array]:
+        """Return the places (n, 2) [deg] on a grid over views and `far` [m] around, where the reference is, and their
+        heights (n,).
+        """
         if not views:
             return np.zeros((0, 2)), np.zeros(0)
         rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
@@ -307,8 +327,8 @@ class _ReferenceWork:
         areas = [0.5 * abs(float((x * np.roll(y, 1) - y * np.roll(x, 1)).sum())) for x, y in (r.T for r in local)]
         apart = self.step * max(HALF // 2, round((max(areas) / GRID_POINTS[-1]) ** 0.5 / self.step))
         every = np.concatenate(local)
-        low = np.floor((every.min(axis=0) - VOTE_RADIUS) / apart)
-        high = np.ceil((every.max(axis=0) + VOTE_RADIUS) / apart)
+        low = np.floor((every.min(axis=0) - far) / apart)
+        high = np.ceil((every.max(axis=0) + far) / apart)
         grid = np.meshgrid(*(apart * np.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
         places = origin + np.stack(grid, axis=-1).reshape(-1, 2) / metres
         places = places[np.any([sheet.shows(places) for sheet in self.sheets], axis=0)]

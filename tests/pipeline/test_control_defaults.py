@@ -76,7 +76,7 @@ def test_altitudes_in_another_unit_are_refused(times: float, unit: str, tmp_path
 
 def test_a_point_outside_its_image_is_refused(tmp_path: Path) -> None:
     gcp = written(tmp_path / "g.csv", float, moved=100.0)
-    with pytest.raises(InputError, match="point gcp_004: outside its image"):
+    with pytest.raises(InputError, match="point gcp_004: outside its image, and inside it by the camera"):
         adjusted(VIEWS, gcp, tmp_path)
     kept = adjusted(VIEWS, gcp, tmp_path, keep_going=True)
     assert any("outside its image" in reason for reason in kept.record.reasons)

@@ -431,7 +431,7 @@ def test_a_reference_that_shows_something_else_is_of_no_use():
     matches = tuple(ViewMatch(name, peak, (0.0, 0.0)) for name, peak in (("A", 3.2), ("B", 5.1)))
     (line,) = reasons(reference=ReferenceControl(None, matches, 1.0, 1.0))
     assert f"(its highest peak has 5.1 standard deviations, {PEAK:g} are needed)" in line
-    assert "another place, too old, or without texture. It was not used" in line
+    assert "another place, too old, without texture, or cameras more than 1 km off. It was not used" in line
     (line,) = reasons(reference=ReferenceControl(None, (ViewMatch("A", PEAK, (0.0, 0.0)), *matches), 1.0, 1.0))
     assert "the DEM under it is of another place, or it is too old or too coarse. It was not used" in line
     (line,) = reasons(reference=ReferenceControl(None, (), 1.0, 1.0))

@@ -176,7 +176,10 @@ def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, so
     """Solve the block with an affine in every image, where residuals are systematic and it is much better."""
     if not (found.is_skew or found.has_trend):
         return None
-    affine = solve(parts.inner, parts.outer, replace(options, model="affine"))
+    try:
+        affine = solve(parts.inner, parts.outer, replace(options, model="affine"))
+    except (AdjustError, np.linalg.LinAlgError):  # cameras hundreds of pixels off
+        return None
     return affine if _is_much_better(affine, found) else None
 
 
