@@ -158,7 +158,7 @@ def solve_block(
 
 
 def _placed(problem: Problem, block: Block) -> Problem:
-    """Return the problem with cameras translated by what a reference found them to be off, where that is much.
+    """Return the problem with cameras translated by their offsets from a reference, where these are large.
 
     From hundreds of metres away no step from the delivered cameras lowers the cost.
     """

@@ -475,7 +475,7 @@ def _with_earlier_held(
     """Return the adjustment of new images to the cameras of the earlier run as they are written, and the run with the
     one that moves them all.
 
-    What is known of the place and shape of the scene is that of the latter, as the cameras held are not exact.
+    The uncertainty of the scene's place and shape is that of the latter, as cameras that are held are not exact.
     """
     prior: BlockPrior = run.earlier.prior
     old = {*run.earlier.number}

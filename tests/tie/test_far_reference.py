@@ -13,7 +13,7 @@ from barpc.scene import View
 from barpc.tie.reference import register_views
 from barpc.verbs.moving import moved
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*moved and refitted")]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")]
 
 
 @pytest.mark.landing(2)
