@@ -13,7 +13,7 @@ from barpc.scene import View
 from barpc.tie.reference import register_views
 from barpc.verbs.moving import moved
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")]
 
 
 @pytest.mark.landing(2)
