@@ -341,14 +341,21 @@ def _with_views(
         workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
     run = Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier)
-    kept, carried = one_each(run.views, run.sources, options.tie.band, frozenset(earlier.number if earlier else ()))
+    of_run = frozenset(earlier.number if earlier else ())
+    kept, carried = one_each(run.views, run.sources, options.tie.band, of_run)
     run = replace(
         run,
         views=tuple(run.views[i] for i in kept),
         sources=tuple(run.sources[i] for i in kept),
         carried=carried,
     )
-    if len(kept) < least:
+    if carried and earlier is not None and all(view.name in of_run for view in run.views):
+        one = carried[0]
+        raise InputError(
+            f"{one.view.name}: has the camera of {one.lead} of {earlier.folder}, up to scale and shift: adjust it with "
+            "the images of that run"
+        )
+    if len(kept) < least and carried:
         one = carried[0]
         raise InputError(
             f"{one.view.name}: a band of {one.lead}, of one acquisition: give an image taken from elsewhere"
@@ -399,7 +406,8 @@ def _met(run: Run, options: RunOptions) -> Run:
     """
     old, tracks = _is_old(run), of_new(run.tracks, _is_old(run))
     tied = np.bincount(tracks.view, minlength=len(run.views)) > 0
-    keep = ~old | tied | bool(options.gcp or options.reference)
+    leads = {one.lead for one in run.carried}
+    keep = ~old | tied | bool(options.gcp or options.reference) | np.array([v.name in leads for v in run.views])
     if not (old & keep).any():
         raise TiePointError(
             f"no tie point of the images given is seen in one of {run.earlier.folder}: look at the images (clouds? "

@@ -30,6 +30,7 @@ MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
 """A whole shift [px], and the share of a pair's matches, `MIN_COPY_MATCHES` or more, that must have it."""
+_COPIED = 0.5  # of the smaller image: less is what two frames of a pass have in common
 MIN_COPY_MATCHES = 20  # Of others a hundredth lies at a whole shift by chance: 18 of 20 never do
 SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
@@ -273,6 +274,10 @@ class Run:
             ):
                 continue  # by no whole shift, whichever: most pairs
             whole = np.rint(np.median(shift, axis=0))
+            first, second = (np.array(self.views[i].size) for i in ties.views)
+            common = np.minimum(first, second - whole) - np.maximum(0.0, -whole)
+            if np.prod(common) < _COPIED * min(np.prod(first), np.prod(second)):
+                continue  # neighbouring frames of one pass
             if np.mean((np.abs(shift - whole) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) >= MIN_WHOLE_SHARE:
                 names = [self.views[i].name for i in ties.views]
                 for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):

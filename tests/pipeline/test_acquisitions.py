@@ -86,6 +86,19 @@ def test_an_image_and_its_band_alone_are_nothing_to_adjust(tmp_path: Path) -> No
         barpc.adjust([VIEWS[0], coarse], tmp_path / "run")
 
 
+def test_a_band_is_added_with_other_images_and_not_alone(tmp_path: Path) -> None:
+    few = {"points_per_image": 500}
+    coarse = band(VIEWS[0], tmp_path / "multi.tif")
+    barpc.adjust(VIEWS[:2], tmp_path / "a", **few)
+    with pytest.raises(InputError, match=r"multi: has the camera of view_00 of .*a, up to scale and shift"):
+        barpc.adjust([coarse], tmp_path / "b", add_to=str(tmp_path / "a"), **few)
+    found = barpc.adjust([coarse, VIEWS[2]], tmp_path / "b", add_to=str(tmp_path / "a"), **few)
+    assert [(one.name, one.lead) for one in found.record.carried or ()] == [("multi", "view_00")]
+    written, lead = (barpc.read_rpc(tmp_path / name) for name in ("b/multi.vrt", "a/view_00.vrt"))
+    ground = written.localize(GRID, np.full(len(GRID), 220.0))
+    assert np.abs(lead.project(ground) - (4 * GRID + 1.5)).max() < 1e-3
+
+
 @pytest.mark.slow
 def test_a_real_multispectral_image_follows_its_panchromatic_one(shared_data: Path, tmp_path: Path) -> None:
     """It ended 4.2 px away from it."""

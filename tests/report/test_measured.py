@@ -57,7 +57,7 @@ def test_pairs_have_the_observations_of_the_tracks_that_both_see():
     assert pair_ties(none) == []
 
 
-def copies(shift=(12.0, -7.0), num=20, others=0, off=0.0):
+def copies(shift=(12.0, -7.0), num=20, others=0, off=0.0, sizes=((500, 500), (500, 500))):
     """The copies of two views whose matches have one shift, but for `others` of them."""
     xy = np.random.default_rng(2).uniform(0, 500, (num, 2))
     second = xy + shift + off
@@ -68,7 +68,7 @@ def copies(shift=(12.0, -7.0), num=20, others=0, off=0.0):
         np.stack([xy, second], 1).reshape(-1, 2),
         np.ones(2 * num),
     )
-    views = tuple(SimpleNamespace(name=name) for name in "AB")
+    views = tuple(SimpleNamespace(name=name, size=size) for name, size in zip("AB", sizes, strict=True))
     return Run("check", views, (), tracks).copies  # type: ignore[arg-type]
 
 
@@ -80,6 +80,9 @@ def test_a_copy_is_an_image_whose_matches_have_one_whole_shift():
     }
     assert copies(off=0.04)
     assert not copies(off=0.06)
+    assert copies(shift=(0.0, -240.0))
+    assert not copies(shift=(0.0, -260.0))  # the next frame of a pass
+    assert copies(shift=(-300.0, -280.0), sizes=((500, 500), (150, 200)))  # a part
     assert copies(off=-0.04)
     assert not copies(num=19)
     assert copies(others=2)  # nine of ten
