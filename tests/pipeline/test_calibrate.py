@@ -123,7 +123,7 @@ def test_runs_tell_the_curve_and_how_well(calibration: Path, archive: list[Path]
         np.testing.assert_array_equal(text[key], np.round(text[key], digits))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_with_a_calibration_writes_it_and_is_calibrated_again_to_the_same(
     calibration: Path, archive: list[Path], line: Sensor, tmp_path: Path
 ) -> None:

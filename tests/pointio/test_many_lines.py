@@ -220,7 +220,7 @@ DENSE = {
 
 
 @pytest.mark.slow
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is told by /proc")
 @pytest.mark.parametrize("kind", DENSE)
 def test_the_densest_file_of_a_kind_takes_a_gigabyte_and_seconds_at_most(tmp_path: Path, kind: str) -> None:

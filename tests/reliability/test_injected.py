@@ -126,7 +126,7 @@ def passes_alone(request: pytest.FixtureRequest) -> bool:
     return True
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_last_rename_and_the_last_sync_of_a_run_fail(traced, tmp_path, request):
     if passes_alone(request):
         return

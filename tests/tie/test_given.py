@@ -170,7 +170,7 @@ def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
     assert typical(scene, tracks, 0, 2) <= 0.1  # of one date: by grey values
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, caplog) -> None:
     """Of the second image three sixteenths are left, the rest says nothing: places stay true, and each counts once."""
     scene = render(views=2, size=(300, 300))

@@ -198,8 +198,9 @@ def datum_shares(
     """
     moves = covariance.of_noise.solve(by_unknown.T)
     variance = np.einsum("mn,nm->m", by_unknown, moves)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unknowns = (moves / np.sqrt(variance)).reshape(problem.structure.num_views, -1, len(variance))
+    told = variance > 0.0
+    scale = np.where(told, 1.0 / np.sqrt(np.where(told, variance, 1.0)), 0.0)
+    unknowns = (moves * scale).reshape(problem.structure.num_views, -1, len(variance))
     paid = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
     paid["cameras"] += (problem.camera_prior.whitened(unknowns) ** 2).sum(axis=(0, 1))
     if (joint := problem.joint_prior) is not None:
@@ -216,8 +217,8 @@ def datum_shares(
         points[asked] = reduced.carried(unknowns, np.flatnonzero(asked))
         held = _point_shares(paid, problem, reduced, unknowns, points, kinds)
         _add_observation_shares(paid, problem, state, weight, (unknowns, points), held)
-    with np.errstate(invalid="ignore"):
-        return {source: cost / sum(paid.values()) for source, cost in paid.items()}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return {source: np.where(told, cost / sum(paid.values()), np.nan) for source, cost in paid.items()}
 
 
 def _point_shares(
