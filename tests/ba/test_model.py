@@ -463,7 +463,7 @@ def script(
     monkeypatch.setattr(solved, "_held_in_shape", lambda found, *_: found)
     use = np.ones(100)
     seen = {"view": np.zeros(100, dtype=np.int64), "point": np.arange(100), "num_tracks": 100}
-    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none(), **seen)
+    block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none(), reference=None, **seen)
     options = AdjustOptions() if options is None else options
     made = solved.solve_block(block, None, options, None, None, prior)  # type: ignore[arg-type]
     named = [

@@ -78,11 +78,9 @@ def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: Sim
     assert {path: path.read_bytes() for path in before} == before
     whole = adjust([archive / f"{v.name}.tif" for v in made.views], tmp_path / "whole", RunOptions(
         matches=(str(archive / "ties.npz"),), matches_only=True))  # fmt: skip
-    ground = made.views[4].sensor.localize(np.array([[0.0, 0.0], [1999.0, 1999.0]]), np.full(2, 300.0))
-    one, other = (
-        read_rpc(place / "view_0004.vrt").project(ground) for place in (eleven / "second", tmp_path / "whole")
-    )
-    np.testing.assert_allclose(one, other, atol=0.3)  # the others have moved there
+    for pair in found.record.pairs:
+        offset = pair.epipolar_after
+        assert abs(offset.median) < 0.02 + 5.0 * offset.spread / np.sqrt(offset.count)
     said = "\n".join(found.summary["verdict"])
     assert "1 image added to the 11 images of first" in said
     assert "The cameras of first were held as they are written" in said

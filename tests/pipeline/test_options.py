@@ -14,7 +14,7 @@ import rasterio
 from rasterio import Affine
 from scipy.interpolate import NearestNDInterpolator
 
-from barpc.ba import AdjustOptions
+from barpc.ba import AdjustOptions, BlockPrior
 from barpc.base.errors import BarpcError, FitError, InputError, OutputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import FitOptions
@@ -250,9 +250,13 @@ def check_points(run: Run, out: Path, scene: Path) -> None:
 
 
 def add_to(run: Run, out: Path, scene: Path) -> None:
-    free, going_on = run.plain, run("b", add_to=str(scene / "earlier"), stop_after="adjustment")
-    assert 0 < len(going_on.tracks) < len(free.tracks)
-    np.testing.assert_allclose(going_on.adjustment.params, free.adjustment.params, atol=0.2)
+    free, held = run.plain, run("b", add_to=str(scene / "earlier"), stop_after="adjustment")
+    assert 0 < len(held.tracks) < len(free.tracks)
+    before = BlockPrior.load(scene / "earlier/tables/block.npz")
+    rows = [held.adjustment.names.index(name) for name in before.names]
+    np.testing.assert_array_equal(held.adjustment.params[rows], before.params)
+    together = run("c", add_to=str(scene / "earlier"), update=True, stop_after="adjustment")
+    np.testing.assert_allclose(together.adjustment.params, free.adjustment.params, atol=0.2)
 
 
 def update(run: Run, out: Path, scene: Path) -> None:
