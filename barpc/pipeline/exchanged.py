@@ -50,7 +50,9 @@ class Exchange:
 def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
     """Return the exchange of cameras that brings the matches of views to their epipolar lines; None without one."""
     pairs = [ties for ties in pair_ties(tracks) if _converges(views, ties)]
-    as_given = [_scatter(views, tracks, ties, ties.views) for ties in pairs]
+    measured = [(ties, _scatter(views, tracks, ties, ties.views)) for ties in pairs]
+    measured = [(ties, scatter) for ties, scatter in measured if np.isfinite(scatter)]  # others have too few matches
+    pairs, as_given = [ties for ties, _ in measured], [scatter for _, scatter in measured]
     worst = sorted((k for k in range(len(pairs)) if as_given[k] > _SCATTER), key=lambda k: -as_given[k])
     suspects = sorted([*dict.fromkeys(view for k in worst for view in pairs[k].views)][:_MOST_TRIED])
     orders = [[*both][::-1] for both in combinations(suspects, 2)]
@@ -78,13 +80,17 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
 
 
 def _converges(views: Sequence[View], ties: PairTies) -> bool:
+    """Return whether the rays of two views meet at an angle that tells epipolar lines."""
     first, second = (views[view] for view in ties.views)
     at = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
     return bool(convergence_angle(first.sensor, second.sensor, at) > _LEAST_ANGLE)
 
 
 def _scatter(views: Sequence[View], tracks: Tracks, ties: PairTies, cameras: tuple[int, int]) -> float:
-    """Return the robust scatter of a pair's matches across epipolar lines through cameras of some views [px]."""
+    """Return the robust scatter of a pair's matches across epipolar lines through cameras of some views [px].
+
+    Infinite where too few matches have a line.
+    """
     rows = np.unique(np.linspace(0, len(ties.a) - 1, min(len(ties.a), _MATCHES)).astype(np.int64))
     first, second = (views[camera] for camera in cameras)
     seen = tracks.xy[ties.a[rows]], tracks.xy[ties.b[rows]]

@@ -20,7 +20,8 @@ from barpc.sensor.rpc import RPC
 
 BEYOND, FAR_BEYOND = 1.5, 4.0
 """Half widths of the ground that an RPC is made for, from its middle to a corner of its image: right images have 0.99
-at most (23 public ones), those shifted by half a side 1.9, with RPCs of products 2 and 4 times coarser 3 and 6."""
+at most (23 public ones), those shifted by half a side 1.5 to 2.0, with RPCs of products 2, 3 and 4 times coarser 2.6,
+4.2 and 5.9 at least."""
 _ANOTHER_SIZE = 0.02  # of a side: vendors' scales are half the sides to a pixel, or padded by more
 _MAP_SHAPE = 0.005, 0.05  # of the longer side: a map on its axes is exact, a turned geotransform fitted to corners
 _MAP_SHIFT = 0.1, 0.5  # of the longer side: by the pointing that somebody corrected in one of both
