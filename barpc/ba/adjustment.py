@@ -33,7 +33,7 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
-from barpc.base.options import AdjustOptions
+from barpc.base.options import OFF, AdjustOptions
 from barpc.base.statistics import CRITICAL, ITERATIONS, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
@@ -107,6 +107,16 @@ def adjust_tracks(
 
     found = _solved_adjustment(parts, options, solve, altimetry, common)
     return replace(found, earlier=prior, common=common, seconds=time.process_time() - start)
+
+
+def agreeing(views: Sequence[View], tracks: Tracks, options: AdjustOptions | None = None) -> BoolArray:
+    """Return which observations (K,) agree with the cameras as they are: an adjustment that moves none would use them.
+
+    Errors as of `adjust_tracks`.
+    """
+    names = tuple(view.name for view in views)
+    held = replace(options or AdjustOptions(), fixed=names, drift=0, terms="none", jitter=OFF, detectors=())
+    return adjust_tracks(views, tracks, held, hold_out=False).inlier
 
 
 def _solved_adjustment(

@@ -162,6 +162,9 @@ class VerifyOptions(Options):
     expect: str | None = option(
         None, "The root that was printed, or a later one: 64 hexadecimal digits.", metavar="ROOT"
     )
+    figures: bool = option(
+        False, "Measure the RMS of every image again, by its files as GDAL or another tool reads them."
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,7 +14,7 @@ from barpc.base.verb_options import CalibrateOptions, DsmOptions, ExportOptions,
 from barpc.cli.flags import flags_of, given_flags, jobs_option
 from barpc.cli.terminal import at_work, echo, print_comparison, remark, tell, tell_gate, wants_json
 
-_VERIFIED = "input", "output", "camera"  # of files that `verify` compares
+_VERIFIED = "input", "output", "camera", "figure"  # that `verify` compares
 _TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 
@@ -85,12 +85,14 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
 
     SHA256SUMS lists all (but .barpc), also for `sha256sum -c`; its own SHA-256 is the root. Only --expect detects
     edits of a file together with the list. Missing inputs are searched by name beside the run, in it, and in the
-    folders given; other hosts are not accessed. Exit code 0:
-    everything is unchanged; 3: something is not; 1: no SHA256SUMS (interrupted, or of release 0.3), or a damaged one.
+    folders given; other hosts are not accessed. --figures measures what the run printed again, by the files on disk as
+    another tool reads them, to 0.005 px. Exit code 0: everything is unchanged; 3: something is not; 1: no SHA256SUMS
+    (interrupted, or of release 0.3), or a damaged one.
 
     \b
     Examples:
       barpc verify adjusted
+      barpc verify adjusted --figures
       barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
     from barpc.pipeline.outputs import SAME
@@ -102,9 +104,11 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     changed = (
         f"{one.kind} {one.file}: {one.now}{one.note and f', {one.note}'}"
         for one in found
-        if one.now != SAME or one.kind == "root"
+        if one.now != SAME or one.kind in ("root", "figure")
     )
     kinds = {kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in _VERIFIED}
+    if not flags.get("figures"):
+        del kinds["figure"]
     tell(list(map(asdict, found)), *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
     if not wrong:
         return 0

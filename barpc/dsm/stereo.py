@@ -32,8 +32,8 @@ from barpc.base.statistics import MAD
 from barpc.cameras import open_camera
 from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
-from barpc.pipeline.inputs import PRIOR_FILE
 from barpc.report.finished import FinishedRun
+from barpc.report.runfiles import PRIOR_FILE
 from barpc.rpcio.grids import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
@@ -338,13 +338,14 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
         if not shot.file:
             raise InputError(f"{folder}: {shot.name} has no pixels")
         grid, date = shot.name + CORRECTION, (shot.light.time or "")[:10]
-        camera = open_camera(scene.run.sealed.file(grid)).model if grid in shot.entry.outputs else shot.rpc
+        camera = open_camera(shot.writer.sealed.file(grid)).model if grid in shot.written else shot.rpc
         views.append(View(shot.name, shot.file, shot.size, camera, scene.alt_range, date))
-    ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.summary.pairs}
+    ties = {frozenset((pair.a, pair.b)): float(pair.num_matches) for pair in scene.pairs}
     worth = {
         (i, j): ties.get(frozenset((views[i].name, views[j].name)), 0.0) for i, j in combinations(range(len(views)), 2)
     }
-    there = None if minus is None else {view.name for view in FinishedRun.open(minus).summary.views}
+    before = () if minus is None else FinishedRun.open(minus).lineage
+    there = None if minus is None else {view.name for run in before for view in run.summary.views}
     parts = [[i for i, v in enumerate(views) if there is None or (v.name in there) == old] for old in (False, True)]
     if there is None:
         del parts[1]

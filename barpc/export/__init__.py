@@ -41,8 +41,7 @@ def export_run(
     files = TARGETS[target](scene, out.absolute())
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
     links = image_links(scene) if target == "colmap" else {}
-    read = scene.run.inputs
-    content = {shot.file: read[shot.entry.path].sha256 for shot in scene.shots if shot.entry.path in read}
+    content = {shot.file: one.sha256 for shot in scene.shots if (one := shot.run.inputs.get(shot.entry.path))}
     known = {name: content[image] for name, image in links.items() if image in content}
     with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():

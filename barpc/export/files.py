@@ -187,7 +187,7 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
             {"rel": rel, "href": f"./{_COLLECTION}", "type": "application/json"}
             for rel in ("root", "parent", "collection")
         ],
-        "assets": {name: _asset(scene.folder / name, out) for name in view.outputs}
+        "assets": {name: _asset(shot.writer.folder / name, out) for name in shot.written}
         | {"image": {"href": relative_link(shot.file, out), "roles": ["source"]}},
     }
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, wrap_longitude
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
 from barpc.rasters.raster import sources_of
@@ -22,11 +22,12 @@ from barpc.report.finished import FinishedRun
 from barpc.report.ranking import sure_pairs
 from barpc.report.runfiles import RunFiles
 from barpc.report.summary import Summary
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
-from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid
+from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, triangulate
 from barpc.sensor.rpc import RPC
 
 ALTITUDE_MARGIN = 20.0
@@ -50,13 +51,16 @@ class Sampled:
 class Shot:
     """An image of a run with its corrected camera.
 
-    `file`: the image, or its URL; `carrier`: the run's VRT or copy, with the RPC in it, if there
-    is one; `index` (n,), `xy` (n, 2), `track` (n,): its tie points, places among the scene's points, and where it shows
-    them [px].
+    `entry`: its record in `run`, the newest that used it; `writer`: the newest run that wrote its camera, into the
+    files `written`; `file`: the image, or its URL; `carrier`: the VRT or copy of those with the RPC in it, if there is
+    one; `index` (n,), `xy` (n, 2): its tie points, places among the scene's points, and where it shows them [px].
     """
 
     entry: ViewEntry
+    run: FinishedRun
     rpc: RPC
+    writer: FinishedRun
+    written: tuple[str, ...]
     file: str
     carrier: Path | None
     light: Acquisition
@@ -76,10 +80,11 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A run: its shots in order, its tie points (P, 3), lon, lat [deg], alt [m], and the altitudes that it spans."""
+    """A run: its shots in order, pairs, tie points (P, 3), lon, lat [deg], alt [m], and the altitudes that it spans."""
 
     run: FinishedRun
     shots: tuple[Shot, ...]
+    pairs: tuple[PairEntry, ...]
     points: Array
     tracks: IntArray
     alt_range: tuple[float, float]
@@ -161,7 +166,9 @@ def relative_link(target: Path | str, folder: Path) -> str:
 def read_scene(folder: Path, alt_range: tuple[float, float] | None = None, of_images: bool = True) -> Scene:
     """Read the scene of a run folder; altitudes [m] by its tie points unless they are given.
 
-    Without `of_images` these are not asked for, and nothing is known of their light.
+    A run that added images to another (`--add-to`) has the images of both, and the tie points of both, intersected with
+    the cameras as the newest run that wrote them has them. Without `of_images` these are not asked for, and nothing is
+    known of their light.
 
     Raises
     ------
@@ -170,38 +177,89 @@ def read_scene(folder: Path, alt_range: tuple[float, float] | None = None, of_im
     `of_images`, an image that was.
     """
     run = FinishedRun.open(folder)
-    summary = run.summary
-    if summary.kind != "adjust":
-        raise InputError(f"{folder / 'summary.json'}: a run of the kind {summary.kind}, without corrected cameras")
-    files = run.tables()
-    order = np.argsort(files.tracks, kind="stable")
-    index, found = _positions_in(files.tracks[order], files.observations.track)
-    counted = np.flatnonzero(found & files.observations.used)
-    counted = counted[np.argsort(files.observations.view[counted], kind="stable")]
-    starts = np.searchsorted(files.observations.view[counted], np.arange(len(summary.views) + 1))
+    if run.summary.kind != "adjust":
+        raise InputError(f"{folder / 'summary.json'}: a run of the kind {run.summary.kind}, without corrected cameras")
+    shots, pairs, ties = list[Shot](), dict[frozenset[str], PairEntry](), list[_Ties]()
+    for one in run.lineage:
+        ties.append(_Ties.of(one))
+        pairs = {frozenset((pair.a, pair.b)): pair for pair in one.summary.pairs} | pairs
+        known = {shot.name for shot in shots}
+        shots += [_shot(run, one, view, of_images) for view in one.summary.views if view.name not in known]
+    number = {shot.name: i for i, shot in enumerate(shots)}
+    view, point, xy = (np.concatenate(part) for part in zip(*_rows_of(ties, number), strict=True))
+    points = np.concatenate([one.points for one in ties])
+    if len(ties) > 1:
+        middle = float(np.median(points[:, 2])) if len(points) else 0.0
+        found = triangulate([shot.rpc for shot in shots], view, point, xy, alt=middle)
+        points = ground_from_ecef(np.concatenate([found.points, np.full((len(points) - len(found.points), 3), np.nan)]))
     if alt_range is None:
-        alt_range = _scene_altitudes(files.points[:, 2], summary)
-    shots = []
-    for number, view in enumerate(summary.views):
-        _check_names(folder, view.name, view.path)
-        if PurePath(view.name).name != view.name or view.name == "..":
-            raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
-        rpc = written_rpc(run, view)
-        if rpc is None:
-            update = any(one.outputs for one in summary.views) and not view.outputs  # of a run that added images
-            raise InputError(
-                f"{folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again"
-                + ", with --update" * update
-            )
-        rows = counted[starts[number] : starts[number + 1]]
-        file, light = str(run.sealed.located(view.path)), Acquisition()
-        if of_images:
-            file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
-            light = read_acquisition(file, source or None)
-        seen = order[index[rows]], files.observations.xy[rows]
-        shots.append(Shot(view, rpc, file, _carrier(run, view), light, *seen))
-    noise = _noise(files, counted)
-    return Scene(run, tuple(shots), files.points[:, :3], files.tracks, alt_range, noise)
+        alt_range = _scene_altitudes(points[np.isfinite(points[:, 2]), 2], run.summary)
+    for i, shot in enumerate(shots):
+        rows = view == i
+        shots[i] = replace(shot, index=point[rows], xy=xy[rows])
+    tracks = ties[0].tracks if len(ties) == 1 else np.arange(len(points))
+    return Scene(run, tuple(shots), tuple(pairs.values()), points, tracks, alt_range, ties[0].noise)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ties:
+    """Tie points of a run in use: their numbers (P,) and places (P, 3); observations (K,): name of the image, index of
+    the point, position; `noise` as of a `Scene`.
+    """
+
+    tracks: IntArray
+    points: Array
+    names: Sequence[str]
+    view: IntArray
+    index: IntArray
+    xy: Array
+    noise: float
+
+    @classmethod
+    def of(cls, run: FinishedRun) -> _Ties:
+        files = run.tables()
+        order = np.argsort(files.tracks, kind="stable")
+        index, found = _positions_in(files.tracks[order], files.observations.track)
+        counted = np.flatnonzero(found & files.observations.used)
+        seen = files.observations.view[counted], order[index[counted]], files.observations.xy[counted]
+        names = [view.name for view in run.summary.views]
+        return cls(files.tracks, files.points[:, :3], names, *seen, _noise(files, counted))
+
+
+def _rows_of(ties: Sequence[_Ties], number: Mapping[str, int]) -> Iterator[tuple[IntArray, IntArray, Array]]:
+    """Yield the observations of each run's tie points by numbers of all images and all points."""
+    before = 0
+    for one in ties:
+        places = np.array([number[name] for name in one.names], dtype=np.int64)
+        yield places[one.view], one.index + before, one.xy
+        before += len(one.points)
+
+
+def _shot(newest: FinishedRun, run: FinishedRun, view: ViewEntry, of_images: bool) -> Shot:
+    """Return an image with its corrected camera, without tie points."""
+    folder = run.folder
+    _check_names(folder, view.name, view.path)
+    if PurePath(view.name).name != view.name or view.name == "..":
+        raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
+    writer, files, rpc = _written(newest, run, view)
+    file, light = str(run.sealed.located(view.path)), Acquisition()
+    if of_images:
+        file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
+        light = read_acquisition(file, source or None)
+    none: IntArray = np.empty(0, dtype=np.int64)
+    carrier = _carrier(writer, view.name, files)
+    return Shot(view, run, rpc, writer, files, file, carrier, light, none, np.empty((0, 2)))
+
+
+def _written(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[FinishedRun, tuple[str, ...], RPC]:
+    """Return the newest run that wrote the camera of an image, the files there that hold it, and its RPC."""
+    of_view = [one for before in run.lineage for one in before.summary.views if one.name == view.name]
+    names = tuple(dict.fromkeys(name for one in of_view for name in one.outputs))
+    for one in newest.lineage:
+        files = tuple(name for name in names if name in one.sealed.listed or not one.sealed.layers)
+        if (rpc := written_rpc(one, files)) is not None:
+            return one, files, rpc
+    raise InputError(f"{run.folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again")
 
 
 def _positions_in(known: IntArray, asked: IntArray) -> tuple[IntArray, Any]:
@@ -222,10 +280,10 @@ def _scene_altitudes(alt: Array, summary: Summary) -> tuple[float, float]:
     return float(np.floor(low - margin)), float(np.ceil(high + margin))
 
 
-def _carrier(run: FinishedRun, view: ViewEntry) -> Path | None:
+def _carrier(run: FinishedRun, image: str, written: Collection[str]) -> Path | None:
     """Return the raster with the corrected RPC that a run wrote for an image, in its own folder."""
-    for name in (view.name + end for row in CARRIERS.values() for end in row.suffixes):
-        if name in view.outputs and is_own(run.folder, name):
+    for name in (image + end for row in CARRIERS.values() for end in row.suffixes):
+        if name in written and is_own(run.folder, name):
             path = run.sealed.file(name).absolute()
             with suppress(InputError):  # of a run that was moved without its images, whose VRTs show none
                 for source in sources_of(path):
@@ -247,6 +305,6 @@ def pairs_of(scene: Scene) -> Sequence[tuple[str, str]]:
 
     Of those under such an angle: two images without reservation with enough matches, where there are any.
     """
-    shown = [pair for pair in scene.summary.pairs if 2.0 <= (pair.convergence_deg or 0.0) <= 50.0]
-    sure = sure_pairs(scene.summary.views, shown)
-    return [(pair.a, pair.b) for pair in sure or shown or scene.summary.pairs]
+    shown = [pair for pair in scene.pairs if 2.0 <= (pair.convergence_deg or 0.0) <= 50.0]
+    sure = sure_pairs([shot.entry for shot in scene.shots], shown)
+    return [(pair.a, pair.b) for pair in sure or shown or scene.pairs]

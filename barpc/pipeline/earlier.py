@@ -31,12 +31,13 @@ from barpc.base.remote import is_url, location
 from barpc.base.safe_io import GEOJSON, parse_json, read_text
 from barpc.base.sealed import Sealed, portable
 from barpc.cameras import split_spec
-from barpc.pipeline.inputs import IMAGES, PRIOR_FILE, linked_names
+from barpc.pipeline.inputs import linked_names
 from barpc.pipeline.loading import Image, LoadedViews, image_path, load_views
 from barpc.pointio.names import unique_names
 from barpc.report import Run
 from barpc.report.finished import FinishedRun
 from barpc.report.outcome import Added
+from barpc.report.runfiles import IMAGES, PRIOR_FILE
 from barpc.scene import BoolArray, Camera, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import footprints

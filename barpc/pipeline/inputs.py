@@ -29,7 +29,7 @@ from barpc.rasters.dem import Dem
 from barpc.rasters.raster import hashed
 from barpc.rasters.vertical import ELLIPSOIDAL, FLAT, NO_GEOID, geoid_file, metres_of
 from barpc.report import Run
-from barpc.report.runfiles import table_path
+from barpc.report.runfiles import IMAGES, PRIOR_FILE, table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, triangulate
 from barpc.tie import Matches
@@ -41,7 +41,6 @@ from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
-PRIOR_FILE, IMAGES = "block.npz", "images.json"  # the files in a run folder that a later run starts from
 _IMAGE_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
 _MAX_OUTSIDE_SHARE = 0.05  # of the points may lie farther off, where a matcher looks over borders; of other crops more
 

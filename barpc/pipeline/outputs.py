@@ -26,14 +26,22 @@ from barpc.cameras import open_camera
 from barpc.fit import RpcFit
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import REOPENED, RESAMPLED, Written, grid_names, made_in_room
-from barpc.pipeline.inputs import IMAGES, PRIOR_FILE
 from barpc.pipeline.verify_outputs import verify
 from barpc.report import Run, Summary
 from barpc.report.finished import FinishedRun
 from barpc.report.geopackage import geopackage
 from barpc.report.page import REPORT_STAGE, can_render, page_of, report_html
 from barpc.report.records import json_form
-from barpc.report.runfiles import FOLDER, PICTURES, TABLES, gcps_geojson, map_layers, read_summary
+from barpc.report.runfiles import (
+    FOLDER,
+    IMAGES,
+    PICTURES,
+    PRIOR_FILE,
+    TABLES,
+    gcps_geojson,
+    map_layers,
+    read_summary,
+)
 from barpc.report.summary import OutputEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS, WRITABLE, format_for, hidden_by, sidecars, write_camera

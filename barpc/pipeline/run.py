@@ -16,10 +16,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, agreeing, block_prior
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
-from barpc.base.errors import BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
+from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
 from barpc.base.frozen import html_table
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
@@ -36,8 +36,6 @@ from barpc.pipeline.exchanged import exchanged_cameras
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
 from barpc.pipeline.inputs import (
-    IMAGES,
-    PRIOR_FILE,
     given_matches,
     given_tracks,
     hash_inputs,
@@ -57,10 +55,10 @@ from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
 from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
-from barpc.report.outcome import WHOLE_PIXELS, pair_ties
+from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
 from barpc.report.records import json_form, table
-from barpc.report.runfiles import FOLDER
+from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import plain_source
@@ -307,7 +305,23 @@ def check(
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
     run = _with_own_cameras(_with_ties(_with_views("check", images, options, work), options, work), options, work)
+    run = replace(run, agreeing=_agreeing(run, options.adjust))
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
+
+
+def _agreeing(run: Run, options: AdjustOptions) -> BoolArray | None:
+    """Return the observations (K,) of a check without those that an adjustment would cut; None for all of them.
+
+    Where it would cut many of an image these are no wrong matches: the cameras disagree.
+    """
+    if len(run.views) < 2 or not len(run.tracks):
+        return None
+    try:
+        found = agreeing(run.views, run.tracks, options)
+    except BarpcError:  # too few
+        return None
+    total, kept = (np.bincount(run.tracks.view, rows, len(run.views)) for rows in (None, found))
+    return found if (kept >= (1.0 - MANY_REJECTED) * total).all() else None
 
 
 def _as_given(views: Iterable[View], images: Sequence[Image], options: RunOptions) -> tuple[View, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
@@ -106,7 +106,7 @@ def _view(runs: tuple[FinishedRun, FinishedRun], views: tuple[ViewEntry, ViewEnt
 
 def _rpc_difference(runs: tuple[FinishedRun, FinishedRun], views: tuple[ViewEntry, ViewEntry]) -> list[float | None]:
     """Return the largest distance between both RPCs [px], and that without their mean shift; None: not known."""
-    first, second = map(written_rpc, runs, views)
+    first, second = (written_rpc(run, view.outputs) for run, view in zip(runs, views, strict=True))
     if first is None or second is None:
         return [None, None]
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
@@ -126,7 +126,7 @@ def _scene_motion(
     Ground points of a grid in each image are projected with the RPCs of the first run, and intersected with those of
     the second, where two images or more show them.
     """
-    rpcs = [[written_rpc(run, view) for run, view in zip(runs, pair, strict=True)] for pair in views]
+    rpcs = [[written_rpc(run, view.outputs) for run, view in zip(runs, pair, strict=True)] for pair in views]
     both = [(pair[0].size, *found) for pair, found in zip(views, rpcs, strict=True) if None not in found]
     if len(both) < 2 or altitude is None:
         return None
@@ -146,9 +146,9 @@ def _scene_motion(
     return np.asarray(np.median(moved, axis=0)) if len(moved) else None
 
 
-def written_rpc(run: FinishedRun, view: ViewEntry) -> RPC | None:
-    """Return the first RPC of those that a run wrote for a view; InputError where it was changed since."""
-    for name in view.outputs:
+def written_rpc(run: FinishedRun, files: Iterable[str]) -> RPC | None:
+    """Return the first RPC of files that a run wrote; InputError where it was changed since."""
+    for name in files:
         if is_own(run.folder, name):
             path = run.sealed.file(name)
             with suppress(BarpcError, OSError):

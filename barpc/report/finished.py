@@ -16,7 +16,16 @@ from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.sealed import Sealed
 from barpc.rasters.raster import sources_of
 from barpc.report.renamed import is_old
-from barpc.report.runfiles import PAGE_TABLES, TIE_TABLES, RunFiles, read_summary, read_tables, table_path
+from barpc.report.runfiles import (
+    FOLDER,
+    PAGE_TABLES,
+    PRIOR_FILE,
+    TIE_TABLES,
+    RunFiles,
+    read_summary,
+    read_tables,
+    table_path,
+)
 from barpc.report.summary import InputEntry, Summary
 
 
@@ -69,6 +78,26 @@ class FinishedRun:
     def inputs(self) -> Mapping[str, InputEntry]:
         """Inputs by their paths in the files of the run."""
         return {one.path: one for one in self.summary.inputs or ()}
+
+    @cached_property
+    def lineage(self) -> tuple[FinishedRun, ...]:
+        """The run itself, the run that it added images to (`--add-to`), the one behind that, and so on.
+
+        InputError where one of them is gone or has another block than images were added to.
+        """
+        added = (self.summary.options or {}).get("add_to")
+        names = f"{added}/{FOLDER}/{PRIOR_FILE}", f"{added}/{PRIOR_FILE}"
+        block = next((path for path in self.inputs if path in names), None)
+        if block is None:
+            return (self,)
+        try:
+            found = self.input(block)
+        except InputError as error:
+            raise InputError(
+                f"{self.folder} adds images to {self.sealed.located(str(added))}, whose cameras it held: {error}"
+            ) from error
+        folder = Path(found).parent
+        return (self, *FinishedRun.open(folder.parent if folder.name == FOLDER else folder).lineage)
 
     def table(self, name: str) -> Path:
         """Return the path of a table; InputError where it was changed since."""

@@ -106,6 +106,7 @@ class Run:
     tracks: Tracks
     matched: tuple[PairReport, ...] = ()
     adjustment: Adjustment | None = None
+    agreeing: BoolArray | None = None  # observations (K,) of a check that agree with the cameras as they are
     centers: tuple[CameraCenter, ...] = ()
     fits: tuple[RpcFit, ...] = ()
     written: tuple[Mapping[str, Mapping[str, float | str]], ...] = ()
@@ -166,8 +167,8 @@ class Run:
 
     @cached_property
     def keep(self) -> BoolArray:
-        """The observations (K,) in use: all of them, or the inliers of the adjustment."""
-        return self._rows("inlier", none=True)
+        """The observations (K,) in use: of an adjustment its inliers, of a check those that agree with its cameras."""
+        return self._rows("inlier", none=True) if self.agreeing is None else self.agreeing
 
     @cached_property
     def held_out(self) -> BoolArray:

@@ -40,6 +40,7 @@ from barpc.sensor.geometry import footprints
 
 FOLDER = "tables"
 """Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
+PRIOR_FILE, IMAGES = "block.npz", "images.json"  # the files in it that a later run starts from
 
 _PLACE = "lon", "lat", "height_above_datum"
 RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")

@@ -255,7 +255,8 @@ def verify(
     run_dir : path of a finished run, or of an export
     places : path or paths, optional, folders in which missing inputs are searched by name
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : fields of `VerifyOptions`: expect, the root that was printed, or a later one
+    **keywords : fields of `VerifyOptions`: expect, the root that was printed, or a later one; figures, to measure the
+        RMS of the images again, by their files as another tool reads them
 
     Returns
     -------
@@ -274,6 +275,11 @@ def verify(
     """
     from barpc.pipeline.outputs import prove
 
-    expect = with_values(VerifyOptions(), keywords, "verify").expect
-    folders = [places] if isinstance(places, (str, os.PathLike)) else places
-    return prove(Path(run_dir), [Path(place) for place in folders], expect and expect.lower(), progress)
+    chosen = with_values(VerifyOptions(), keywords, "verify")
+    folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect
+    found = prove(Path(run_dir), [Path(place) for place in folders], expect and expect.lower(), progress)
+    if chosen.figures:
+        from barpc.pipeline.figures import reread_figures
+
+        found += reread_figures(Path(run_dir))
+    return found

@@ -6,6 +6,7 @@ import base64
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -370,9 +371,10 @@ def test_two_runs_or_a_run_and_images_are_not_one_source(tmp_path, capsys):
 
 
 def shot(name: str, outputs=(), source="rpc", file=None, advice=""):
-    entry = SimpleNamespace(rpc_source=source and SimpleNamespace(format=source), outputs=outputs, advice=advice)
+    entry = SimpleNamespace(rpc_source=source and SimpleNamespace(format=source), advice=advice)
     place = f"/x/{name}.tif" if file is None else file
-    return SimpleNamespace(name=name, entry=entry, file=place, size=(9, 8), rpc=f"rpc {name}",
+    return SimpleNamespace(name=name, entry=entry, file=place, size=(9, 8), rpc=f"rpc {name}", written=outputs,
+                           writer=SimpleNamespace(sealed=SimpleNamespace(file=Path)),
                            light=SimpleNamespace(time=f"2020-01-0{'abcd'.index(name) + 1}T10:00:00Z"))  # fmt: skip
 
 
@@ -387,11 +389,12 @@ def run_of_shots(monkeypatch, tmp_path):
 
     def made(shots, pairs=(), minus=None, there=()):
         pairs = [SimpleNamespace(a=a, b=b, num_matches=num) for a, b, num in pairs]
-        opened = SimpleNamespace(sealed=SimpleNamespace(file=tmp_path.joinpath), table=tmp_path.joinpath)
-        scene = SimpleNamespace(shots=shots, alt_range=(5.0, 9.0), summary=SimpleNamespace(pairs=pairs), run=opened)
+        opened = SimpleNamespace(table=tmp_path.joinpath)
+        scene = SimpleNamespace(shots=shots, alt_range=(5.0, 9.0), pairs=pairs, run=opened)
         earlier = SimpleNamespace(views=[SimpleNamespace(name=name) for name in there])
+        before = SimpleNamespace(summary=earlier)
         monkeypatch.setattr(stereo, "read_scene", lambda folder, alts: scene)
-        monkeypatch.setattr(stereo.FinishedRun, "open", lambda folder: SimpleNamespace(summary=earlier))
+        monkeypatch.setattr(stereo.FinishedRun, "open", lambda folder: SimpleNamespace(lineage=(before,)))
         return stereo.block_of_run(tmp_path, None, minus)
 
     monkeypatch.setattr(stereo, "open_camera", lambda path: SimpleNamespace(model=path.name))

@@ -38,7 +38,7 @@ def dateline(on_date_line) -> Scene:
 
 
 def with_shot(of: Scene, **fields: Any) -> Scene:
-    """The scene with its first shot changed; fields of its entry by the names that it has."""
+    """The scene with its first shot changed; fields of its entry by the names that it has, of itself else."""
     shot = of.shots[0]
     entry = {key: value for key, value in fields.items() if hasattr(shot.entry, key)}
     own = {key: value for key, value in fields.items() if key not in entry}
@@ -155,25 +155,25 @@ def test_pairs_for_stereo_have_an_angle_between_two_and_fifty_degrees(south):
             replace(south.summary.pairs[0], a=a, b=b, convergence_deg=angle)
             for (a, b), angle in zip(names, angles, strict=False)
         ]
-        return pairs_of(with_summary(south, pairs=tuple(of)))
+        return pairs_of(replace(south, pairs=tuple(of)))
 
     assert pairs(2.0, 50.0, 1.9, 50.1) == [("A", "B"), ("A", "C")]
     assert pairs(1.0, None) == [("A", "B"), ("A", "C")]  # better than none
 
 
 def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, south, tmp_path):
-    view = replace(south.summary.views[0], outputs={"x": {}})
-    names = [f"{view.name}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
+    image = south.summary.views[0].name
+    names = [f"{image}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
     for name in names:
         (tmp_path / name).write_text("x")
     run = replace(south.run, sealed=Sealed.unproved(tmp_path))
-    assert scene._carrier(run, view) is None  # the run says nothing of it
+    assert scene._carrier(run, image, {"x"}) is None  # the run says nothing of it
     for name in names:
-        assert scene._carrier(run, replace(view, outputs={name: {}})) == tmp_path / name
+        assert scene._carrier(run, image, {name}) == tmp_path / name
         (tmp_path / name).unlink()
     (tmp_path.parent / "outside.vrt").write_text("x")
     (tmp_path / names[0]).symlink_to(tmp_path.parent / "outside.vrt")
-    assert scene._carrier(run, replace(view, outputs={names[0]: {}})) is None
+    assert scene._carrier(run, image, {names[0]}) is None
 
 
 # --- for renderers ----------------------------------------------------------------------------------------
@@ -355,7 +355,7 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
         "a.xml": ("application/xml", "metadata"), "a.json": ("application/json", "metadata"),
         "a_RPC.TXT": ("text/plain", "metadata"),
     }  # fmt: skip
-    run = with_shot(south, outputs={key: {} for key in kinds})
+    run = with_shot(south, written=tuple(kinds))
     assets = json.loads(made_of.stac(run, OUT)[f"{name}.json"])["assets"]
     for output, (kind, role) in kinds.items():
         assert assets[output] == {"href": relative_link(southern / output, OUT), "type": kind, "roles": [role]}
@@ -449,7 +449,8 @@ def test_stereo_is_made_of_images_without_reservation_that_share_thirty_matches(
     rows = [replace(base, a="A", b="B"), replace(base, a="A", b="C", num_matches=900)]
 
     def of(*pairs):
-        return list(pairs_of(with_summary(south, views=tuple(views), pairs=pairs)))
+        shots = tuple(replace(south.shots[0], entry=view) for view in views)
+        return list(pairs_of(replace(south, shots=shots, pairs=pairs)))
 
     assert of(*rows) == [("A", "B")]
     assert of(rows[1], replace(rows[0], num_matches=29)) == [("A", "C"), ("A", "B")]  # better than none

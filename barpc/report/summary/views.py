@@ -226,7 +226,7 @@ class ViewEntry(Record):
         "name verdict wrong num_observations lost tie_coverage rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
-    TERMINAL: ClassVar = "name verdict num_observations rmse_before rmse_after correction.center_shift_px largest"
+    TERMINAL: ClassVar = "name verdict num_observations lost rmse_before rmse_after correction.center_shift_px largest"
     CORRECTIONS: ClassVar = (
         "name moves correction.angle_urad correction.translation_norm_m camera_center.altitude_m camera_center.method"
     )
