@@ -41,7 +41,7 @@ from barpc.simulate import simulate_block
 
 HEAD = """# Accuracy
 
-<!-- Written by benchmarks/accuracy.py --write. Do not edit. -->
+<!-- printed by: python benchmarks/accuracy.py --data DATA -->
 
 All figures of this page come from one run of `python benchmarks/accuracy.py --data DATA`: {versions}.
 Methods and tests: [adjustment](adjustment.md), [tie points](tie_points.md),
