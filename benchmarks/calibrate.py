@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba import Adjustment, adjust_tracks
-from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
+from barpc.ba.calibration import Learnt, Line, SensorTies, contradicts, learn, share_shown
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_unit
@@ -45,6 +45,7 @@ from barpc.simulate import Look, fly
 
 SIZE, GSD = (20000, 12000), 0.5
 SMALL = (6000, 4000)
+FEWEST = 300  # observations of a block of parts that tells something
 LINE_RATE = 1e-4
 Curve = Callable[[Array], Array]
 """Columns (n,) -> what a detector line does there (n, 2) [px]."""
@@ -269,6 +270,57 @@ def exact(made: Scene, name: str = "") -> SensorTies:
     return SensorTies.of(name, made.views, made.tracks, made.cameras, made.ground)
 
 
+def parts(made: Scene, rng: np.random.Generator, share: float, loose: float = 0.0) -> tuple[Scene, Line]:
+    """Return a scene whose images are random parts of the line, and where they lie on it; `loose`: to how many px."""
+    width = made.views[0].size[0]
+    count, views, cameras = round(width * share), [], []
+    start = np.round(rng.uniform(0.0, width - count, len(made.views)))
+    for view, camera, first in zip(made.views, made.cameras, start, strict=True):
+        views.append(replace(view, size=(count, view.size[1]), sensor=view.sensor.crop(first, 0.0)))
+        cameras.append(Corrected(camera.sensor.crop(first, 0.0), camera.correction))
+    tracks = made.tracks
+    xy = tracks.xy - np.stack([start[tracks.view], np.zeros(len(tracks))], axis=1)
+    keep = (xy[:, 0] >= 0) & (xy[:, 0] <= count - 1)
+    keep &= (np.bincount(tracks.point[keep], minlength=tracks.num_points) >= 2)[tracks.point]
+    used = np.unique(tracks.point[keep])
+    some = Tracks(tracks.view[keep], np.searchsorted(used, tracks.point[keep]), xy[keep], tracks.sigma[keep])
+    guess = start + rng.normal(0.0, loose, len(start)) if loose else start
+    line = Line(width, guess, np.full(len(start), loose))
+    return Scene(tuple(views), some, made.ground[used], tuple(cameras)), line
+
+
+def crops_row(seed: int, kind: str, runs: int, share: float, tracks: int = 3000) -> str:
+    """Return the error of a curve by runs of random parts of the line, and the error over what is said."""
+    rng, sensor, blocks = np.random.default_rng(seed), Sensor.made(kind, seed, chips=4, size=SMALL), list[SensorTies]()
+    while len(blocks) < runs:
+        made, line = parts(scene(any_looks(3, rng), sensor, rng, tracks, size=SMALL), rng, share)
+        if len(made.tracks) > FEWEST and len(np.unique(made.tracks.view)) > 1:
+            blocks.append(SensorTies.of("", made.views, made.tracks, made.cameras, made.ground, line))
+    found = learn(blocks)
+    (wrong, said), some = off(found, sensor, SMALL[0]), int(np.median([len(one.view) for one in blocks]))
+    over = f"{wrong[0] / said[0]:.2f} / {wrong[1] / said[1]:.2f}"
+    return f"{runs} runs of parts of {share:.1f}, {some} ties: {wrong[0]:.4f} / {wrong[1]:.4f} px, over said {over}"
+
+
+def shorter_row(seed: int, kind: str, missing: int = 88) -> str:
+    """Return the error of the place of shorter products, whose columns are cut off at one side, and of the curve."""
+    rng, sensor, blocks, cut = np.random.default_rng(seed), Sensor.made(kind, seed, chips=4, size=SMALL), [], SMALL[0]
+    for i in range(8):
+        made = scene(any_looks(3, rng), sensor, rng, 700, size=SMALL)
+        line = Line(cut, np.zeros(3), np.zeros(3))
+        if i % 2:
+            made, where = parts(made, np.random.default_rng(0), 1.0 - missing / cut)
+            line = Line(cut, np.full(3, missing / 2.0), np.full(3, missing / np.sqrt(12.0)))
+            true = where.start
+        blocks.append((SensorTies.of("", made.views, made.tracks, made.cameras, made.ground, line), made, line))
+    found = learn([one[0] for one in blocks])
+    places = [line.start + shift - true for (_, _, line), shift in list(zip(blocks, found.shifts, strict=True))[1::2]]
+    wrong, said = off(found, sensor, SMALL[0])
+    place = f"{np.abs(places).max():.1f} px (said {np.max(np.concatenate(found.shift_sigmas)):.1f})"
+    over = f"{wrong[0] / said[0]:.2f} / {wrong[1] / said[1]:.2f}"
+    return f"shorter products: places to {place}, curve to {wrong[0]:.4f} / {wrong[1]:.4f} px, over said {over}"
+
+
 def others(sensor: Sensor, seed: int, width: int) -> dict[str, Sensor]:
     """Return lines that a calibration of a sensor is not of; binned: of half of its columns, two in one."""
     curve = sensor.curve
@@ -334,21 +386,29 @@ def prior_row(name: str, seed: int) -> tuple[float, float, float]:
     return bent_by, bent_by / cameras, bent_by / both
 
 
+def print_refusals(count: int) -> None:
+    """Print what was refused of some sensors, and how often each."""
+    found = []
+    for seed in range(count):
+        found.append(refusals(seed))
+        print(", ".join(name for name, is_refused in found[-1].items() if is_refused), flush=True)
+    for name in found[0]:
+        print(f"{name}: refused {sum(one[name] for one in found)} of {count}")
+
+
 def tables(which: str, count: int, kind: str) -> None:
     """Print a table beside that of the scenes."""
     if which == "said":
         print(f"{count} sensors, 12 small scenes each: error over said, RMS {np.round(said(count, kind), 2)}")
     elif which == "refusals":
-        found = []
-        for seed in range(count):
-            found.append(refusals(seed))
-            print(", ".join(name for name, is_refused in found[-1].items() if is_refused), flush=True)
-        for name in found[0]:
-            print(f"{name}: refused {sum(one[name] for one in found)} of {count}")
+        print_refusals(count)
     elif which == "sizes":
         for runs in (3, 12, 50, 200, 1000):
             if runs <= count:
                 subprocess.run([sys.executable, __file__, "--table", "size", "--count", str(runs)], check=True)
+    elif which == "crops":
+        for seed in range(count):
+            print(crops_row(seed, kind, 12, 0.7), shorter_row(seed, kind), sep="\n", flush=True)
     elif which == "size":
         print(size_row(count), flush=True)
     else:
@@ -369,7 +429,9 @@ def main() -> None:
     parser.add_argument("--tails", action="store_true", help="noise with heavy tails")
     parser.add_argument("--pairs", type=int, default=3, help="pairs of either kind to try it on")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--table", choices=["scenes", "said", "refusals", "sizes", "size", "prior"], default="scenes")
+    parser.add_argument(
+        "--table", choices=["scenes", "said", "crops", "refusals", "sizes", "size", "prior"], default="scenes"
+    )
     parser.add_argument("--count", type=int, default=20, help="sensors, blocks or, at most, runs of another table")
     given = parser.parse_args()
     if given.table != "scenes":

@@ -35,6 +35,7 @@ from barpc.sensor.image_corrections import ColumnSpline
 _ROUGHNESS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: standard deviations of third differences that are compared
 _CANDIDATES = 128  # places of a step that are looked at first; each turn looks at `_FINER` times as many around it
 _FINER = 12
+_PLACES = 65  # of a view on the line, over three standard deviations either way, then over a sixteenth of that
 _MOST_STEPS = 40  # taken one by one; focal planes have up to some thirty detectors
 _NUISANCES = 5  # nuisances of a coordinate of a view
 _LOOSE = 100.0  # px: standard deviation of nuisances, some of which a block does not determine
@@ -52,13 +53,14 @@ class SensorTies:
     Parameters
     ----------
     name, date : str, the block; its first day (ISO 8601), empty where not stated
-    width : int, columns of every image
+    width : int, columns of the line
     view, point : (K,), indices
-    xy : (K, 2), where a point is seen, col, row [px]
+    col : (K,), column of the line in which a point is seen [px]
     place : (K, 2), where its camera has it, from -1 to 1 over the image: what is weakly known takes the noise of places
         for information
     residual : (K, 2), projected - observed [px]
     by_point : (K, 2, 3), derivative of the projection by the point, ECEF [px/m]
+    loose : (V,), standard deviation of the place of each view on the line [px], 0: known
     """
 
     name: str
@@ -66,22 +68,32 @@ class SensorTies:
     width: int
     view: IntArray
     point: IntArray
-    xy: Array
+    col: Array
     place: Array
     residual: Array
     by_point: Array
+    loose: Array
 
     @classmethod
     def of(
-        cls, name: str, views: Sequence[View], tracks: Tracks, sensors: Sequence[SensorModel], ground: Array
+        cls,
+        name: str,
+        views: Sequence[View],
+        tracks: Tracks,
+        sensors: Sequence[SensorModel],
+        ground: Array,
+        line: Line | None = None,
     ) -> SensorTies:
         """Linearise a block at cameras without corrections in the image, and at the tracks' ground points (P, 3) [deg].
 
-        InputError where the images' widths differ, or less than two views of a tie point have a place.
+        `line`: its columns and where the views' lie on it; without, each view is the whole line. InputError where
+        widths differ then, or less than two views of a tie point have a place.
         """
-        widths = {view.size[0] for view in views}
-        if len(widths) > 1:
-            raise InputError(f"{name}: images of {', '.join(map(str, sorted(widths)))} columns are not of one line")
+        if line is None:
+            widths = {view.size[0] for view in views}
+            if len(widths) > 1:
+                raise InputError(f"{name}: images of {', '.join(map(str, sorted(widths)))} columns are not of one line")
+            line = Line(widths.pop(), np.zeros(len(views)), np.zeros(len(views)))
         places = ground[tracks.point]
         image, by_ground = Several(sensors, tracks.view).project_jacobian(places)
         known = np.isfinite(image).all(axis=1) & np.isfinite(by_ground).all(axis=(1, 2))
@@ -92,9 +104,23 @@ class SensorTies:
         by_point = by_ground[kept] @ np.linalg.inv(ecef_from_ground_jacobian(places[kept]))
         place = (2.0 * image[kept] + 1.0) / np.array([view.size for view in views])[view] - 1.0
         dates = sorted(view.date for view in views if view.date)
-        used, point = (np.unique(part, return_inverse=True)[1] for part in (view, tracks.point[kept]))
-        first = dates[0] if dates else ""
-        return cls(name, first, widths.pop(), used, point, xy, place, image[kept] - xy, by_point)
+        point = np.unique(tracks.point[kept], return_inverse=True)[1]
+        number, used = np.unique(view, return_inverse=True)
+        first, col = dates[0] if dates else "", xy[:, 0] + line.start[view]
+        return cls(name, first, line.width, used, point, col, place, image[kept] - xy, by_point, line.loose[number])
+
+    def moved(self, by: Array) -> SensorTies:
+        """Return the same with views that lie elsewhere on the line, by (V,) [px]."""
+        return replace(self, col=self.col + by[self.view])
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Columns of a line, places of views on it (N,), each the column of its first one, and their sigmas (N,) [px]."""
+
+    width: int
+    start: Array
+    loose: Array
 
 
 class _Eliminated:
@@ -147,6 +173,13 @@ class _Eliminated:
         """Return the residuals (K, 2) [px] that points and nuisances leave."""
         moved = self._residual - self._nuisances @ self._solve(self._half)
         return self._off_points(moved).reshape(-1, 2) / self.weight[:, None]
+
+    def cost(self, residual: Array) -> float:
+        """Return the cost of residuals (K, 2) [px] in place of its own, points and nuisances eliminated."""
+        whitened = (residual * self.weight[:, None]).ravel()
+        off = self._off_points(whitened)
+        half = self._nuisances.T @ off
+        return float(off @ off - half @ self._solve(half))
 
     def told(self, unknowns: sp.csr_array) -> Told:
         """Return the block's normal equations of the unknowns."""
@@ -216,13 +249,13 @@ class Told:
 
 def normal_equations(curve: LineCurve, ties: SensorTies, weight: Array) -> Told:
     """Return a block's normal equations of splines and detectors, its observations weighted by (K,) [1/px]."""
-    block, (values, place) = _Eliminated(ties, ties.residual, weight), curve.local(ties.xy[:, 0])
+    block, (values, place) = _Eliminated(ties, ties.residual, weight), curve.local(ties.col)
     return block.told(block.both(values, place, curve.size + 1))
 
 
 def _weights(ties: SensorTies, curve: ColumnSpline | None) -> Array:
     """Return the weights (K,) [1/px] of a block's observations by their residuals at the present curve."""
-    residual = ties.residual if curve is None else ties.residual + curve.at(ties.xy[:, 0])
+    residual = ties.residual if curve is None else ties.residual + curve.at(ties.col)
     count = np.bincount(ties.point)[ties.point]
     free = (2.0 * count - 3.0) / (2.0 * count)  # of a track's coordinates three go into its point
     left, weight = residual - np.median(residual, axis=0), np.ones(len(count))
@@ -252,6 +285,7 @@ class Learnt:
     scatter : float, variance of blocks against each other over what their noise says
     change : (int, float), first of the blocks, in the order given, after which the curve may be another one, and how
         much more probable that is than that it stays [nats]
+    shifts, shift_sigmas : of each block (V,), how far its views lie on the line from where they were stated to [px]
     """
 
     curve: LineCurve
@@ -262,6 +296,8 @@ class Learnt:
     noise_px: float
     scatter: float
     change: tuple[int, float]
+    shifts: tuple[Array, ...] = ()
+    shift_sigmas: tuple[Array, ...] = ()
 
     @property
     def spline(self) -> ColumnSpline:
@@ -280,27 +316,72 @@ def learn(blocks: Sequence[SensorTies]) -> Learnt:
     widths = {block.width for block in blocks}
     if len(blocks) < 3 or len(widths) > 1:
         raise InputError(f"{len(blocks)} blocks of images of {len(widths)} widths: three of one are needed at least")
-    width = float(widths.pop())
-    spacing, around = width / _CANDIDATES, np.zeros(0)
-    spline, bend = None, float(_ROUGHNESS[len(_ROUGHNESS) // 2])
+    width = widths.pop()
+    curve, bend, weights, spline = _shape(blocks, width, None)
+    shifts, sigmas = [np.zeros(len(block.loose)) for block in blocks], [np.zeros(len(block.loose)) for block in blocks]
+    for _ in range(STEPS if any(block.loose.any() for block in blocks) else 0):
+        placed = [_placed(*one, spline) for one in zip(blocks, shifts, weights, strict=True)]
+        shifts, sigmas = [one[0] for one in placed], [one[1] for one in placed]
+        moved = [block.moved(by) for block, by in zip(blocks, shifts, strict=True)]
+        curve, bend, weights, spline = _shape(moved, width, spline)
+    blocks = [block.moved(by) for block, by in zip(blocks, shifts, strict=True)]
+    told = [normal_equations(curve, *one).by_steps(curve) for one in zip(blocks, weights, strict=True)]
+    found = _judged(curve, told, curve.prior(bend), float(np.median([1.0 / one.max() for one in weights])))
+    return replace(found, shifts=tuple(shifts), shift_sigmas=tuple(sigmas))
+
+
+def _shape(
+    blocks: Sequence[SensorTies], width: int, spline: ColumnSpline | None
+) -> tuple[LineCurve, float, list[Array], ColumnSpline]:
+    """Return the layout of the curve of some blocks, the size of its third differences, the weights of the blocks'
+    observations at a curve so far, and the new curve.
+    """
+    spacing, bend = width / _CANDIDATES, float(_ROUGHNESS[len(_ROUGHNESS) // 2])
     places = np.arange(1, _CANDIDATES) * spacing
     for turn in range(STEPS):
-        candidates = LineCurve(int(width), np.unique(np.round(places)) - 0.5)
+        candidates = LineCurve(width, np.unique(np.round(places)) - 0.5)
         weights = [_weights(block, spline) for block in blocks]
         total = reduce(add, (normal_equations(candidates, *one) for one in zip(blocks, weights, strict=True))).by_steps(
             candidates
         )
         chosen, bend = _best(total, candidates)
         chosen.sort()
-        curve = LineCurve(int(width), candidates.edges[chosen])
+        curve = LineCurve(width, candidates.edges[chosen])
         own = np.r_[:LINE_SPLINES, LINE_SPLINES + np.array(chosen, dtype=np.int64)]
         spline = curve.spline(total.part(np.r_[own, candidates.size + own]).solved(curve.prior(bend))[0])
         if turn + 1 < STEPS:
             around = np.arange(-1.5 * _FINER, 1.5 * _FINER + 1) * max(spacing / _FINER, 1.0)
             places = (curve.edges[:, None] + 0.5 + around).clip(1.0, width - 1.0).ravel()
             spacing = max(spacing / _FINER, 1.0)
-    told = [normal_equations(curve, *one).by_steps(curve) for one in zip(blocks, weights, strict=True)]
-    return _judged(curve, told, curve.prior(bend), float(np.median([1.0 / one.max() for one in weights])))
+    assert spline is not None
+    return curve, bend, weights, spline
+
+
+def _placed(ties: SensorTies, shift: Array, weight: Array, spline: ColumnSpline) -> tuple[Array, Array]:
+    """Return where the loose views of a block fit a curve best, from their places by a shift (V,) [px], and the
+    standard deviation of that (V,) [px].
+
+    Each view is tried at places over three standard deviations, then at finer ones around the best; views of a block
+    take turns, as they have points in common.
+    """
+    shift, sigma = shift.copy(), np.zeros(len(shift))
+    if not ties.loose.any():
+        return shift, sigma
+    block = _Eliminated(ties, ties.residual, weight)
+    for _ in range(STEPS):
+        for v in np.flatnonzero(ties.loose).tolist():
+            middle, reach, sigma[v] = 0.0, 3.0 * ties.loose[v], 0.0
+            for _ in range(STEPS):  # to a 4000th of the first reach
+                tried = middle + np.linspace(-reach, reach, _PLACES)
+                at = np.tile(shift, (_PLACES, 1))
+                at[:, v] = tried
+                cost = np.array([block.cost(ties.residual + spline.at(ties.col + one[ties.view])) for one in at])
+                cost += (tried / ties.loose[v]) ** 2
+                best = int(np.argmin(cost))
+                near = np.ptp(tried[cost <= cost[best] + 4.0]) / 4.0  # four more: two standard deviations
+                middle, reach = float(tried[best]), 4.0 * reach / (_PLACES - 1)
+                shift[v], sigma[v] = middle, max(near, sigma[v])  # a finer level may end within it
+    return shift, sigma
 
 
 def _best(total: Told, curve: LineCurve) -> tuple[list[int], float]:
@@ -382,7 +463,7 @@ def _between_blocks(told: Sequence[Told], curves: Sequence[_Solved], prior: Arra
 def share_shown(ties: SensorTies, spline: ColumnSpline) -> tuple[float, float]:
     """Return how much of a curve the tie points of a block show, 1: all of it, and its standard deviation."""
     block = _Eliminated(ties, ties.residual, _weights(ties, spline))
-    shown = spline.at(ties.xy[:, 0])
+    shown = spline.at(ties.col)
     rows = (shown * block.weight[:, None]).reshape(-1, 1)
     one = block.told(sp.csr_array(rows))
     information = max(float(one.matrix[0, 0]), ROUNDING)

@@ -11,8 +11,8 @@ displaced observations.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 
 import numpy as np
@@ -118,13 +118,17 @@ class LineCurve:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The curve of a sensor, its covariance (n, n) [px^2], and the file it came from, with the hash of that."""
+    """The curve of a sensor, its covariance (n, n) [px^2], and the file it came from, with the hash of that.
+
+    `starts`: columns of the line at which products of other numbers of columns begin, by that number.
+    """
 
     sensor: str
     spline: ColumnSpline
     covariance: Array
     path: str
     sha256: str
+    starts: Mapping[int, float] = field(default_factory=dict)
 
     @classmethod
     @cache
@@ -162,6 +166,11 @@ class CommonErrors:
         found = np.array([None if one is None else one.sha256 for one in self.of_view])
         return [(one, found == key) for key, one in used.items()]
 
+    @cached_property
+    def _starts(self) -> Array:
+        """Places of views on the line (N,) [px]: the column of each one's first."""
+        return np.array([0.0 if one is None else one.spline.start for one in self.of_view])
+
     @property
     def count(self) -> int:
         """Number k of independent errors."""
@@ -169,9 +178,9 @@ class CommonErrors:
 
     def moved(self, view: IntArray, col: Array) -> Array:
         """Return the displacements (k, K, 2) [px] at columns (K,) by one standard deviation of each error."""
-        found = [np.zeros((0, len(col), 2))]
+        found, on_line = [np.zeros((0, len(col), 2))], col + self._starts[view]
         for one, of in self._groups:
-            basis = one.curve.basis(col) * of[view][:, None]
+            basis = one.curve.basis(on_line) * of[view][:, None]
             found.append(np.stack([basis @ part for part in np.split(one.root, 2)]).transpose(2, 1, 0))
         return np.concatenate(found)
 
@@ -179,10 +188,10 @@ class CommonErrors:
         """Yield displacements, weighted, of a coordinate: its number, (K, m) by coefficients, and these by all errors
         (m, k).
         """
-        first = 0
+        first, on_line = 0, col + self._starts[view]
         for one, of in self._groups:
             curve, last, own = one.curve, first + one.root.shape[1], of[view]
-            values, place = curve.local(col[own])
+            values, place = curve.local(on_line[own])
             bounds = np.concatenate([[0], np.cumsum(values.shape[1] * own)])
             weighted = (values * weight[own][:, None]).ravel()
             matrix = sp.csr_array((weighted, place.ravel(), bounds), shape=(len(col), curve.size + 1))

@@ -122,8 +122,9 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
 def calibrate(runs: tuple[str, ...], out: str, **flags: Any) -> int:
     r"""Estimate the interior distortion and detector steps of one sensor from finished runs.
 
-    `barpc adjust --calibration FILE` corrects for it. Exit code 1, and nothing written, where it changes with time,
-    directions do not suffice, or the residuals of runs left out do not improve.
+    `barpc adjust --calibration FILE` corrects for it. Images may be parts of products; their place on the line of
+    detectors is that which their camera states. Exit code 1, and nothing written, where such a place is not known, the
+    distortion changes with time, directions do not suffice, or the residuals of runs left out do not improve.
 
     \b
     Example:

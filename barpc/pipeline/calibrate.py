@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.ba import Adjustment
-from barpc.ba.calibration import Learnt, SensorTies, contradicts, learn, share_shown
+from barpc.ba.calibration import Learnt, Line, SensorTies, contradicts, learn, share_shown
 from barpc.ba.interior import LINE_SPLINES, Calibration, CommonErrors
 from barpc.base.atomic import refuse_existing, write_text
 from barpc.base.declarations import with_values
@@ -28,7 +28,8 @@ from barpc.base.verb_options import CalibrateOptions
 from barpc.pipeline.earlier import Earlier
 from barpc.report import Run
 from barpc.report.records import Record, column
-from barpc.scene import BoolArray, Camera, Tracks, View
+from barpc.rpcio.line import LinePlace, line_place
+from barpc.scene import BoolArray, Camera, IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
 from barpc.sensor.timing import Clocked
@@ -40,6 +41,10 @@ logger = logging.getLogger(__name__)
 
 CALIBRATION_SCHEMA = "barpc calibration 1"
 SUFFIX = ".cal"
+_OTHERWISE_BINNED = 1.1  # times as many columns: products of one sensor are trimmed or padded by up to 5 %
+_FEWEST_WHOLE = 3  # images of the longest line, by which shorter ones find their place
+KNOWN_TO = 5.0  # px: a curve changes by less than 0.001 px over it
+_PLACED_TO = 20.0  # px: a curve of 0.3 px over 3000 columns changes by 0.002 px over it
 _FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
 _MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
 _ABSURD = 1e3  # px: no curve is larger
@@ -50,13 +55,17 @@ _FLAT = 30.0  # deg: rows that run within so much of each other are of one direc
 
 @dataclass(frozen=True, eq=False)
 class _FinishedRun:
-    """A finished run's information on a sensor, and the directions of its images' rows, clockwise from north [deg]."""
+    """A finished run's information on a sensor, the directions of its images' rows, clockwise from north [deg], the
+    images and their places on the line; `seen`: those of them with tie points.
+    """
 
     folder: Path
     root: str
     ties: SensorTies
     directions: Array
-    images: int
+    paths: tuple[str, ...]
+    on_line: _OnLine
+    seen: IntArray
 
 
 def calibrate(
@@ -99,32 +108,45 @@ def calibrate(
     for number, folder in enumerate(runs, start=1):
         opened.append(_images_of(Path(folder)))
         tell("open", number, len(runs))
-    name, found = _one_sensor([stated for *_, stated in opened], chosen.sensor), list[_FinishedRun]()
-    for folder, run in zip(runs, opened, strict=True):
-        found.append(_finished_run(Path(folder), *run, name))
+    _refuse_shared_images(runs, opened)
+    name = _one_sensor([[one.sensor for one in sources] for *_, sources in opened], chosen.sensor)
+    found = list[_FinishedRun]()
+    for folder, run, on_line in zip(runs, opened, _one_line(runs, opened, name), strict=True):
+        found.append(_finished_run(Path(folder), run, on_line))
         tell("read", len(found), len(opened))
     roots = _one_root_each(found)
-    _one_width(found)
     order = sorted(range(len(found)), key=lambda i: (found[i].ties.date, roots[i]))
     found, roots = [found[i] for i in order], [roots[i] for i in order]
     _refuse_unsure(name, learnt := learn([one.ties for one in found]), found)
-    content = _content(name, learnt, found, roots)
+    content = _content(name, learnt, found, roots, _starts(learnt, found))
     write_text(out, json.dumps(content, indent=1) + "\n", overwrite=chosen.overwrite)
     return content
 
 
-_OpenedRun = tuple[Earlier, list[View], Sequence[SensorModel], list[str]]
+_OpenedRun = tuple[Earlier, list[View], Sequence[SensorModel], Sequence[Camera]]
 
 
 def _images_of(folder: Path) -> _OpenedRun:
-    """Return a run, its images with their corrected cameras, and the sensors that they state."""
+    """Return a run, its images with their corrected cameras, and the cameras as delivered."""
     earlier = Earlier.open(folder)
     names = {view.name for view in earlier.run.summary.views}
     images = [image for image in earlier.images if image.name in names]
     if gone := [image for image in images if image.choices is None]:
         raise InputError(f"{gone[0].path or gone[0].name}: an image of {folder} whose camera came from no file")
     views, sensors, sources = earlier.corrected(images, earlier.prior)
-    return earlier, views, sensors, [source.sensor for source in sources]
+    return earlier, views, sensors, sources
+
+
+def _refuse_shared_images(runs: Sequence[str | Path], opened: Sequence[_OpenedRun]) -> None:
+    """Raise InputError where two runs have an image in common, which would count twice."""
+    seen: dict[str, str | Path] = {}
+    for folder, (earlier, *_) in zip(runs, opened, strict=True):
+        for image in earlier.images:
+            if image.sha256 in seen and seen[image.sha256] != folder:
+                raise InputError(f"{folder}: {image.path} is an image of {seen[image.sha256]}, too, and would count "
+                                 "twice: give one of both runs")  # fmt: skip
+            if image.sha256:
+                seen[image.sha256] = folder
 
 
 def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
@@ -142,26 +164,72 @@ def _one_sensor(stated: Sequence[Sequence[str]], given: str | None) -> str:
     return names[0]
 
 
-def _finished_run(
-    folder: Path, earlier: Earlier, views: list[View], sensors: Sequence[SensorModel], stated: list[str], name: str
-) -> _FinishedRun:
-    tables = earlier.run.tables()
-    own = [view.name for view, said in zip(views, stated, strict=True) if said in ("", name)]
-    number = {view.name: i for i, view in enumerate(views)}
-    used = [i for i, view in enumerate(views) if view.name in own]
-    place = np.array([used.index(number[v.name]) if v.name in own else -1 for v in tables.summary.views])
+@dataclass(frozen=True, eq=False)
+class _OnLine:
+    """Images of a run that are of the sensor (n,), where they lie on its line, and `columns` (n,) of their products."""
+
+    index: list[int]
+    line: Line
+    columns: Array
+
+
+def _one_line(runs: Sequence[str | Path], opened: Sequence[_OpenedRun], name: str) -> list[_OnLine]:
+    """Return where the images of each run lie on the line of a sensor.
+
+    The line is the longest of all. A product of fewer columns lies somewhere within it: in its middle, to a standard
+    deviation of the columns it lacks over sqrt(12), until tie points tell. InputError where the place of an image is not
+    known, lines are binned otherwise, or too few images hold the others.
+    """
+    places: list[list[tuple[int, LinePlace]]] = []
+    for folder, (_, views, _, sources) in zip(runs, opened, strict=True):
+        of_run = list[tuple[int, LinePlace]]()
+        for i, (view, source) in enumerate(zip(views, sources, strict=True)):
+            if source.sensor in ("", name):
+                try:
+                    of_run.append((i, line_place(source, view.size)))
+                except InputError as error:
+                    raise InputError(f"{view.path}: its place on the line of {name} is not known: {error}") from error
+        if len(of_run) < 2:
+            raise InputError(f"{folder}: {len(of_run)} images of {name}: nothing is told")
+        places.append(of_run)
+    columns = [place.columns for of_run in places for _, place in of_run]
+    width = round(max(columns))
+    if width > _OTHERWISE_BINNED * min(columns):
+        raise InputError(f"{name}: products of {min(columns):.0f} and of {width} columns: these are of other bands, "
+                         "binned, or of another sensor: calibrate each by its own runs")  # fmt: skip
+    exact = sum(width - one <= KNOWN_TO for one in columns)
+    if exact < len(columns) and exact < _FEWEST_WHOLE:
+        raise InputError(f"{name}: {exact} images of lines of {width} columns, the others of fewer: at least "
+                         f"{_FEWEST_WHOLE} are needed, to find the place of the others by")  # fmt: skip
+    return [_on_line(of_run, width) for of_run in places]
+
+
+def _on_line(places: Sequence[tuple[int, LinePlace]], width: int) -> _OnLine:
+    columns = np.array([place.columns for _, place in places])
+    missing = width - columns
+    start = np.array([place.start for _, place in places]) + missing / 2.0
+    loose = np.where(missing <= KNOWN_TO, 0.0, missing / np.sqrt(12.0))
+    return _OnLine([i for i, _ in places], Line(width, start, loose), columns)
+
+
+def _finished_run(folder: Path, opened: _OpenedRun, on_line: _OnLine) -> _FinishedRun:
+    earlier, views, sensors, _ = opened
+    tables, used = earlier.run.tables(), on_line.index
+    number = {views[i].name: k for k, i in enumerate(used)}
+    place = np.array([number.get(view.name, -1) for view in tables.summary.views])
     table = tables.observations
     keep: BoolArray = (place[table.view] >= 0) & np.isin(table.track, tables.tracks)
-    if len(used) < 2 or not keep.any():
-        raise InputError(f"{folder}: {len(used)} images of {name} with {keep.sum()} observations: nothing is told")
+    if not keep.any():
+        raise InputError(f"{folder}: {len(used)} images without a tie point in common: nothing is told")
     order = np.argsort(tables.tracks)
     point = order[np.searchsorted(tables.tracks[order], table.track[keep])]
     tracks = Tracks(place[table.view[keep]], point, table.xy[keep], np.ones(keep.sum()))
     chosen = [views[i] for i in used]
     behind = [one.sensor if isinstance(one, Splined) else one for one in (sensors[i] for i in used)]
-    ties = SensorTies.of(str(folder), chosen, tracks, behind, tables.points[:, :3])
+    ties = SensorTies.of(str(folder), chosen, tracks, behind, tables.points[:, :3], on_line.line)
     directions = np.array([_row_direction(v, s) for v, s in zip(chosen, behind, strict=True)])
-    return _FinishedRun(folder, earlier.run.sealed.root, ties, directions, len(used))
+    seen = np.unique(tracks.view)
+    return _FinishedRun(folder, earlier.run.sealed.root, ties, directions, tuple(v.path for v in chosen), on_line, seen)
 
 
 def _row_direction(view: View, sensor: SensorModel) -> float:
@@ -180,12 +248,25 @@ def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
     return roots
 
 
-def _one_width(found: Sequence[_FinishedRun]) -> None:
-    first = found[0]
-    for one in found[1:]:
-        if one.ties.width != first.ties.width:
-            raise InputError(f"{one.folder}: images of {one.ties.width} columns, those of {first.folder} have "
-                             f"{first.ties.width}: a calibration is of whole lines without binning")  # fmt: skip
+def _starts(learnt: Learnt, found: Sequence[_FinishedRun]) -> dict[int, float]:
+    """Return the column of the line at which shorter products begin, by their columns; InputError where one is not
+    found, or two of one length disagree.
+    """
+    begun: dict[int, list[float]] = {}
+    for one, shift, sigma in zip(found, learnt.shifts, learnt.shift_sigmas, strict=True):
+        for k, v in enumerate(one.seen.tolist()):
+            if not one.on_line.line.loose[v]:
+                continue
+            if sigma[k] > _PLACED_TO:
+                raise InputError(f"{one.paths[v]}: its place on a line of {one.ties.width} columns is found to "
+                                 f"{sigma[k]:.0f} px: leave {one.folder} out")  # fmt: skip
+            columns = one.on_line.columns[v]
+            begun.setdefault(round(columns), []).append((one.ties.width - columns) / 2.0 + shift[k])
+    for columns, places in begun.items():
+        if np.ptp(places) > 2.0 * _PLACED_TO:
+            raise InputError(f"products of {columns} columns begin at columns {min(places):.0f} to {max(places):.0f} "
+                             "of the line: their number of columns does not tell where")  # fmt: skip
+    return {columns: float(np.mean(places)) for columns, places in sorted(begun.items())}
 
 
 def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> None:
@@ -211,7 +292,9 @@ def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> 
                          f"{len(found)} runs left out in turn: these images do not share it")  # fmt: skip
 
 
-def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Sequence[str]) -> dict[str, Any]:
+def _content(
+    name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Sequence[str], starts: Mapping[int, float]
+) -> dict[str, Any]:
     spline = learnt.spline
     rows = np.tril_indices(len(learnt.unknowns))
     dates = [one.ties.date for one in found if one.ties.date]
@@ -220,6 +303,7 @@ def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Se
         "barpc": __version__,
         "sensor": name,
         "columns": spline.width,
+        "starts_px": {str(columns): round(start, 2) for columns, start in starts.items()},
         "coefficients_px": np.round(spline.coeffs, 7).tolist(),
         "edges": spline.edges.tolist(),
         "steps_px": np.round(spline.steps, 7).tolist(),
@@ -228,7 +312,7 @@ def _content(name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Se
         "held_out_noise": np.round(learnt.rms, 4).tolist(),
         "dates": [dates[0], dates[-1]] if dates else [],
         "runs": [
-            {"name": one.folder.resolve().name, "root": root, "date": one.ties.date, "images": one.images,
+            {"name": one.folder.resolve().name, "root": root, "date": one.ties.date, "images": len(one.paths),
              "gain": round(float(gain), 1)}
             for one, root, gain in zip(found, roots, learnt.gain, strict=True)
         ],
@@ -247,7 +331,8 @@ def read_calibration(path: str | Path) -> Calibration:
         raise InputError(f"{path}: schema {schema!r}, not a calibration that this release reads ({CALIBRATION_SCHEMA})")
     try:
         file = _CalibrationFile.read(found)
-        return Calibration(file.sensor, *file.curve(), str(path), fingerprint(path).sha256)
+        starts = {int(columns): start for columns, start in (file.starts_px or {}).items()}
+        return Calibration(file.sensor, *file.curve(), str(path), fingerprint(path).sha256, starts)
     except (ValueError, RpcError) as error:
         raise InputError(f"{path}: damaged ({plain(error)}); make it again (barpc calibrate)") from error
 
@@ -259,13 +344,16 @@ class _CalibrationFile(Record):
     """Fields of a calibration file, with their limits."""
 
     sensor: str = column("Sensor", min_length=1, max_length=200)
-    columns: int = column("Columns of its images", ge=2, le=1 << 24)
+    columns: int = column("Columns of its line", ge=2, le=1 << 24)
     coefficients_px: tuple[tuple[_Pixels, _Pixels], ...] = column(
         "Spline coefficients", min_length=LINE_SPLINES, max_length=LINE_SPLINES
     )
     edges: tuple[float, ...] = column("Columns at which another detector begins", max_length=_MOST_EDGES)
     steps_px: tuple[tuple[_Pixels, _Pixels], ...] = column("What is added from each on", max_length=_MOST_EDGES)
     covariance_px2: tuple[float, ...] = column("Lower triangle of the covariance of the coefficients and steps")
+    starts_px: Mapping[str, float] | None = column(
+        "Columns of the line at which products of fewer columns begin, by their columns", default=None
+    )
 
     def curve(self) -> tuple[ColumnSpline, Array]:
         """Return the correction and its covariance; an error where they do not go together."""
@@ -317,14 +405,26 @@ def calibrations_of(
     for view, source in zip(views, sources, strict=True):
         if (used := _own(view, source.sensor, by_sensor)) is None:
             continue
-        if used.spline.width != view.size[0]:
-            raise InputError(f"{used.path}: of {used.spline.width} columns, {view.path} has {view.size[0]}: it is "
-                             "of whole lines without binning; leave it out, or calibrate such images")  # fmt: skip
-        found[view.name] = used
+        found[view.name] = _on_its_columns(used, view, source)
     for one in () if some else given:
-        if one not in found.values():
+        if one.sha256 not in {used.sha256 for used in found.values()}:
             raise InputError(f"{one.path}: is of {one.sensor}, and no image given is")
     return found
+
+
+def _on_its_columns(used: Calibration, view: View, source: Camera) -> Calibration:
+    """Return a calibration for an image, with its place on the line; InputError without one."""
+    width = used.spline.width
+    try:
+        place = line_place(source, view.size)
+    except InputError as error:
+        raise InputError(f"{used.path}: the place of {view.path} on its line of {width} columns is not known: {error}; "
+                         "leave it out")  from error  # fmt: skip
+    start = 0.0 if abs(place.columns - width) <= KNOWN_TO else used.starts.get(round(place.columns))
+    if start is None:
+        raise InputError(f"{used.path}: of a line of {width} columns, {view.path} is of one of {place.columns:.0f}: "
+                         "leave it out, or calibrate with such images")  # fmt: skip
+    return replace(used, spline=replace(used.spline, start=place.start + start))
 
 
 def calibrated(sensors: Sequence[SensorModel], used: Sequence[Calibration | None]) -> list[SensorModel]:
@@ -383,9 +483,8 @@ def _ties_by_calibration(run: Run, adjustment: Adjustment) -> Iterator[tuple[Cal
             continue
         part = Tracks(index[tracks.view[rows]], tracks.point[rows], tracks.xy[rows], tracks.sigma[rows])
         chosen = np.flatnonzero(of)
-        yield (
-            used,
-            SensorTies.of(
-                used.path, [run.views[i] for i in chosen], part, [adjustment.bases[i] for i in chosen], ground
-            ),
-        )
+        views, bases = [run.views[i] for i in chosen], [adjustment.bases[i] for i in chosen]
+        start = np.array([run.calibrated[view.name].spline.start for view in views])
+        line = Line(used.spline.width, start, np.zeros(len(views)))
+        whole = replace(used, spline=replace(used.spline, start=0.0))
+        yield whole, SensorTies.of(used.path, views, part, bases, ground, line)

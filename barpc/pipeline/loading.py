@@ -159,7 +159,7 @@ def _open_image(
             camera = open_split(file, choices, dataset=dataset)
             if camera.format in ("grid", "correction") and "camera" not in choices:
                 raise ImageError(f"{file}: a grid and no image; give it behind its image: IMAGE,camera={file}")
-        taken = read_acquisition(file, camera.path)
+        taken = read_acquisition(file, camera.path, tags)
         camera = replace(camera, sensor=taken.sensor)
         camera.require_usable(file)
         day = (image.date if isinstance(image, View) else "") or taken.day(tags)

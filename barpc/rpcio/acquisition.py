@@ -1,6 +1,7 @@
 """The sensor, time and sun angles of an image, read from its metadata.
 
-Metadata are the file of the camera, Maxar's IMD and XML, Airbus' DIM and Planet's JSON beside the image; never pixels.
+Metadata are the file of the camera, Maxar's IMD and XML, Airbus' DIM and Planet's JSON beside the image, and its tags;
+never pixels.
 """
 
 from __future__ import annotations
@@ -43,13 +44,16 @@ class Acquisition:
         return next((day for tag in found if tag and (day := _day("-".join(tag.groups())))), "")
 
 
-def read_acquisition(image: PathOrUrl | str, camera: PathOrUrl | str | None = None) -> Acquisition:
-    """Read the sensor, time and sun angles of an image from its camera's file and the metadata beside it, each once.
+def read_acquisition(
+    image: PathOrUrl | str, camera: PathOrUrl | str | None = None, tags: Mapping[str, str] | None = None
+) -> Acquisition:
+    """Read the sensor, time and sun angles of an image from its camera's file, the metadata beside it, and its `tags`.
 
-    The first file that states a thing counts; of several values in it (Airbus' sun angles) the median is taken.
+    The first that states a thing counts; of several values in it (Airbus' sun angles) the median is taken.
     """
     sun, words, time = dict[str, float](), dict[str, str](), ""
-    for text in map(_Text, _metadata(image, camera)):
+    of_tags = "".join(f"{key}={value}\n" for key, value in (tags or {}).items()).encode()[:SCANNED]
+    for text in map(_Text, (*_metadata(image, camera), of_tags)):
         angles = dict[str, list[float]]()
         for found in _SUN.matches(text):
             angles.setdefault("azimuth" if found[1] is None else "elevation", []).append(float(found[2]))
@@ -58,8 +62,12 @@ def read_acquisition(image: PathOrUrl | str, camera: PathOrUrl | str | None = No
             if name not in words and (stated := next(keyed.matches(text), None)):
                 words[name] = stated[1].decode()
         time = time or _time(text)
+        if not (words and time) and (strip := next(_STRIP.matches(text), None)):
+            words.setdefault("satellite", strip[1].decode())
+            time = time or _of_digits(strip[2].decode(), strip[3].decode())
     name, number, band = (words.get(word, "") for word in _SENSOR)
-    sensor = re.sub(r"[^\w-]+", "-", name + number + ("_" + band if band else "")) if name else ""
+    band = "" if name.startswith(band) else f"_{band}"  # OTB's keyword lists call an instrument PHR
+    sensor = re.sub(r"[^\w-]+", "-", name + number + band) if name else ""
     return Acquisition(sun.get("elevation"), sun.get("azimuth"), time or None, sensor)
 
 
@@ -152,6 +160,9 @@ _WHEN = _Keyed(
         re.IGNORECASE,
     ),
 )
+_STRIP = _Keyed(
+    (b"ds_",), re.compile(rb"(?<![A-Za-z0-9])DS_(PHR1[AB]|SPOT[67]|PNEO[3-6])_(\d{8})(\d{6})\d?_")
+)  # the acquisition by which Airbus names what it delivers: sensor, day, time
 _IMAGING_TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)
 _DAY_TAGS = ("ACQUISITIONDATETIME", "NITF_IDATIM", "TIFFTAG_DATETIME")  # the last is often that of the file
 _DAY_TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
@@ -166,6 +177,12 @@ def _time(text: _Text) -> str:
     if clock is None and (later := _IMAGING_TIME.search(text.whole, stated.end(), stated.end() + 500)):
         clock = later[1]
     return f"{day}T{clock.decode()}Z" if clock else day
+
+
+def _of_digits(day: str, clock: str) -> str:
+    """Return a time of YYYYMMDD and HHMMSS; empty if it is none."""
+    found = _day(f"{day[:4]}-{day[4:6]}-{day[6:]}")
+    return f"{found}T{clock[:2]}:{clock[2:4]}:{clock[4:]}Z" if found and clock[:2] < "24" else found
 
 
 def _day(text: str) -> str:

@@ -296,10 +296,11 @@ class ColumnSpline(_Curved):
 
     Parameters
     ----------
-    width : int, columns of its images
-    coeffs : (M, 2), coefficients of uniform cubic B-splines from edge to edge of the image, (col, row) [px]; M >= 4
-    edges : (C,), columns at which another detector begins [px], ascending
+    width : int, columns of its line of detectors
+    coeffs : (M, 2), coefficients of uniform cubic B-splines from end to end of the line, (col, row) [px]; M >= 4
+    edges : (C,), columns of the line at which another detector begins [px], ascending
     steps : (C, 2), what is added from each edge on, (col, row) [px]
+    start : float, the column of the line that is the first of the image [px]
     """
 
     _axis = 0
@@ -307,6 +308,7 @@ class ColumnSpline(_Curved):
     coeffs: Array
     edges: Array = field(default_factory=lambda: np.zeros(0))
     steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    start: float = 0.0
 
     def __post_init__(self) -> None:
         coeffs, edges = self._array("coeffs", (None, 2), RpcError), self._array("edges", (None,), RpcError)
@@ -319,7 +321,7 @@ class ColumnSpline(_Curved):
         out = self._along(col, rate=False)
         if len(self.edges):
             begun = np.concatenate([np.zeros((1, 2)), np.cumsum(self.steps, axis=0)])
-            out += begun[np.searchsorted(self.edges, col, side="right").clip(0, len(self.edges))]
+            out += begun[np.searchsorted(self.edges, col + self.start, side="right").clip(0, len(self.edges))]
         return np.where(np.isfinite(col)[..., None], out, np.nan)
 
     def _by_image(self, image: Array) -> Array:
@@ -330,7 +332,7 @@ class ColumnSpline(_Curved):
         return self._along(col, rate=True) * (2.0 / self.width)
 
     def _along(self, col: Array, rate: bool) -> Array:
-        return self._splined((np.asarray(col, dtype=np.float64) + 0.5) * (2.0 / self.width) - 1.0, rate)
+        return self._splined((np.asarray(col, dtype=np.float64) + self.start + 0.5) * (2.0 / self.width) - 1.0, rate)
 
 
 @dataclass(frozen=True)

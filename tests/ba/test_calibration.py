@@ -11,6 +11,7 @@ import scipy.linalg as la
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.calibration import (
     Learnt,
+    Line,
     SensorTies,
     Told,
     _judged,
@@ -23,7 +24,7 @@ from barpc.ba.interior import Calibration, CommonErrors, LineCurve
 from barpc.base.errors import InputError
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline
 from barpc.simulate import simulate_block
-from benchmarks.calibrate import Scene, Sensor, any_looks, off, others, said, scene
+from benchmarks.calibrate import SMALL, Scene, Sensor, any_looks, off, others, parts, said, scene
 
 SIZE = (6000, 4000)
 
@@ -47,7 +48,7 @@ def test_points_and_nuisances_are_eliminated_as_a_dense_solution_does() -> None:
     col, row = made.place.T
     terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
     others, own = np.zeros((2 * count, 3 * points + 10 * views)), np.zeros((2 * count, 2 * curve.size))
-    basis = curve.basis(made.xy[:, 0])
+    basis = curve.basis(made.col)
     for k in range(count):
         for i in range(2):
             at = 3 * made.point[k], 3 * points + 10 * made.view[k] + 5 * i
@@ -214,3 +215,23 @@ def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:
     np.testing.assert_allclose(first.covariance.full, plain.covariance.full + shared @ shared.T)
     np.testing.assert_allclose(first.covariance.view(0, 2), first.covariance.full[:9, 18:27], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(first.covariance.variances().ravel(), np.diag(first.covariance.full), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_shorter_products_find_their_place_on_the_line() -> None:
+    """Cut off somewhere within 88 columns: 25 px is where their middle would put them."""
+    rng, sensor, blocks, true = np.random.default_rng(3), Sensor.made("polynomials", 3, chips=4, size=SMALL), [], []
+    for i in range(6):
+        made = scene(any_looks(3, rng), sensor, rng, 700, size=SMALL)
+        line = Line(SMALL[0], np.zeros(3), np.zeros(3))
+        if i % 2:
+            made, where = parts(made, np.random.default_rng(0), 1.0 - 88 / SMALL[0])
+            line = Line(SMALL[0], np.full(3, 44.0), np.full(3, 88 / np.sqrt(12.0)))
+            true.append(where.start)
+        blocks.append(SensorTies.of("", made.views, made.tracks, made.cameras, made.ground, line))
+    found = learn(blocks)
+    off = np.array([44.0 + shift for shift in found.shifts[1::2]]) - np.array(true)
+    said = np.array(found.shift_sigmas[1::2])
+    assert np.sqrt((off**2).mean()) < 15.0
+    assert 0.4 < np.sqrt((off**2).mean() / (said**2).mean()) < 2.5
+    assert not np.concatenate(found.shifts[::2]).any()

@@ -15,7 +15,7 @@ import rasterio
 from click.testing import CliRunner, Result
 
 import barpc
-from barpc.ba.calibration import SensorTies, learn
+from barpc.ba.calibration import Line, SensorTies, learn
 from barpc.ba.interior import Calibration, LineCurve
 from barpc.base.errors import InputError, OutputError
 from barpc.base.options import AdjustOptions, RunOptions
@@ -26,6 +26,7 @@ from barpc.pipeline import AdjustResult, adjust
 from barpc.pipeline.calibrate import (
     _FinishedRun,
     _may_be_covariance,
+    _OnLine,
     _refuse_unsure,
     _row_direction,
     calibrations_of,
@@ -41,7 +42,7 @@ from barpc.scene import Camera
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
-from benchmarks.calibrate import Scene, Sensor, any_looks, scene
+from benchmarks.calibrate import Scene, Sensor, any_looks, parts, scene
 from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
@@ -186,6 +187,39 @@ def test_what_is_not_of_the_images_is_refused(calibration: Path, line: Sensor, t
         other.write_text(json.dumps({**text, **change}))
         with pytest.raises(InputError, match=words):
             run(paths, "wrong", calibration=(str(other),))
+
+
+@pytest.mark.nightly
+def test_an_archive_of_parts_tells_the_line_and_a_new_part_is_corrected_by_its_columns(
+    line: Sensor, tmp_path: Path
+) -> None:
+    """RPCs that were moved with their parts state where these lie."""
+    rng, runs = np.random.default_rng(8), []
+
+    def part(name: str) -> tuple[Scene, list[Path], Line]:
+        made, where = parts(scene(any_looks(3, rng), line, rng, 2500, size=SIZE), rng, 0.7)
+        return made, files(made, tmp_path / name), where
+
+    for i in range(6):
+        run(paths := part(f"scene{i}")[1])
+        runs.append(paths[0].parent / "adjusted")
+    barpc.calibrate(runs, tmp_path / "SIM1_PAN.cal")
+    found, text = read_calibration(tmp_path / "SIM1_PAN.cal"), json.loads((tmp_path / "SIM1_PAN.cal").read_text())
+    assert abs(found.spline.width - SIZE[0]) <= 1
+    cols = np.arange(5.0, SIZE[0] - 5.0)
+    cols = cols[np.abs(cols[:, None] - line.edges).min(axis=1) > 5.0]
+    wrong = straight(found.spline.at(cols), cols) - straight(line.curve(cols), cols)
+    assert np.sqrt((wrong**2).mean()) < 0.06
+    assert np.linalg.norm(np.sqrt((wrong**2).mean(axis=0))) < 2.5 * np.linalg.norm(text["sigma_px"])
+    _, paths, where = part("new")
+    shutil.copy(tmp_path / "SIM1_PAN.cal", paths[0].parent)
+    done = run(paths)
+    starts = [done.run.calibrated[view.name].spline.start for view in done.run.views]
+    np.testing.assert_allclose(starts, where.start, atol=1.0)
+    (paths[0].parent / "SIM1_PAN.cal").unlink()
+    plain = run(paths, "plain")
+    after = [np.sqrt((one.adjustment.residuals[one.adjustment.inlier] ** 2).mean()) for one in (plain, done)]
+    assert after[1] < 0.95 * after[0]
 
 
 @pytest.mark.slow
@@ -357,8 +391,8 @@ def test_an_image_takes_the_calibration_of_its_sensor_or_of_none(tmp_path: Path)
         of(one, other)
     with pytest.raises(InputError, match=r"c\.cal: another calibration of SIM1_PAN is given"):
         of(one, written(tmp_path / "c.cal"))
-    with pytest.raises(InputError, match=r"a\.cal: of 4001 columns, .* has 4000"):
-        of(written(one, columns=SIZE[0] + 1))
+    with pytest.raises(InputError, match=r"a\.cal: of a line of 4100 columns, .* is of one of 4000"):
+        of(written(one, columns=SIZE[0] + 100))
     beside = written(tmp_path / "two/SIM2_PAN.cal", "SIM2_PAN")
     assert of(written(one)) == {"one": str(one), "two": str(beside), "none": str(one)}
     written(beside)
@@ -373,7 +407,8 @@ def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Se
         made = scene([Look(12.0, 12.0), Look(12.0, 192.0)], line, rng, 250, size=SIZE)
         ties = SensorTies.of(f"run{i}", made.views, made.tracks, made.cameras, made.ground)
         directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
-        found.append(_FinishedRun(Path(f"run{i}"), "", ties, directions, 2))
+        on_line = _OnLine([0, 1], Line(SIZE[0], np.zeros(2), np.zeros(2)), np.full(2, SIZE[0]))
+        found.append(_FinishedRun(Path(f"run{i}"), "", ties, directions, ("a", "b"), on_line, np.arange(2)))
     assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
     learnt = learn([one.ties for one in found])
     with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):
