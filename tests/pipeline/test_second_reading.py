@@ -18,7 +18,7 @@ from rasterio.transform import RPCTransformer
 
 import barpc
 from barpc.base.geodesy import Array
-from barpc.pipeline import figures
+from barpc.export import figures
 from barpc.pipeline.run import AdjustResult
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
