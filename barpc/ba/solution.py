@@ -87,14 +87,21 @@ class Solution:
     @property
     def has_trend(self) -> bool:
         """Whether systematic residuals are left that another model may explain: smooth, or of rejected observations."""
-        left = bool(self.outcome.smooth.found(_TREND).any())
-        return left or self.after.error > MUCH_NOISE * self.outcome.noise
+        return bool(self.outcome.smooth.found(_TREND).any()) or self._meets_worse
 
     @property
     def has_waves(self) -> bool:
-        """Whether neighbours share something that splines over the rows or steps between detectors may follow."""
+        """Whether neighbours share something that splines over the rows or steps between detectors may follow.
+
+        Observations of a view that shakes may be rejected: check tie points have it then.
+        """
         tested = self.outcome.smooth
-        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any())
+        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any()) or self._meets_worse
+
+    @property
+    def _meets_worse(self) -> bool:
+        """Whether check tie points are met surely worse than those in use."""
+        return self.after.error > MUCH_NOISE * self.outcome.noise
 
     @property
     def is_skew(self) -> bool:

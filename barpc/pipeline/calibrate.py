@@ -177,8 +177,8 @@ def _one_line(runs: Sequence[str | Path], opened: Sequence[_OpenedRun], name: st
     """Return where the images of each run lie on the line of a sensor.
 
     The line is the longest of all. A product of fewer columns lies somewhere within it: in its middle, to a standard
-    deviation of the columns it lacks over sqrt(12), until tie points tell. InputError where the place of an image is not
-    known, lines are binned otherwise, or too few images hold the others.
+    deviation of the columns it lacks over sqrt(12), until tie points tell. InputError where the place of an image is
+    unknown, lines are binned otherwise, or too few images hold the others.
     """
     places: list[list[tuple[int, LinePlace]]] = []
     for folder, (_, views, _, sources) in zip(runs, opened, strict=True):

@@ -305,7 +305,8 @@ def check(
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
     run = _with_own_cameras(_with_ties(_with_views("check", images, options, work), options, work), options, work)
-    run = replace(run, agreeing=_agreeing(run, options.adjust))
+    if (found := _agreeing(run, options.adjust)) is not None:
+        run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
 

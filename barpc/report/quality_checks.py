@@ -17,6 +17,7 @@ from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_
 from barpc.report.summary.block import AXES, LeftEntry, left_entries, matters, strangeness
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
+from barpc.report.unseen import unseen_parts
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
 from barpc.tie.reference import FAR_RADIUS, PEAK
@@ -62,6 +63,8 @@ def _reservations(view: ViewEntry, run: Run) -> Causes:
     if adjustment is not None:
         yield from _of_camera(view, run, adjustment)
         yield from _of_tie_points(view, run, adjustment)
+        for part in unseen_parts(run, run.number[view.name]):
+            yield "along_lines", {"place": part.place, "metres": metres(part.metres), "lines": part.words}
         yield from _beyond_one_rpc(view, run)
     error = known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
     if view.num_observations and not error <= GOOD_RMSE:

@@ -21,7 +21,8 @@ from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
 from barpc.base.statistics import FEW, LARGEST, SURE
 
-_SPACING, _DENSER = 2000.0, 4  # rows between knots at first, and how often they are halved
+_SPACING = 2000.0  # rows between knots at first: satellites swing once in some seconds
+_DENSER = 1.5  # times as many splines a try: 7, 10, 15, 22, 33
 _TWICE = 2  # times that detectors are searched for, and that denser splines may be no better
 
 
@@ -90,7 +91,7 @@ def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solut
         else:
             tried = _with_edges(_solve_with(found, parts, options, layout, once=True), parts, options)
         better = given or (asked and best is found) or is_admitted(tried.after, best.after, parts.outer)
-        best, misses = (tried, 0) if better else (best, misses + 1)
+        best, misses = (tried, 0) if better else (best, misses + (best is not found))
     if best is found or not (given or asked or _explains(best, found, block)):
         return found
     return replace(best, asked={**found.asked, "jitter": found.outcome.smooth})
@@ -169,9 +170,12 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
     if options.spacing:
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), MIN_SPLINES)]
     most = min(most, LARGEST // (2 * len(block.views)))
-    wanted = [int(np.ceil(rows / (_SPACING / 2**n))) + 3 for n in range(_DENSER)]
-    dense = np.unique(np.clip(wanted, MIN_SPLINES, most)).tolist() if has_waves and most >= MIN_SPLINES else []
-    return dense or [0] * bool(options.detectors)
+    if not has_waves or most < MIN_SPLINES:
+        return [0] * bool(options.detectors)
+    counts = [min(max(int(np.ceil(rows / _SPACING)) + 3, MIN_SPLINES), most)]
+    while counts[-1] < most:
+        counts.append(min(int(_DENSER * counts[-1]), most))
+    return counts
 
 
 def _solve_with(found: Solution, parts: Parts, options: AdjustOptions, layout: _Layout, once: bool = False) -> Solution:
