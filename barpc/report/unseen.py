@@ -38,9 +38,11 @@ class UnseenPart:
 
 
 def unseen_parts(run: Run, i: int) -> Iterator[UnseenPart]:
-    """Yield the displaced parts of view i whose displacement along the epipolar lines nothing tells."""
+    """Yield the displaced parts of view i of which no image shows the displacement along the epipolar lines."""
     adjustment = run.adjustment
     assert adjustment is not None
+    if not any(one.view == i and one.where is not None for one in adjustment.findings):
+        return
     unknowns, camera = adjustment.cameras.unknowns, adjustment.sensors[i]
     waves = unknowns.waves
     if waves is None or not isinstance(camera, Splined):
