@@ -205,7 +205,8 @@ _LINES = re.compile(r"\r\n|\r|\n")
 def _header(text: str) -> tuple[int, str, list[str]]:
     """Return the number of the line with column names, its delimiter, and the names.
 
-    It is counted from 0: the first that is no comment, or a comment before it of as many cells; -1: none.
+    It is counted from 0: the first that is no comment, or the last comment before it, where that line is of as many
+    cells and names no columns; -1: none.
     """
     none: tuple[int, str, list[str]] = (-1, "", [])
     last = none
@@ -215,12 +216,10 @@ def _header(text: str) -> tuple[int, str, list[str]]:
             continue
         sign = next((sign for sign in "\t;," if sign in bare), " ")
         words, comment = row_of(bare.lstrip("# "), sign), bare.startswith("#")
-        if not comment and len(words) <= len(last[2]):
-            return last
         if not any(numbers_of([word]) for word in words[1:4]) and _names_columns(words):
             last = i, sign, words
         if not comment:
-            return last if last[0] == i else none
+            return last if last[0] == i or len(words) <= len(last[2]) else none
     return none
 
 
@@ -265,6 +264,8 @@ def _read_asp(path: Path) -> GcpTable:
                     col, row, *spread = map(float, words[i + 1 : i + 5])
                     yield words[0], words[i], lon, lat, *ground, col, row, max(spread)
             except ValueError as error:
+                if other := _foreign(words):
+                    raise InputError(f"{path}: {other}") from error
                 raise InputError(
                     f"{path}, line {number}: in no format that is read ({', '.join(GCP_FORMATS)}): a CSV begins with "
                     "its columns' names, a line of ASP's is 'id lat lon alt sx sy sz image col row scol srow ...' "
@@ -272,6 +273,23 @@ def _read_asp(path: Path) -> GcpTable:
                 ) from error
 
     return GcpTable.of_rows(rows())._replace(vertical=Vertical(ELLIPSOID, provenance=INFERRED))
+
+
+def _foreign(words: Sequence[str]) -> str:
+    """Return what a line of another program's file is and how to give it; empty where it is none that is known."""
+    how, words = "give it a first line of names", [word for word in re.split(r"[\s,]+", " ".join(words)) if word]
+    if len(words) == 4 and numbers_of(words) is not None:
+        return (
+            "ArcGIS links, pairs of places without names and heights: "
+            f"{how} (col row east north) with rows that count downwards, --gcp-crs, and heights by --dem"
+        )
+    if len(words) > 4 and numbers_of(words[:4]) is not None and numbers_of(words[4:5]) is None:
+        return f"Global Mapper's points: {how} (col,row,east,north,id,...), and --gcp-crs"
+    if len(words) == 4 and numbers_of(words[2:]) is not None and "." in words[0]:
+        return f"Pix4D's image points: {how} (image,id,col,row), and the ground points with another --gcp"
+    if len(words) == 4 and numbers_of(words[1:]) is not None:
+        return f"Pix4D's ground points: {how} (id,east,north,alt), the image points with another --gcp, and --gcp-crs"
+    return ""
 
 
 def _words_of(path: Path, sign: str = "#") -> Iterator[tuple[int, list[str]]]:
@@ -413,6 +431,17 @@ def read_tags(path: PathOrUrl) -> tuple[GcpTable, tuple[int, int]]:
     return table._replace(crs=system, said=said), size
 
 
+_CONTROLS = re.compile(r"[\0-\x08\x0e-\x1f]")
+_TEXT_CONTROLS = 1e-3  # of a text's characters: form feeds and the like
+_LONGEST_LINE = 16384  # characters of a first line of names, or of a comment with a reference system
+
+
+def _is_binary(text: str) -> bool:
+    """Return whether the beginning of a file is no text: low heights of two bytes look like letters in UTF-16."""
+    endless = len(text) > _LONGEST_LINE and not text.startswith(("{", "<")) and not re.search(r"[\r\n]", text)
+    return "\0" in text or endless or len(_CONTROLS.findall(text)) > _TEXT_CONTROLS * len(text)
+
+
 def _read_tagged(path: Path) -> GcpTable:
     if driver_of(read_head(path, TABLE)) is None:
         raise InputError(f"{path}: neither a text nor a file of points that is read ({', '.join(GCP_FORMATS)})")
@@ -458,6 +487,9 @@ def _read_micmac(path: Path) -> GcpTable:
     except BarpcError as error:
         raise InputError(str(error)) from error
 
+    if root.tag == "kml":
+        raise InputError(f"{path}: KML, places without image points; give a CSV (id,image,lon,lat,alt,col,row)")
+
     def stated(point: Element, tag: str, count: int, usual: str = "") -> tuple[float, ...]:
         numbers = tuple(map(float, (point.findtext(tag) or usual).split()))
         if len(numbers) != count:
@@ -488,7 +520,7 @@ def _read_micmac(path: Path) -> GcpTable:
 
 GCP_FORMATS: dict[str, GcpFormat] = {
     "GeoPackage or Shapefile": GcpFormat(lambda _, head: head.startswith((GEOPACKAGE, SHAPEFILE)), _read_vector),
-    "image with GCP tags": GcpFormat(lambda text, head: driver_of(head) is not None or "\0" in text, _read_tagged),
+    "image with GCP tags": GcpFormat(lambda text, head: driver_of(head) is not None or _is_binary(text), _read_tagged),
     "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
     MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
     "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1

@@ -63,7 +63,8 @@ def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[st
     exact = header_of(bare, {**COLUMNS, **known})
     found = dict(exact)
     if {"x", "y"} <= set(bare) and not {"lon", "lat", "col", "row"} & set(found):
-        pair = ("east", "north") if "alt" in found else ("col", "row")
+        on_map = all(key in found or _alike(key, words, bare, found.values()) is not None for key in ("east", "north"))
+        pair = ("east", "north") if "alt" in found and not on_map else ("col", "row")
         found |= {key: bare.index(word) for key, word in zip(pair, "xy", strict=True)}
     for key in (key for key in _LIKE if key not in found):
         if (place := _alike(key, words, bare, found.values())) is not None:

@@ -53,11 +53,11 @@ _MARKUP = re.compile(r"\s*+<")
 _TEXT_ENDS = ("_RPC.TXT", ".rpc", ".txt", ".rpc_adj")  # the last: of SAT-BA, beside the .rpc that it adjusted
 _BESIDE = "gdal, beside an image"
 # OSSIM's keys, in small letters, have two digits
-_TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=](?(1)|[ \t]*+[-+.\d])")
+_TXT = _has(r"(?im)^[ \t]*+(?:[a-z][\w.]*?[._])?LINE_NUM_COEFF(_1|(?-i:(?<=F)_01))?[ \t]*+[:=,](?(1)|[ \t]*+[-+.\d])")
 _RPB = _has(r"(?i)lineNumCoef\s*+=")
 _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _is_maxar = _has(r"<(\w+:)?LINENUMCOEF", markup=True)
-_JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")')
+_JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")|"rowNum"')
 _SYNTAXES = (
     Format("txt", _TEXT_ENDS, _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
     Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
@@ -68,6 +68,7 @@ _SYNTAXES = (
         "dimap", (), _has(r"<(\w+:)?Global_RFM", markup=True), xml.read_dimap
     ),  # a Dimap_Document, or the model alone
     Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>", markup=True), xml.read_enmap),
+    Format("radarsat", (), _has(r"<(\w+:)?rationalFunctions\b", markup=True), xml.read_radarsat),
     Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"', markup=True), xml.read_gdal),
     Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
     Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
@@ -175,10 +176,13 @@ def parse_rpc(data: bytes, name: str, options: ReadOptions | None = None) -> tup
     for row in FORMATS.values():
         if row.sniff(content):
             return row.read(content, name, options or ReadOptions()), row.name
+    if (part := _PART_OF_MAXAR.search(content)) is not None:
+        raise RpcFormatError(f"{name}: Maxar's {part[1].lower()} file, a part of a camera: give the product's .XML")
     hint = "; it holds a physical camera model: give FILE,model=physical" if holds_physical(content) else ""
     raise RpcFormatError(f"{name}: no RPC format recognised (known: {', '.join(FORMATS)}){hint}")
 
 
+_PART_OF_MAXAR = re.compile(r"(?im)^[ \t]*+BEGIN_GROUP\s*+=\s*+(ATTITUDE|EPHEMERIS|GEOMETRIC|OPTICAL|PRINCIPAL)")
 holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b", markup=True)
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import RpcError, RpcFormatError, plain
+from barpc.base.errors import Remark, RpcError, RpcFormatError, plain
 from barpc.base.safe_io import encoding_of, parse_json
 from barpc.sensor.rpc import RPC, RPCM_NAMES
 
@@ -162,9 +163,12 @@ _B_FROM_A = (0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 7, 11, 14, 17, 12, 15, 18, 13, 16, 1
 
 
 def in_order_b(fields: Fields, order: str, name: str) -> Fields:
-    """Return the fields with coefficients in RPC00B's order, of one that a file calls "RPC00A" or "RPC00B"."""
-    if order not in ("RPC00A", "RPC00B"):
-        raise RpcFormatError(f"{name}: coefficients in the order {order[:40]!r}, only RPC00A and RPC00B are read")
+    """Return the fields with coefficients in RPC00B's order, of one that a file calls "RPC00A"; any other is RPC00B.
+
+    Converters write "XXX" or the name of their program there, and GDAL passes it over.
+    """
+    if re.fullmatch(r"RPC00[C-Z]", order):
+        raise RpcFormatError(f"{name}: coefficients in the order {order!r}, only RPC00A and RPC00B are read")
     lists = (key for key in COEFFICIENTS if order == "RPC00A" and len(fields.get(key, ())) == len(_B_FROM_A))
     return fields | {key: [fields[key][i] for i in _B_FROM_A] for key in lists}
 
@@ -221,7 +225,8 @@ def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
 # Patterns here take time in proportion to the text, whatever it holds: no two repetitions can share a character,
 # and one that may run far begins where a line or a word begins.
 _PREFIX = re.compile(r"(|.*[._])LINE_OFF")
-_KEY_VALUE_LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=](.*)$", re.MULTILINE)
+_KEY_VALUE_LINE = re.compile(r"^[ \t]*+([A-Za-z][\w.]*+)[ \t]*+[:=,](.*)$", re.MULTILINE)
+_INVERSE = re.compile(r"(LAT|LONG)_(NUM|DEN)_COEFF_\d+")  # of WHU-TLC and SatMVS, in the units of their own
 
 
 def decode_text(data: bytes) -> str:
@@ -258,9 +263,14 @@ def _key_value_pairs(text: str, name: str) -> list[tuple[str, str]]:
 def read_txt(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ``KEY: value``, with or without a unit behind (GDAL, Planet, IKONOS, GeoEye, OrbView, KOMPSAT).
 
-    Coefficients are numbered from 1 or 0, or twenty in a line, as GDAL has them.
+    Coefficients are numbered from 1 or 0, or twenty in a line, as GDAL has them. An inverse from image to ground of
+    the 170 lines of WHU-TLC and SatMVS is passed over: the RPC's own is computed.
     """
-    return rpc_from_fields(_fields_of_lines(_key_value_pairs(text, name), name), name, options)
+    lines = _key_value_pairs(text, name)
+    if any(key.startswith("LONG_NUM_COEFF") for key, _ in lines):
+        warnings.warn(f"{name}: its inverse (LAT_ and LONG_ coefficients) is not used", Remark, stacklevel=2)
+        lines = [(key, value) for key, value in lines if not _INVERSE.fullmatch(key)]
+    return rpc_from_fields(_fields_of_lines(lines, name), name, options)
 
 
 def _fields_of_lines(lines: Iterable[tuple[str, str]], name: str) -> Fields:
@@ -392,11 +402,12 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
 
 def _rpc_in_order(values: Sequence[float], what: str, name: str, options: ReadOptions) -> RPC:
     if len(values) not in _RPC_LENGTHS:
-        raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90 or 93")
-    return rpc_from_fields(fields_in_order(values, OFFSETS + SCALES), name, options)
+        raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90, 92 or 93")
+    return rpc_from_fields(fields_in_order(values, SINGLE if len(values) == _OF_TAG else SINGLE[2:]), name, options)
 
 
-_RPC_LENGTHS = (90, 93)  # numbers of an RPC; three more may follow
+_OF_TAG = 92  # numbers of GeoTIFF's tag 50844, the errors first
+_RPC_LENGTHS = (90, _OF_TAG, 93)  # numbers of an RPC; three more may follow
 _BETWEEN = re.compile(r"[\s,;]+")
 _ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbView's are 0.99995
 
@@ -408,14 +419,16 @@ def is_bare_rpc(text: str) -> bool:
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read numbers without names, between commas, blanks or lines, in the order of ENVI's header (IARPA, s2p)."""
+    """Read numbers without names, between commas, blanks or lines, in the order of ENVI's header (IARPA, s2p), or of
+    GeoTIFF's tag 50844.
+    """
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
     rpc = _rpc_in_order(values, "a list without names", name, options)
     first = rpc.coeffs[1::2, 0]
     if not (np.abs(first - 1.0) <= _ONE).all():
         raise RpcFormatError(
-            f"{name}: {len(values)} numbers without names, of which the 31st and 71st are {values[30]:g} and "
-            f"{values[70]:g}: denominators of an RPC begin with 1"
+            f"{name}: {len(values)} numbers without names, whose denominators would begin with {first[0]:g} and "
+            f"{first[1]:g}: those of an RPC begin with 1"
         )
     return rpc
 
@@ -423,21 +436,27 @@ def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
 _LOWER_KEYS = {key: key.lower() for key in KEYS}
 _RPCM_KEYS = _LOWER_KEYS | dict(zip(KEYS[2:], RPCM_NAMES, strict=True))  # the errors are not rpcm's own
 _RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
+_VISSAT_WORDS = (
+    "rowoff coloff latoff lonoff altoff rowscale colscale latscale lonscale altscale rownum rowden colnum colden"
+)
+_VISSAT_KEYS = dict(zip(KEYS[2:], _VISSAT_WORDS.split(), strict=True))
 
 
 def read_rpc_json(text: str, name: str, options: ReadOptions) -> RPC:
-    """Read ``{"rpc": {"row_offset": ...}}`` (rpcm, s2p) or ``{"line_off": ...}`` (rasterio), nested or not."""
+    """Read ``{"rpc": {"row_offset": ...}}`` (rpcm, s2p), ``{"line_off": ...}`` (rasterio) or ``{"rowOff": ...}``
+    (VisSat, SatelliteSfM), nested or not.
+    """
     try:
         document = parse_json(text)
     except ValueError as error:
         raise RpcFormatError(f"{name}: not JSON ({plain(error)})") from error
-    for dialect, mark in ((_RPCM_KEYS, "row_num"), (_LOWER_KEYS, "line_num_coeff")):
+    for dialect, mark in ((_RPCM_KEYS, "row_num"), (_LOWER_KEYS, "line_num_coeff"), (_VISSAT_KEYS, "rownum")):
         found = _find(document, mark)
         if found is not None:
             values = {word.lower(): value for word, value in found.items() if value is not None}
             fields = {key: _values(values[word], name, word) for key, word in dialect.items() if word in values}
             return rpc_from_fields(fields, name, options)
-    raise RpcFormatError(f"{name}: no RPC in this JSON (looked for row_num and line_num_coeff)")
+    raise RpcFormatError(f"{name}: no RPC in this JSON (looked for row_num, line_num_coeff and rowNum)")
 
 
 def _find(document: Any, mark: str, depth: int = 3) -> dict[str, Any] | None:

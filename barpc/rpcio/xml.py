@@ -145,6 +145,25 @@ def read_enmap(text: str, name: str, options: ReadOptions) -> RPC:
     return rpc_from_fields(fields, name, options)
 
 
+_RADARSAT_WORDS = (
+    "biasError randomError lineOffset pixelOffset latitudeOffset longitudeOffset heightOffset lineScale pixelScale "
+    "latitudeScale longitudeScale heightScale lineNumeratorCoefficients lineDenominatorCoefficients "
+    "pixelNumeratorCoefficients pixelDenominatorCoefficients"
+)
+_RADARSAT = dict(zip(KEYS, _RADARSAT_WORDS.split(), strict=True))
+
+
+def read_radarsat(text: str, name: str, options: ReadOptions) -> RPC:
+    """Read `<rationalFunctions>` of RADARSAT-2's and RCM's product.xml."""
+    functions = _element(_xml_root(text, name), ("rationalFunctions",), name)
+    fields = {
+        key: _element_numbers(functions, word, name)
+        for key, word in _RADARSAT.items()
+        if key not in ERROR_FIELDS or functions.find(word) is not None
+    }
+    return rpc_from_fields(fields, name, options)
+
+
 def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
     """Read GDAL's RPC metadata domain; a VRT is read by the grammar by which it is opened (`barpc.rasters.vrt`)."""
     root = _xml_root(text, name, strip_namespaces=False)

@@ -46,6 +46,7 @@ FOREIGN: dict[str, tuple[str, Callable[[Path], object]]] = {
     "letter": ("letter.txt", written(b"To whom it may concern:\nnothing is here.\n")),
     "polygons": ("left.gpkg", lambda path: path.write_bytes(geopackage_of()[:9000])),
     "heights": ("n44e005.hgt", written(RNG.integers(0, 900, 1201**2).astype(">i2").tobytes())),
+    "low heights": ("n45e006.hgt", written(RNG.integers(120, 255, 1201**2).astype(">i2").tobytes())),
     "voids": ("n43e006.hgt", written(struct.pack(">h", -32768) * 1201**2)),
     "zeros": ("zeros", written(bytes(5000))),
     "JSON": ("a.json", written(b'{"a": [1, 2, {"b": null}]}')),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import RpcFormatError
+from barpc.base.errors import Remark, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
 from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.sources import described
@@ -197,7 +197,9 @@ def test_the_order_that_a_file_states_is_the_order_of_its_terms(name, old, new, 
         np.testing.assert_allclose(camera.project(points), expected, rtol=0, atol=1e-8)
     assert np.abs(found.project(points) - rpc.project(points)).max() > 1e-3
     with pytest.raises(RpcFormatError, match="only RPC00A and RPC00B are read"):
-        read(text.replace(old, new.replace("RPC00A", "IKONOS").replace("  A", "  Z")))
+        read(text.replace(old, new.replace("RPC00A", "RPC00Z").replace("  A", "  Z")))
+    if name != "geom":  # by others than the vendor
+        assert read(text.replace(old, new.replace("RPC00A", "XXX"))) == rpc
 
 
 # --- OSSIM's adjustments ----------------------------------------------------------------------------------
@@ -318,6 +320,66 @@ def test_maxar_xml_states_the_size_of_the_image_where_it_is_known(rpc, tmp_path)
         assert ("<NUMCOLUMNS>7<" in (tmp_path / name).read_text()) == wide
 
 
+# --- names and orders of other programs -------------------------------------------------------------------
+
+
+def test_an_inverse_beside_the_rpc_is_passed_over_and_said_to_be(rpc):
+    """The 170 lines of WHU-TLC and SatMVS, whatever their inverse is worth."""
+    lines = written(fields_from_rpc(replace(rpc, err_bias=None, err_rand=None)))
+    inverse = {f"{axis}_{part}_COEFF": [0.1] * 20 for axis in ("LAT", "LONG") for part in ("NUM", "DEN")}
+    with pytest.warns(Remark, match="its inverse"):
+        assert read(lines + written(inverse)) == replace(rpc, err_bias=None, err_rand=None)
+
+
+@pytest.mark.parametrize("between", [",", "\n", ", ", " "])
+def test_ninety_two_numbers_are_those_of_the_geotiff_tag(between, rpc):
+    known = replace(rpc, err_bias=3.5, err_rand=0.25)
+    numbers = [
+        3.5,
+        0.25,
+        *(value for key, values in fields_from_rpc(known).items() if key in KEYS[2:] for value in values),
+    ]
+    assert len(numbers) == 92
+    assert read(between.join(map(repr, numbers))) == known
+    numbers[32] = 0.3  # the first of a denominator
+    with pytest.raises(RpcFormatError, match="those of an RPC begin with 1"):
+        read(between.join(map(repr, numbers)))
+
+
+def test_keys_and_values_may_have_a_comma_between(rpc):
+    assert read(written(fields_from_rpc(rpc), units={}).replace(": ", ",")) == rpc
+
+
+def test_vissat_s_words(rpc):
+    fields = fields_from_rpc(replace(rpc, err_bias=None, err_rand=None))
+    words = dict(zip(("LINE", "SAMP", "LAT", "LONG", "HEIGHT"), ("row", "col", "lat", "lon", "alt"), strict=True))
+    parts = {"OFF": "Off", "SCALE": "Scale", "NUM": "Num", "DEN": "Den"}
+    found = {words[k.split("_")[0]] + parts[k.split("_")[1]]: v[0] if len(v) == 1 else v for k, v in fields.items()}
+    assert read(json.dumps({"rpc": found, "height": 7})) == replace(rpc, err_bias=None, err_rand=None)
+
+
+def test_radarsat_s_rational_functions(rpc):
+    """Names by GDAL's driver: pixel for sample, latitude and longitude in full."""
+    words = {"SAMP": "pixel", "LINE": "line", "LAT": "latitude", "LONG": "longitude", "HEIGHT": "height"}
+    parts = {"OFF": "Offset", "SCALE": "Scale", "NUM": "NumeratorCoefficients", "DEN": "DenominatorCoefficients"}
+    lines = []
+    for key, values in fields_from_rpc(rpc).items():
+        axis, part = key.split("_")[:2]
+        if axis in words:
+            tag = words[axis] + parts[part]
+            lines.append(f"<{tag} units='m'>{' '.join(map(repr, values))}</{tag}>")
+    errors = "".join(f"<{w}>{v!r}</{w}>" for w, v in (("biasError", rpc.err_bias), ("randomError", rpc.err_rand)) if v)
+    inside = f"<rationalFunctions>{errors}{''.join(lines)}</rationalFunctions>"
+    text = f"<product xmlns='http://www.rsi.ca/rs2'><imageGenerationParameters>{inside}</imageGenerationParameters></product>"
+    assert read(text) == rpc
+
+
+@pytest.mark.parametrize("part", ["ATTITUDE", "EPHEMERIS"])
+def test_a_part_of_maxar_s_camera_is_refused_by_name(part):
+    with pytest.raises(RpcFormatError, match=rf"Maxar's {part.lower()} file, .*give the product's \.XML"):
+        read(f'satId = "WV02";\nBEGIN_GROUP = {part}\n\tnumPoints = 2;\n')
+
+
 # --- the cases of the shared data -------------------------------------------------------------------------
 
 P = np.array([[5.4, 43.3, 250.0]])
@@ -329,6 +391,12 @@ P = np.array([[5.4, 43.3, 250.0]])
         ("refined.geom", (499.7732, 565.4442)),
         ("rpc_units.tif", (509.7732, 540.4442)),
         ("rpc_zero_based_RPC.TXT", (509.7732, 540.4442)),
+        ("spec_xxx.rpb", (509.7732, 540.4442)),
+        ("rpc92_comma.txt", (509.7732, 540.4442)),
+        ("satellitesfm_meta.json", (509.7732, 540.4442)),
+        pytest.param(
+            "rpc_with_inverse_170.rpc", (509.7732, 540.4442), marks=pytest.mark.filterwarnings("ignore:.*its inverse")
+        ),
     ],
 )
 def test_a_case_from_the_field_projects_as_its_oracle(file, expected, shared_data):
