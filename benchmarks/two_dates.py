@@ -8,6 +8,7 @@ cameras, minus those of the first, at the points whose true image positions the 
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -42,6 +43,7 @@ def row(name: str, first: Sequence[Path], second: Sequence[Path], truth: dict) -
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as place:
         work = Path(place)

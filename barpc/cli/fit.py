@@ -52,6 +52,8 @@ def fit(source: str, output: str | None, **flags: Any) -> int:
     if not verdict:
         return 0
     how = "written all the same" if done.written else "nothing written (--keep-going writes it all the same)"
+    if not done.fault:  # few points
+        how = "written" if done.written else "nothing written without -o"
     return tell_gate(f"{verdict}; {how}", [])
 
 

@@ -151,6 +151,7 @@ class RpcFit(Shown):
     height_px : float
         Standard deviation of projections [px] of ground 100 m above or below given points by the first power of the
         altitude alone, at least; 0 for a model.
+    few : str, the model that fewer than 40 points carry, and its error, in words; empty for a whole RPC
     """
 
     rpc: RPC
@@ -172,6 +173,7 @@ class RpcFit(Shown):
     axes: str = ""
     reason: Reason | None = None
     height_px: float = 0.0
+    few: str = ""
 
     def __repr__(self) -> str:
         return f"RpcFit({self.method}, at most {self.max_ckp.max():.2g} px at {self.num_ckp} check points, {self.rpc})"

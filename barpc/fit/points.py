@@ -138,7 +138,7 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
     if ground.ndim != 2 or ground.shape[1:] != (3,) or image.shape != (len(ground), 2):
         raise FitError(f"points: expected (N, 3) and (N, 2), found {ground.shape} and {image.shape}")
     if not len(ground):
-        raise FitError("points: none at all, an RPC takes forty or more")
+        raise FitError("points: none at all; 4 give an affine at their altitude, 40 a whole RPC")
     bad = np.flatnonzero(~np.isfinite(ground.sum(axis=1) + image.sum(axis=1)))
     if len(bad):
         raise FitError(f"points: {len(bad)} of {len(ground)} are not finite (the first is point {bad[0]})")

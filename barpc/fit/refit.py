@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +14,8 @@ from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, WGS84_A, Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
-from barpc.fit.methods import FitSolution, solve, solve_problem
+from barpc.fit.few import BETTER, MANY, WHOLE, fit_few
+from barpc.fit.methods import FitSolution, normalization, solve, solve_problem
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
     Errors,
@@ -195,7 +196,9 @@ def fit_rpc_points(
     Raises
     ------
     FitError
-        Too few points, not finite, out of range, in a plane, a grid of exchanged axes; or the tolerance is not reached.
+        Fewer than four points, not finite, out of range, in a plane, a grid of exchanged axes; or the tolerance is not
+        reached. Of fewer than 40 the largest model that they carry is taken (`RpcFit.few`), of fewer than 400 the
+        better one.
 
     Warns
     -----
@@ -213,26 +216,62 @@ def fit_rpc_points(
     axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(given[0]))
     held_out = None if check is None else checked_points(*check)
 
+    if len(given[0]) < WHOLE:
+        return _accepted(_few_points(given, weight, held_out, size, options), options, strict)
+
     def attempt(method: str) -> RpcFit:
         solution = solve(*given, options, method, weight=weight)
         return replace(_certified_on_points(solution, held_out, size, options.precision is None), axes=axes)
 
-    fit, seen = _best_method(attempt, options, strict, exact=False), partial(_check_errors, held_out, *given)
+    fit = _best_method(attempt, options, strict and len(given[0]) >= MANY, exact=False)
+    if len(given[0]) < MANY and options.method == "auto":
+        small = replace(_few_points(given, weight, held_out, size, options), axes=axes, few="")
+        smaller = float(np.linalg.norm(small.rmse_ckp)) < BETTER * float(np.linalg.norm(fit.rmse_ckp))
+        fit = _accepted(small if smaller else fit, options, strict)
+    seen = partial(_check_errors, held_out, *given)
     return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
 
 
-def _certified_on_points(
-    solution: FitSolution, held_out: tuple[Array, Array] | None, size: tuple[int, int] | None, limited: bool
+def _few_points(
+    given: tuple[Array, Array],
+    weight: Array | None,
+    held_out: tuple[Array, Array] | None,
+    size: tuple[int, int] | None,
+    options: FitOptions,
 ) -> RpcFit:
-    """Return a fit to given points with its certificate, on check points or on each point, left out.
+    """Return the fit of the largest model that some points, too few for an RPC, carry."""
+    (ground, image), norm = given, normalization(*given, options)
+    place = (ground - norm.ground_offset) / norm.ground_scale
+    found = fit_few(place, (image - norm.image_offset) / norm.image_scale, weight)
+    problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin)
+    solution = FitSolution(found.coeffs, problem, [], np.zeros(2), 1, found.model.name)
+    left_out = found.left_out * norm.image_scale
+    fit = _certified_on_points(solution, held_out, size, options.precision is None, [left_out])
+    error = np.sqrt((left_out**2).sum(axis=1).mean())
+    few = (
+        f"{len(ground)} points carry {found.model.name}, which misses points left out by {error:.3g} px (RMS): "
+        f"give {WHOLE} or more for a whole RPC"
+    )
+    return replace(fit, few=few)
+
+
+def _certified_on_points(
+    solution: FitSolution,
+    held_out: tuple[Array, Array] | None,
+    size: tuple[int, int] | None,
+    limited: bool,
+    left_out: Iterable[Array] | None = None,
+) -> RpcFit:
+    """Return a fit to given points with its certificate, on check points or on each point, left out (N, 2) [px].
 
     Its RPC is perhaps `limited` to the altitudes of the points.
     """
     ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
     if held_out is not None:
         errors.add(solution.rpc.project(held_out[0]) - held_out[1])
-    for residual in solution.leave_one_out() if held_out is None else ():
-        errors.add(residual)
+    if held_out is None:
+        for residual in solution.leave_one_out() if left_out is None else left_out:
+            errors.add(residual)
     loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
     fit = _certified(solution, errors, errors.largest, loop, size)
     rpc = _limited_to_altitudes(fit.rpc, ground[:, 2]) if limited else fit.rpc

@@ -128,6 +128,11 @@ def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = 
     return _consumer_readings(path, _grid_consumers(path), measured)
 
 
+def projection_by(tool: str, path: Path) -> Projection:
+    """Return the projection of a file's camera as a tool of `CONSUMERS` reads it, with the errors of that tool."""
+    return CONSUMERS[tool].open(path)
+
+
 def unverified(paths: Sequence[Path | str]) -> list[str]:
     """Return a sentence for each kind of these files that no installed tool but barpc reads."""
     # the readers of a state are no packages

@@ -276,7 +276,7 @@ def _read_asp(path: Path) -> GcpTable:
 
 
 def _foreign(words: Sequence[str]) -> str:
-    """Return what a line of another program's file is and how to give it; empty where it is none that is known."""
+    """Return the name of the program that writes such lines, and the cure; empty for an unknown one."""
     how, words = "give it a first line of names", [word for word in re.split(r"[\s,]+", " ".join(words)) if word]
     if len(words) == 4 and numbers_of(words) is not None:
         return (

@@ -167,7 +167,7 @@ def in_order_b(fields: Fields, order: str, name: str) -> Fields:
 
     Converters write "XXX" or the name of their program there, and GDAL passes it over.
     """
-    if re.fullmatch(r"RPC00[C-Z]", order):
+    if order.startswith("RPC00") and order not in ("RPC00A", "RPC00B"):
         raise RpcFormatError(f"{name}: coefficients in the order {order!r}, only RPC00A and RPC00B are read")
     lists = (key for key in COEFFICIENTS if order == "RPC00A" and len(fields.get(key, ())) == len(_B_FROM_A))
     return fields | {key: [fields[key][i] for i in _B_FROM_A] for key in lists}
@@ -397,17 +397,13 @@ def read_envi(text: str, name: str, options: ReadOptions) -> RPC:
     """Read ENVI's header: offsets, scales, four times twenty coefficients; three more numbers may follow."""
     match = _ENVI_RPC_INFO.search(text)
     values = listed_numbers(match.group(1), name, "rpc info") if match else []
-    return _rpc_in_order(values, "rpc info", name, options)
-
-
-def _rpc_in_order(values: Sequence[float], what: str, name: str, options: ReadOptions) -> RPC:
     if len(values) not in _RPC_LENGTHS:
-        raise RpcFormatError(f"{name}: {what} has {len(values)} numbers, expected 90, 92 or 93")
-    return rpc_from_fields(fields_in_order(values, SINGLE if len(values) == _OF_TAG else SINGLE[2:]), name, options)
+        raise RpcFormatError(f"{name}: rpc info has {len(values)} numbers, expected 90 or 93")
+    return rpc_from_fields(fields_in_order(values, OFFSETS + SCALES), name, options)
 
 
+_RPC_LENGTHS = (90, 93)  # numbers of an RPC; three more may follow
 _OF_TAG = 92  # numbers of GeoTIFF's tag 50844, the errors first
-_RPC_LENGTHS = (90, _OF_TAG, 93)  # numbers of an RPC; three more may follow
 _BETWEEN = re.compile(r"[\s,;]+")
 _ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbView's are 0.99995
 
@@ -415,7 +411,7 @@ _ONE = 0.01  # by which the first coefficient of a denominator may miss 1: OrbVi
 def is_bare_rpc(text: str) -> bool:
     """Return whether a text holds the numbers of an RPC and nothing else."""
     parts = [part for part in _BETWEEN.split(text, maxsplit=100) if part]
-    return len(parts) in _RPC_LENGTHS and all(map(NUMBER.fullmatch, parts))
+    return len(parts) in (*_RPC_LENGTHS, _OF_TAG) and all(map(NUMBER.fullmatch, parts))
 
 
 def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
@@ -423,12 +419,13 @@ def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
     GeoTIFF's tag 50844.
     """
     values = [number(part, name, "a number") for part in _BETWEEN.split(text) if part]
-    rpc = _rpc_in_order(values, "a list without names", name, options)
+    keys = SINGLE if len(values) == _OF_TAG else OFFSETS + SCALES
+    rpc = rpc_from_fields(fields_in_order(values, keys), name, options)
     first = rpc.coeffs[1::2, 0]
     if not (np.abs(first - 1.0) <= _ONE).all():
         raise RpcFormatError(
-            f"{name}: {len(values)} numbers without names, whose denominators would begin with {first[0]:g} and "
-            f"{first[1]:g}: those of an RPC begin with 1"
+            f"{name}: {len(values)} numbers without names, whose denominators would begin with {first[1]:g} and "
+            f"{first[0]:g}: those of an RPC begin with 1"
         )
     return rpc
 

@@ -40,9 +40,14 @@ class Fitted:
     doubts: tuple[Doubt, ...] = ()
 
     @property
-    def verdict(self) -> str:
-        """Reason why the fit misses the tolerance, or its camera is not its image's; empty without one."""
+    def fault(self) -> str:
+        """Reason why it is not written: the fit misses the tolerance, or its camera is not its image's; else empty."""
         return self.fit.verdict(self.tolerance) or "; ".join(one.sentence for one in self.doubts)
+
+    @property
+    def verdict(self) -> str:
+        """Its fault, or the model that few points carry; empty without either."""
+        return self.fault or self.fit.few
 
 
 def fit(
@@ -110,7 +115,7 @@ def fitted(
     found, size, doubts = _fit_source(source, of_fit, choices)
     tell("fit", 1, 1)
     done = Fitted(found, of_fit.tolerance, doubts=doubts)
-    if output is None or (done.verdict and not choices.keep_going):
+    if output is None or (done.fault and not choices.keep_going):
         return done
     return _write_rpc_file(done, os.fspath(place_of(source)), output, choices, size)
 
@@ -164,7 +169,7 @@ def _write_rpc_file(
     with suppress(_Missed), replacing(output, overwrite=choices.overwrite) as partial:
         write_camera(done.fit.rpc, partial, source, place=output, overwrite=True, size=size)
         done = replace(done, fit=done.fit.as_written(read_rpc(partial)))
-        if done.verdict and not choices.keep_going:
+        if done.fault and not choices.keep_going:
             raise _Missed
         done = replace(done, written=True)
     return done

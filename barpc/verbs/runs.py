@@ -279,7 +279,7 @@ def verify(
     folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect
     found = prove(Path(run_dir), [Path(place) for place in folders], expect and expect.lower(), progress)
     if chosen.figures:
-        from barpc.export.figures import reread_figures
+        from barpc.verbs.figures import reread_figures
 
         found += reread_figures(Path(run_dir))
     return found

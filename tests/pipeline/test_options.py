@@ -6,6 +6,7 @@ import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pyproj
@@ -375,19 +376,25 @@ def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: 
 
 
 def calibration(run: Run, out: Path, scene: Path) -> None:  # what it does: test_calibrate
-    width, path = run.plain.run.views[0].size[0], scene / "line.cal"
+    width, path = 1001, scene / "line.cal"  # of the images that these are parts of
     text = {"schema": CALIBRATION_SCHEMA, "sensor": "A", "columns": width, "edges": [], "steps_px": []}
     text |= {
         "coefficients_px": [[0.0, 0.0]] * 28,
         "covariance_px2": [1e-4 * (i == j) for i in range(56) for j in range(i + 1)],
     }
     path.write_text(json.dumps(text))
-    found = run("b", calibration=str(path), stop_after="adjustment")
+    with pytest.raises(InputError, match="1001 columns are no whole line of a sensor"):
+        run("b", calibration=str(path))
+    with patch("barpc.rpcio.line.LEAST_LINE", 1000):
+        found = run("b", calibration=str(path), stop_after="adjustment")
     np.testing.assert_allclose(found.adjustment.params, run.plain.adjustment.params, atol=1e-9)
     # of a sensor without one the prior of its distortion is wider
     assert (found.adjustment.covariance.variances() < run.plain.adjustment.covariance.variances()).all()
-    path.write_text(json.dumps(text | {"columns": width + 1}))
-    with pytest.raises(InputError, match=f"of {width + 1} columns"):
+    path.write_text(json.dumps(text | {"columns": width + 100}))
+    with (
+        patch("barpc.rpcio.line.LEAST_LINE", 1000),
+        pytest.raises(InputError, match=f"a line of {width + 100} columns"),
+    ):
         run("c", calibration=str(path))
 
 

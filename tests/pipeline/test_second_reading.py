@@ -18,8 +18,8 @@ from rasterio.transform import RPCTransformer
 
 import barpc
 from barpc.base.geodesy import Array
-from barpc.export import figures
 from barpc.pipeline.run import AdjustResult
+from barpc.verbs import figures
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 TOLERANCE = 0.005  # px

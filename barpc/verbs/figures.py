@@ -15,7 +15,7 @@ from barpc.base.errors import BarpcError, InputError, out_of_memory
 from barpc.base.geodesy import Array
 from barpc.export.shots import Shot, read_scene
 from barpc.pipeline.outputs import CHANGED, NOT_ASKED, SAME, Proved
-from barpc.pipeline.verify_outputs import CONSUMERS
+from barpc.pipeline.verify_outputs import CONSUMERS, projection_by
 from barpc.rpcio import format_for
 
 FIGURE_TOLERANCE = 0.005  # px: a hundredth of the largest RMS of a good image; tables hold positions to 0.001 px
@@ -60,7 +60,7 @@ def _reread(shot: Shot, printed: float | None, ground: Array, xy: Array) -> Iter
 def _rms(shot: Shot, name: str, tool: str, ground: Array, xy: Array) -> float:
     """Return the RMS [px] as a tool reads a file; NaN where it cannot."""
     try:
-        off = CONSUMERS[tool].open(shot.writer.folder / name)(ground) - xy
+        off = projection_by(tool, shot.writer.folder / name)(ground) - xy
     except Exception as failure:  # whatever a reader raises is its finding
         if out_of_memory(failure):
             raise MemoryError from failure
