@@ -13,6 +13,7 @@ import numpy as np
 from barpc.ba.altimetry import hold_by_altimetry
 from barpc.ba.constraints.block import Block, join
 from barpc.ba.constraints.gauge import GaugeReport, datum_shares, earlier_scene, gauge_report
+from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.constraints.terrain import Terrain
 from barpc.ba.control.snooping import image_test
@@ -312,9 +313,23 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
     """Report the motion and accuracy of the scene and their sources; an earlier run keeps its own scene."""
     known, outcome = (block.num_tracks, block.num_known), found.outcome
-    gauge = _datum_report(found, block, covariance)
+    gauge = _with_survey_errors(_datum_report(found, block, covariance), found, block)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
     return gauge, shares
+
+
+def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> GaugeReport:
+    """Return the accuracy of a scene with the errors that ground control points of one survey have in common.
+
+    They are worth `MAX_INDEPENDENT_ERRORS` independent points, at most: of thousands the place is no better known.
+    """
+    used = np.ones(len(block.gcps.names), dtype=bool) if found.tested is None else found.tested.used
+    if not found.heights.has_control or used.sum() <= MAX_INDEPENDENT_ERRORS:
+        return gauge
+    common = np.median(block.gcps.sigma[used], axis=0) ** 2 * (1.0 / MAX_INDEPENDENT_ERRORS - 1.0 / used.sum())
+    motions = gauge.motion_sigma.copy()
+    motions[:3] = np.sqrt(motions[:3] ** 2 + common)
+    return replace(gauge, sigma=np.sqrt(gauge.sigma**2 + common), motion_sigma=motions)
 
 
 def _datum_report(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:

@@ -26,7 +26,7 @@ def a_fit(**changes: Any) -> Any:
         "method": "ridge", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
         "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
         "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
-        "contradiction": 3e-9,
+        "contradiction": 3e-9, "few": "",
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **changes})
 

@@ -37,7 +37,7 @@ def error(rpc: barpc.RPC) -> float:
         (39, ("a projective camera", "quadratic polynomials"), 0.01),
     ],
 )
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_exact_points_carry_more_the_more_there_are(count, names, most, seed):
     found = barpc.fit_rpc_points(*points(count, seed=seed), strict=False)
     assert found.method in names
@@ -45,11 +45,11 @@ def test_exact_points_carry_more_the_more_there_are(count, names, most, seed):
     assert f"{count} points carry {found.method}" in found.few
 
 
-@pytest.mark.parametrize("count", [10, 16, 24, 39, 60, 120])
+@pytest.mark.parametrize("count", [10, 24, 60, pytest.param(120, marks=pytest.mark.nightly)])
 def test_noisy_points_get_no_more_than_they_carry_and_the_error_that_is_said(count):
     """A whole RPC of 60 points of 0.3 px of noise errs by 0.4 px."""
     ratio, worst = [], 0.0
-    for seed in range(6):
+    for seed in range(5):
         found = barpc.fit_rpc_points(*points(count, 0.3, seed), strict=False)
         worst = max(worst, error(found.rpc))
         noise = 0.3 * np.sqrt(2.0)
@@ -60,7 +60,7 @@ def test_noisy_points_get_no_more_than_they_carry_and_the_error_that_is_said(cou
 
 
 def test_exact_points_of_a_whole_rpc_keep_it():
-    for count in (40, 60, 200):
+    for count in (40, 200):
         found = barpc.fit_rpc_points(*points(count), strict=False)
         assert found.method == "ridge"
         assert not found.few
