@@ -100,7 +100,9 @@ def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[
 
 def verb_section(name: str, known: dict[str, str]) -> list[str]:
     """Return a verb: its usage, its first words, its examples, and the flags that are not known yet."""
-    usage, first, examples, flags = parts(cli.get_command(click.Context(cli), name), f"barpc {name}")
+    usage, first, examples, flags = parts(
+        cli.get_command(click.Context(cli, **cli.context_settings), name), f"barpc {name}"
+    )
     lines = ["", f"### {usage.replace(' [OPTIONS]', '')}".replace("[", r"\["), "", first]
     if examples:
         lines += ["", "```", *(line.strip() for line in examples.splitlines() if line.strip()), "```"]
@@ -158,7 +160,7 @@ def manual() -> str:
     lines += man_section(cli, "barpc")
     for name, told in COMMANDS.items():
         lines += [f".SH BARPC {name.upper()}", roff(told), ".PP"]
-        lines += man_section(cli.get_command(click.Context(cli), name), f"barpc {name}")
+        lines += man_section(cli.get_command(click.Context(cli, **cli.context_settings), name), f"barpc {name}")
     return "\n".join(lines) + "\n"
 
 

@@ -258,7 +258,7 @@ def test_a_choice_that_does_not_go_with_the_camera_names_the_file(choice, words,
 
 
 def test_every_choice_of_every_kind_stands_in_the_help():
-    text = cli.get_command(click.Context(cli), "info").help
+    text = cli.get_command(click.Context(cli, **cli.context_settings), "info").help
     for choice in {"size", "camera", *(choice for opener in OPENERS.values() for choice in opener.choices)}:
         assert f'",{choice}=' in text, choice
 

@@ -110,7 +110,7 @@ def adjust_tracks(
     return replace(found, earlier=prior, common=common, seconds=time.process_time() - start)
 
 
-def agreeing(views: Sequence[View], tracks: Tracks, options: AdjustOptions | None = None) -> BoolArray:
+def consistent_observations(views: Sequence[View], tracks: Tracks, options: AdjustOptions | None = None) -> BoolArray:
     """Return which observations (K,) agree with the cameras as they are: an adjustment that moves none would use them.
 
     Errors as of `adjust_tracks`.

@@ -15,7 +15,7 @@ from barpc.sensor.rational import monomials
 
 WHOLE = 40
 """Points that determine the 39 unknowns of each coordinate of a whole RPC, and one to spare."""
-MANY = 400
+NOISY = 400
 """Points from which on the noise of a whole RPC's unknowns is a third of that of a point, or less."""
 BETTER = 0.9  # times the error left out: a larger model must be better by a tenth, the scatter of an error of 16 points
 _PASSES = 4  # in which a projective model is weighted by its denominator: it varies by some per cent

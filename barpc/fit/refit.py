@@ -14,7 +14,7 @@ from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, WGS84_A, Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
-from barpc.fit.few import BETTER, MANY, WHOLE, fit_few
+from barpc.fit.few import BETTER, NOISY, WHOLE, fit_few
 from barpc.fit.methods import FitSolution, normalization, solve, solve_problem
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
@@ -217,14 +217,16 @@ def fit_rpc_points(
     held_out = None if check is None else checked_points(*check)
 
     if len(given[0]) < WHOLE:
+        if options.localisation:
+            raise FitError(f"points: {len(given[0])} are too few for a localisation RPC: give {WHOLE} or more")
         return _accepted(_few_points(given, weight, held_out, size, options), options, strict)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(*given, options, method, weight=weight)
         return replace(_certified_on_points(solution, held_out, size, options.precision is None), axes=axes)
 
-    fit = _best_method(attempt, options, strict and len(given[0]) >= MANY, exact=False)
-    if len(given[0]) < MANY and options.method == "auto":
+    fit = _best_method(attempt, options, strict and len(given[0]) >= NOISY, exact=False)
+    if len(given[0]) < NOISY and options.method == "auto":
         small = replace(_few_points(given, weight, held_out, size, options), axes=axes, few="")
         smaller = float(np.linalg.norm(small.rmse_ckp)) < BETTER * float(np.linalg.norm(fit.rmse_ckp))
         fit = _accepted(small if smaller else fit, options, strict)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, agreeing, block_prior
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
@@ -318,7 +318,7 @@ def _agreeing(run: Run, options: AdjustOptions) -> BoolArray | None:
     if len(run.views) < 2 or not len(run.tracks):
         return None
     try:
-        found = agreeing(run.views, run.tracks, options)
+        found = consistent_observations(run.views, run.tracks, options)
     except BarpcError:  # too few
         return None
     total, kept = (np.bincount(run.tracks.view, rows, len(run.views)) for rows in (None, found))

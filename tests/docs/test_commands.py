@@ -28,7 +28,7 @@ def commands(page: Path) -> list[str]:
 
 
 def flags(verb: str) -> set[str]:
-    command = cli.get_command(click.Context(cli), verb)
+    command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
     assert command is not None
     return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
 

@@ -36,7 +36,7 @@ def inline(page: Path) -> list[str]:
 @cache
 def flags() -> set[str]:
     """Flags of all verbs."""
-    verbs = [cli.get_command(click.Context(cli), verb) for verb in COMMANDS]
+    verbs = [cli.get_command(click.Context(cli, **cli.context_settings), verb) for verb in COMMANDS]
     return GENERAL | {name for verb in verbs if verb for p in verb.params for name in (*p.opts, *p.secondary_opts)}
 
 

@@ -85,7 +85,7 @@ def test_no_template_is_in_the_old_dialect(template: Path) -> None:
 
 @pytest.mark.parametrize("verb", COMMANDS)
 def test_no_help_is_in_the_old_dialect(verb: str) -> None:
-    command = cli.get_command(click.Context(cli), verb)
+    command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
     assert command is not None
     helps = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
     assert [phrase for text in helps for phrase in found(text or "")] == []

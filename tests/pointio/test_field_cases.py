@@ -19,6 +19,7 @@ NAMES = ["view_00", "view_01", "view_02"]
 def is_the_samples(path: Path, names: list[str], crs: str | None = None) -> None:
     pytest.importorskip("pyproj")
     found = read_gcps(path, names, ControlReference(crs=crs, heights="ellipsoidal"))
+    assert len(found.names) == len(TRUE) == 5
     places = np.array([f["geometry"]["coordinates"][:2] for f in TRUE.values()])
     for lon, lat in found.lonlatalt[:, :2]:
         assert np.abs(places - [lon, lat]).max(axis=1).min() < 1e-7

@@ -173,7 +173,7 @@ def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
         ["dsm", ".", "-o"], ["export", ".", "s2p"], ["ortho", ".", "-o"]
     ]  # fmt: skip
     for command in use.commands:
-        verb = cli.get_command(click.Context(cli), command.split()[1])
+        verb = cli.get_command(click.Context(cli, **cli.context_settings), command.split()[1])
         assert verb is not None
         verb.make_context(None, command.replace(" . ", " adjusted ").split(" && ")[0].split()[2:])
     assert use.commands[1].split()[3] in TARGETS

@@ -51,7 +51,9 @@ def test_an_option_in_a_remedy_is_one_of_its_table():
 
 @pytest.mark.slow
 def test_every_flag_that_any_message_names_exists_in_some_verb():
-    known = {"--help", "--version"}.union(*(flags_of(cli.get_command(click.Context(cli), name)) for name in COMMANDS))
+    known = {"--help", "--version"}.union(
+        *(flags_of(cli.get_command(click.Context(cli, **cli.context_settings), name)) for name in COMMANDS)
+    )
     known |= {"--quiet", "--verbose", "--debug", "--json", "--file"}  # (the last of projsync)
     missing = set()
     for path in Path(barpc.__file__).parent.rglob("*.py"):

@@ -61,7 +61,7 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
     of_options = {name for table in (RunOptions, TieOptions, AdjustOptions, FitOptions) for name in declared(table)}
     of_options |= set(FLAG_NAMES.values())
     for verb in set(COMMANDS) - {"report"}:
-        command = cli.get_command(click.Context(cli), verb)
+        command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
         assert command is not None
         known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *of_options}
         for flag in command.params:
