@@ -108,7 +108,7 @@ class JointPrior:
         own = first + np.concatenate([waves.alike, waves.alike + waves.strips.shape[1]])
         of_view = np.zeros(size)
         of_view[own] = ALIKE_SIGMA**-2.0
-        information: Array = np.kron(np.eye(views) - 1.0 / views, np.diag(of_view))
+        information = np.asarray(np.kron(np.eye(views) - 1.0 / views, np.diag(of_view)), np.float64)
         return cls(np.arange(views * size), np.zeros(views * size), information, earlier=False)
 
     def gradient(self, params: Array) -> Array:
