@@ -183,7 +183,7 @@ def parse_rpc(data: bytes, name: str, options: ReadOptions | None = None) -> tup
 
 
 _PART_OF_MAXAR = re.compile(r"(?im)^[ \t]*+BEGIN_GROUP\s*+=\s*+(ATTITUDE|EPHEMERIS|GEOMETRIC|OPTICAL|PRINCIPAL)")
-holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b", markup=True)
+holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model|Scene_Source)\b", markup=True)  # the last: of DIMAP 1
 
 
 def write_rpc(

@@ -67,13 +67,24 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
 
 def metadata_beside(image: Path) -> Path:
-    """Return the XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
+    """Return the XML beside an image that may hold its physical model: Maxar's or SPOT's, Airbus' ``DIM_*.XML``."""
     present, product = files_of(image.parent), image.stem[4:]  # of IMG_<product>_R1C1
     names = (f"{image.stem}.xml", f"dim_{product}.xml", f"dim_{product.rpartition('_')[0]}.xml")
+    if (scene := scene_beside(image)) is not None:
+        return scene
     for name in names:
         if name.lower() in present:
             return image.parent / present[name.lower()]
     raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
+
+
+def scene_beside(image: Path) -> Path | None:
+    """Return the ``.DIM`` of a SPOT scene: of the image's name, or ``METADATA.DIM`` beside ``IMAGERY.*``."""
+    present = files_of(image.parent)
+    for name in (f"{image.stem}.dim".lower(), *["metadata.dim"] * (image.stem.lower() == "imagery")):
+        if name in present:
+            return image.parent / present[name]
+    return None
 
 
 def described(path: PathOrUrl) -> tuple[tuple[int, int] | None, bool]:
