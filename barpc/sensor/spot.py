@@ -27,10 +27,17 @@ from barpc.sensor.samples import ATTITUDE_STEP, Detector, Linescan, Samples, cam
 SCENE = "Dataset_Sources/Source_Information/Scene_Source"
 """Where DIMAP 1 says what took an image; DIMAP 2 has no such part."""
 
+_LEVEL = re.compile(r"(?<!\d)(1A|1B|2A|2B|3|ORTHO)(?![0-9A-Z])")
+_LEVEL_PLACES = (
+    "Data_Processing/PROCESSING_LEVEL",
+    "Metadata_Id/METADATA_PROFILE",
+    "Data_Processing/GEOMETRIC_PROCESSING",
+)
 _POINTS = 8  # of the ephemeris
 _LONGEST_PERIOD = 0.1  # s; 0.0004 to 0.003 are usual
 _LARGEST = 0.5  # rad: of an attitude; 0.07 are usual (yaw steering)
 _LOOK_DEGREES, _LOOK_MISFIT = range(1, 9), 1e-4  # px: the lowest degree of the tangents that is truer is taken
+_LEAST_PIXEL = 1e-7  # rad; 3e-6 is the least of SPOT 5
 _LOOK_STEP = 2.0  # px: look angles farther from a polynomial are no line of detectors
 _SIGMAS = {True: (30 / 8.3e5, 1.0), False: (350 / 8.3e5, 10.0)}  # rad, m: location without GCPs of SPOT 5, of 1 to 4
 _NAVIGATION_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -78,15 +85,15 @@ def camera_of_scene(root: XmlFields, band: str | None = None, attitudes: str | N
 
 def _is_spot_5(root: XmlFields) -> bool:
     """Return whether a scene is SPOT 5's; RpcFormatError for another satellite than SPOT 1 to 5, or level than 1A."""
-    source = root.one(SCENE)
-    name, index = source.text("MISSION"), source.text("MISSION_INDEX")
-    if name.upper() != "SPOT" or index not in ("1", "2", "3", "4", "5"):
-        raise RpcFormatError(f"{root.name}: a scene of {name} {index}; of DIMAP 1 only SPOT 1 to 5 are read")
-    for where in ("Data_Processing/PROCESSING_LEVEL", "Metadata_Id/METADATA_PROFILE"):
-        level = re.search(r"(?<!\d)(1A|1B|2A|2B|3)(?![0-9A-Z])", root.element.findtext(where, "").upper())
-        if level is not None and level[1] != "1A":
-            raise RpcFormatError(f"{root.name}: a scene of level {level[1]}, resampled: only 1A has a physical model")
-    return index == "5"
+    name = " ".join(root.one(SCENE).element.findtext(tag, "").strip() for tag in ("MISSION", "MISSION_INDEX")).strip()
+    mission = re.fullmatch(r"SPOT[ -]*([1-5])( \1)?", name, re.IGNORECASE)
+    if mission is None:
+        raise RpcFormatError(f"{root.name}: a scene of {name or 'no MISSION'}; of DIMAP 1 only SPOT 1 to 5 are read")
+    stated = (_LEVEL.search(root.element.findtext(where, "").upper()) for where in _LEVEL_PLACES)
+    level = next((found[1] for found in stated if found), "1A")
+    if level != "1A":
+        raise RpcFormatError(f"{root.name}: a scene of level {level}, resampled: only 1A has a physical model")
+    return mission[1] == "5"
 
 
 def _states(strip: XmlFields, first: np.datetime64, last: float, ticks: Array) -> Array:
@@ -162,7 +169,9 @@ def _look(strip: XmlFields, band: str | None, width: int) -> Array:
     tangents = np.tan(np.stack([psi_x, -psi_y], axis=1))
     half = (width - 1) / 2
     scaled = np.linspace(-1.0, 1.0, width)
-    pixel = max(float(np.linalg.norm(tangents[-1] - tangents[0])) / (width - 1), np.finfo(float).tiny)
+    pixel = float(np.linalg.norm(tangents[-1] - tangents[0])) / (width - 1)
+    if not pixel > _LEAST_PIXEL:
+        raise RpcFormatError(f"{strip.name}: look angles of one direction, {pixel:.2g} rad a detector")
     for degree in _LOOK_DEGREES:
         coeffs = polyfit(scaled, tangents, degree)
         misfit = float(np.abs(polyval(scaled, coeffs).T - tangents).max() / pixel)
