@@ -47,7 +47,7 @@ def doubts_of(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None = None)
 
 
 def corners_off(model: SensorModel, corners: Array) -> tuple[str, tuple[Doubt, ...]]:
-    """Return what a producer's corners (N, 4) - lon, lat [deg] at altitude 0, col, row [px] - say of a camera."""
+    """Return the distance of a camera from its producer's corners (N, 4), `Linescan.corners`, in words, and doubts."""
     stated = np.column_stack([corners[:, :2], np.zeros(len(corners))])
     ground = ecef_from_ground(model.localize(corners[:, 2:], np.zeros(len(corners))))
     off = float(np.linalg.norm(ground - ecef_from_ground(stated), axis=1).max())

@@ -40,7 +40,7 @@ def padded(rows: Iterable[npt.NDArray[Any] | list[float]]) -> Array:
 
 
 def parse_time(text: str, name: str) -> np.datetime64:
-    """Parse a UTC time such as "2021-02-16T15:12:07.524369", perhaps with a Z behind it or "UTC=" before."""
+    """Parse a UTC time such as "2021-02-16T15:12:07.524369", from 1900, perhaps with a Z behind it or "UTC=" before."""
     match = _ISO_TIME.fullmatch(text.strip())
     try:
         return np.datetime64(match["time"] if match else "none", "ns")

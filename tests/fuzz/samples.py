@@ -59,6 +59,7 @@ from tests.sensor import terrasar_files
 from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
+from tests.sensor.spot_files import Scene
 
 from .ends import mutate_npz_ends
 from .kinds import Sample
@@ -612,6 +613,7 @@ SAMPLES: dict[str, Sample] = {
     ),
     "isd": Sample("image.XML", _use_linescan, lambda: isd(_FLIGHT)[0].encode(), (mutate_xml,)),
     "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),
+    "spot": Sample("METADATA.DIM", _use_linescan, lambda: Scene(mission=4).text().encode(), (mutate_xml,)),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
     "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
     **USED,
