@@ -111,6 +111,13 @@ class JointPrior:
         information = np.asarray(np.kron(np.eye(views) - 1.0 / views, np.diag(of_view)), np.float64)
         return cls(np.arange(views * size), np.zeros(views * size), information, earlier=False)
 
+    @classmethod
+    def of_values(cls, index: IntArray, values: Array, shape: tuple[int, ...]) -> JointPrior:
+        """Return the prior that unknowns at places `index` (m,) of the raveled (N, q) array have values (m,)."""
+        size, own = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
+        own[0, index], own[1, index] = values, ALIKE_SIGMA**-2.0
+        return cls(np.arange(size), own[0], np.diag(own[1]), earlier=False)
+
     def gradient(self, params: Array) -> Array:
         """Return half the derivative (n,) of the cost by the unknowns `index` at unknowns (N, q)."""
         return self.information @ (params.ravel()[self.index] - self.mean) + self.slope

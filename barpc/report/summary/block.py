@@ -334,6 +334,10 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
             words["first"] = np.ceil(start)
         else:
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
+            from_start = start <= 0.0  # of lines lost: rows behind them are seen early
+            words["edge"] = np.ceil(stop if from_start else start)
+            lost = "lost" if (one.size[1] < 0.0) != from_start else "repeated"
+            words["lines"] = f"{size:.0f} line{'s were' if size > 1.5 else ' was'} {lost}"
             fields["first"], fields["last"] = np.clip((np.ceil(start), np.ceil(stop) - 1.0), 0.0, last).tolist()
             words |= fields
     numbers = one.gain, one.gap, one.runner_up or None
