@@ -153,6 +153,15 @@ class ExportOptions(Options):
         unit="m",
         metavar="LOW HIGH",
     )
+    time: tuple[str, ...] = option(
+        (),
+        """UTC time of images whose files state none (`satnerf` needs it: the sun), or of the named one, as
+        2013-04-17T10:36:44.""",
+        metavar="[IMAGE=]TIME",
+    )
+    date: tuple[str, ...] = option(
+        (), "Their day, where the time is not known (`stac`), as 2013-04-17.", metavar="[IMAGE=]DAY"
+    )
     overwrite: bool = option(False, "Replace what an earlier export wrote.")
 
 

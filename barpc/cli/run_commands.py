@@ -59,17 +59,22 @@ def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
 
     satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
     each; s2p, cars, asp: a configuration that is ready to run; stac: a collection for catalogues; points: tie points
-    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied.
+    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied. Exit code 3: nothing is
+    written, as satnerf and stac need the time of images that no file states.
 
     \b
     Examples:
-      barpc export adjusted nerf --to satnerf
+      barpc export adjusted nerf --to satnerf --time 2013-04-17T10:36:44
       barpc export adjusted sparse --to colmap --alt 80 320
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
+    from barpc.export import UnknownTimeError
     from barpc.verbs import runs
 
-    paths = runs.export(run_dir, out_dir, target, **given_flags(flags))
+    try:
+        paths = runs.export(run_dir, out_dir, target, **given_flags(flags))
+    except UnknownTimeError as error:
+        return tell_gate(f"nothing is written: {error}", [])
     tell([str(path) for path in paths], *paths)
     if not wants_json() and target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
         remark("the images are not copied: move them together with both folders, or adjust with --images copy")

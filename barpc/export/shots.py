@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import InputError
+from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
-from barpc.rasters.raster import sources_of
+from barpc.rasters.raster import open_raster, sources_of
 from barpc.report.compare import is_own, written_rpc
 from barpc.report.finished import FinishedRun
 from barpc.report.ranking import sure_pairs
@@ -132,10 +132,13 @@ class Scene:
             raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
         return Sampled(self.world(ground[known]), image[known])
 
+    def middle(self, shot: Shot) -> Array:
+        """Return the ground (3,) in the middle of a shot, at the altitude of the origin."""
+        return np.asarray(shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(self.origin[2])))
+
     def sight_of(self, shot: Shot) -> tuple[Array, float]:
         """Return the unit vector (3,) in the world from a shot's ground middle to its sensor, and the distance [m]."""
-        ground = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(self.origin[2]))
-        away = camera_center(shot.rpc, shot.size, self.alt_range).ecef - ecef_from_ground(ground)
+        away = camera_center(shot.rpc, shot.size, self.alt_range).ecef - ecef_from_ground(self.middle(shot))
         far = float(np.linalg.norm(away))
         return enu_basis(self.origin) @ away / far, far
 
@@ -245,10 +248,23 @@ def _shot(newest: FinishedRun, run: FinishedRun, view: ViewEntry, of_images: boo
     file, light = str(run.sealed.located(view.path)), Acquisition()
     if of_images:
         file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
-        light = read_acquisition(file, source or None)
+        light = _light(view, file, source)
     none: IntArray = np.empty(0, dtype=np.int64)
     carrier = _carrier(writer, view.name, files)
     return Shot(view, run, rpc, writer, files, file, carrier, light, none, np.empty((0, 2)))
+
+
+def _light(view: ViewEntry, file: str, source: str) -> Acquisition:
+    """Return the sensor, time and sun of an image by its files; the day that the run was given where these state none.
+
+    The date of a TIFF is that of the file: it is none of an acquisition.
+    """
+    tags: Mapping[str, str] = {}
+    if not is_url(file):
+        with suppress(BarpcError), open_raster(file) as dataset:
+            tags = dataset.tags()
+    light = read_acquisition(file, source or None, tags)
+    return light if light.time or view.date == light.day(tags) else replace(light, time=view.date)
 
 
 def _written(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[FinishedRun, tuple[str, ...], RPC]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
+from barpc.base.verb_options import ExportOptions
 from barpc.cli import main
 from barpc.export import TARGETS, _link_image, export_run
+from barpc.export.light import sun_angles
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
 from tests.sealing import seal
 
+DATED = {"time": ("2013-04-17T22:00:00+02:00",)}  # for images whose files state no time
+
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
-    export_run(run, target, tmp_path / target, **options)
+    export_run(run, target, tmp_path / target, ExportOptions(**DATED | options))
     return tmp_path / target
 
 
@@ -77,9 +82,12 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
     records = [read(out / name) for name in names]
     paths = [Path(view["path"]) for view in read(run_dir / "summary.json")["views"]]
     assert [(out / one["img"]).resolve() for one in records] == paths  # in several folders: from OUT
-    assert [one["sun_elevation"] for one in records] == [52.25, None, None]
-    assert [one["sun_azimuth"] for one in records] == [150.5, None, None]
-    assert [one["acquisition_date"] for one in records] == ["2013-04-17T10:32:15.5Z", None, None]
+    times = [datetime.strptime(one["acquisition_date"], "%Y%m%d%H%M%S") for one in records]  # as its scripts read it
+    assert [f"{time:%d %H:%M:%S}" for time in times] == ["17 10:32:15", "17 20:00:00", "17 20:00:00"]
+    angles = np.array([[float(one["sun_elevation"]), float(one["sun_azimuth"])] for one in records])
+    assert angles[0] == pytest.approx([52.25, 150.5])  # as its file states it
+    lon, lat = records[1]["geojson"]["center"]
+    assert angles[1:] == pytest.approx(np.array([sun_angles(times[1].replace(tzinfo=UTC), lon, lat)] * 2), abs=0.02)
     pyproj = pytest.importorskip("pyproj")
     back = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     for one in records:
@@ -176,7 +184,7 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
 @pytest.mark.slow
 def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
     for _ in range(2):  # again: in place of the first
-        export_run(southern, "colmap", tmp_path / "model", overwrite=True)
+        export_run(southern, "colmap", tmp_path / "model", ExportOptions(overwrite=True))
     lines = (tmp_path / "model/sparse/0/images.txt").read_text().splitlines()[::2]
     views = read(southern / "summary.json")["views"]
     for line, view in zip(lines, views, strict=True):
@@ -188,7 +196,7 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
     theirs = tmp_path / "other/images" / lines[0].split()[-1]
     theirs.write_bytes(b"mine")
     with pytest.raises(OutputError):
-        export_run(southern, "colmap", tmp_path / "other", overwrite=True)
+        export_run(southern, "colmap", tmp_path / "other", ExportOptions(overwrite=True))
     assert theirs.read_bytes() == b"mine"
 
 
@@ -254,9 +262,9 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     np.testing.assert_allclose(np.diag(scatter), np.diag(matrix[7]), rtol=0.15)
 
 
-def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, tmp_path):
+def test_stac_items_are_valid_of_a_day_and_across_the_date_line(run_dir, tmp_path):
     pystac = pytest.importorskip("pystac")
-    out = exported(run_dir, "stac", tmp_path)
+    out = exported(run_dir, "stac", tmp_path, time=(), date=("2013-04-17",))
     views = read(run_dir / "summary.json")["views"]
     for view in views:
         content = read(out / f"{view['name']}.json")
@@ -283,12 +291,14 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
         assert south <= item.bbox[1] < item.bbox[3] <= north
         assert 0.0 <= (item.bbox[0] - west) % turn <= (item.bbox[2] - west) % turn <= (east - west) % turn + 1e-9
     assert read(out / f"{views[0]['name']}.json")["properties"]["datetime"] == "2013-04-17T10:32:15.5Z"
-    assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
+    day = pystac.Item.from_file(str(out / f"{views[1]['name']}.json"))
+    assert day.datetime is None
+    assert f"{day.common_metadata.end_datetime:%F %T}" == "2013-04-17 23:59:59"
 
 
 @pytest.mark.slow
 def test_altitudes_may_be_given(southern, tmp_path):
-    out = exported(southern, "colmap", tmp_path, alt_range=(-200.0, 2000.0))
+    out = exported(southern, "colmap", tmp_path, alt=(-200.0, 2000.0))
     assert read(out / "world.json")["alt_range"] == [-200.0, 2000.0]
 
 
@@ -298,13 +308,13 @@ def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp
     out = exported(southern, target, tmp_path)
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     with pytest.raises(OutputError, match="not empty"):
-        export_run(southern, target, out)
-    export_run(southern, target, out, overwrite=True)
+        exported(southern, target, tmp_path)
+    exported(southern, target, tmp_path, overwrite=True)
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
     foreign = sorted(before)[0]
     (out / foreign).write_text("mine")
     with pytest.raises(OutputError, match="not replaced"):
-        export_run(southern, target, out, overwrite=True)
+        exported(southern, target, tmp_path, overwrite=True)
     assert (out / foreign).read_text() == "mine"
 
 
@@ -320,7 +330,7 @@ def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
 
 def test_the_run_s_own_folder_is_never_an_export(southern):
     with pytest.raises(OutputError, match="one of its own"):
-        export_run(southern, "s2p", southern, overwrite=True)
+        export_run(southern, "s2p", southern, ExportOptions(overwrite=True))
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", "x\0y"])
@@ -404,6 +414,6 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
         export_run(southern, "obj", tmp_path / "x")
     for altitudes in ((5.0, 5.0), (6.0, 5.0)):
         with pytest.raises(InputError, match="the lower one first"):
-            export_run(southern, "s2p", tmp_path / "x", alt_range=altitudes)
+            export_run(southern, "s2p", tmp_path / "x", ExportOptions(alt=altitudes))
     assert not (tmp_path / "x").exists()
     assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]

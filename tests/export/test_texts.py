@@ -19,9 +19,9 @@ from barpc.base.sealed import Sealed
 from barpc.export import files as made_of
 from barpc.export import pinholes
 from barpc.export import shots as scene
+from barpc.export.light import UnknownTimeError, dated
 from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import read_rpc
-from barpc.rpcio.acquisition import Acquisition
 from barpc.sensor.geometry import camera_center, image_grid
 
 OUT = Path("/elsewhere/out")
@@ -180,7 +180,7 @@ def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, sou
 
 
 def test_a_record_of_sat_nerf(south):
-    files = made_of.satnerf(south, OUT)
+    files = made_of.satnerf(dated(south, ["2013-04-17T20:00:00"], []), OUT)
     shot = south.shots[0]
     one = json.loads(files[f"{shot.name}.json"])
     assert (one["height"], one["width"], one["min_alt"], one["max_alt"]) == (700, 900, *south.alt_range)
@@ -188,7 +188,7 @@ def test_a_record_of_sat_nerf(south):
     assert (one["sun_elevation"], one["sun_azimuth"], one["acquisition_date"]) == (
         52.25,
         150.5,
-        "2013-04-17T10:32:15.5Z",
+        "20130417103215",
     )
     middle = shot.rpc.localize(np.array([449.5, 349.5]), np.array(south.origin[2]))
     assert one["geojson"]["center"] == pytest.approx(middle[:2])
@@ -323,7 +323,8 @@ def test_the_yaml_of_cars(south):
 
 
 def test_a_stac_item_says_where_when_and_how(south, southern):
-    name, texts = south.shots[0].name, made_of.stac(south, OUT)
+    of = dated(south, [], ["2013-04-17"])
+    name, texts = south.shots[0].name, made_of.stac(of, OUT)
     item = json.loads(texts[f"{name}.json"])
     boxes = np.array([json.loads(text)["bbox"] for key, text in texts.items() if key != "collection.json"])
     ends = [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
@@ -332,7 +333,12 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
     assert [(one["rel"], one["href"]) for one in item["links"]] == [
         (rel, "./collection.json") for rel in ("root", "parent", "collection")
     ]
-    assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
+    used = {key.partition(":")[0] for key in item["properties"] if ":" in key}
+    names = {"proj": "projection/v2.0.0", "view": "view/v1.0.0", "processing": "processing/v1.2.0"}
+    assert item["stac_extensions"] == [
+        f"https://stac-extensions.github.io/{names[one]}/schema.json" for one in sorted(used)
+    ]
+    assert used == set(names)
     ring = np.array(item["geometry"]["coordinates"][0])
     assert item["bbox"] == pytest.approx([ring[:, 0].min(), ring[:, 1].min(), ring[:, 0].max(), ring[:, 1].max()])
     found, view = item["properties"], south.shots[0].entry
@@ -355,23 +361,28 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
         "a.xml": ("application/xml", "metadata"), "a.json": ("application/json", "metadata"),
         "a_RPC.TXT": ("text/plain", "metadata"),
     }  # fmt: skip
-    run = with_shot(south, written=tuple(kinds))
+    run = with_shot(of, written=tuple(kinds))
     assets = json.loads(made_of.stac(run, OUT)[f"{name}.json"])["assets"]
     for output, (kind, role) in kinds.items():
         assert assets[output] == {"href": relative_link(southern / output, OUT), "type": kind, "roles": [role]}
 
 
 def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
-    unknown = json.loads(made_of.stac(south, OUT)[f"{south.shots[1].name}.json"])["properties"]
-    assert unknown["datetime"] is None
-    assert (unknown["start_datetime"], unknown["end_datetime"]) == (
-        "1957-10-04T00:00:00Z",
-        "9999-12-31T23:59:59Z",
-    )
-    assert "view:sun_azimuth" not in unknown
-    day = with_shot(south, light=Acquisition(None, None, "2020-01-02"))
-    name = south.shots[0].name
-    assert json.loads(made_of.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
+    """A day is an interval: no clock is invented."""
+    with pytest.raises(UnknownTimeError, match=r"^view_0001, view_0002: no file states the day .* --date YYYY-MM-DD "):
+        made_of.stac(south, OUT)
+    of = dated(south, [], ["2013-04-19", "view_0002=2013-04-20"])
+    texts = {name: json.loads(text) for name, text in made_of.stac(of, OUT).items()}
+    found = texts["view_0001.json"]["properties"]
+    assert [found[key] for key in ("datetime", "start_datetime", "end_datetime")] == [
+        None,
+        "2013-04-19T00:00:00Z",
+        "2013-04-19T23:59:59Z",
+    ]
+    assert "view:sun_azimuth" not in found
+    interval = texts["collection.json"]["extent"]["temporal"]["interval"]
+    assert interval == [["2013-04-17T10:32:15.5Z", "2013-04-20T23:59:59Z"]]
+    dateline = dated(dateline, [], ["2013-04-17"])
     west, south_lat, east, north = json.loads(made_of.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]
     assert 179 < west < 180
     assert -180 < east < -179
