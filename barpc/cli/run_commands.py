@@ -57,15 +57,15 @@ def report(run_dir: str, other: str | None) -> int:
 def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
-    satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
-    each; s2p, cars, asp: a configuration that is ready to run; stac: a collection for catalogues; points: tie points
-    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied. Exit code 3: nothing is
-    written, as satnerf and stac need the time of images that no file states.
+    satnerf: JSON an image with the RPC; colmap: central pinhole cameras, for trainers; s2p, cars, asp: a configuration
+    that is ready to run; stac: a collection for catalogues; points: tie points with their covariance. Images are
+    pointed at, relative to OUT_DIR. Exit code 3: nothing is written, as no file states the time that satnerf and stac
+    need.
 
     \b
     Examples:
       barpc export adjusted nerf --to satnerf --time 2013-04-17T10:36:44
-      barpc export adjusted sparse --to colmap --alt 80 320
+      barpc export adjusted splats --to colmap --images --tolerance 0.05
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
     from barpc.export import UnknownTimeError

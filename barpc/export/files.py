@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,6 +13,7 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, wrap_longitude
+from barpc.base.verb_options import ExportOptions
 from barpc.export.light import lit, moment, require
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.report.records import json_form
@@ -20,7 +21,8 @@ from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
 
-Files = dict[str, bytes]
+Files = Mapping[str, bytes | Callable[[], bytes]]
+"""Content of files by name, or what makes it when it is written."""
 
 _COLLECTION = "collection.json"
 _EXTENSIONS = {"proj": "projection/v2.0.0", "view": "view/v1.0.0", "processing": "processing/v1.2.0"}
@@ -66,10 +68,10 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
     }
 
 
-def satnerf(scene: Scene, out: Path) -> Files:
+def satnerf(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``; EOGS reads them.
 
-    UnknownTimeError where nothing tells when an image was taken.
+    UnknownTimeError for an image whose time of acquisition is unknown.
     """
     scene = lit(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
@@ -96,13 +98,13 @@ def _rpc_text(shot: Shot, name: str) -> bytes:
     return write(shot.rpc).encode()
 
 
-def s2p(scene: Scene, out: Path) -> Files:
+def s2p(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
     images = [{"img": _image(shot, out), "rpc": shot.rpc.to_rpcm_dict()} for shot in scene.shots]
     return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
 
 
-def cars(scene: Scene, out: Path) -> Files:
+def cars(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
     sensors = {}
     for shot in scene.shots:
@@ -114,7 +116,7 @@ def cars(scene: Scene, out: Path) -> Files:
     return {**files, "inputs.yaml": as_json(found)}  # (JSON is YAML)
 
 
-def asp(scene: Scene, out: Path) -> Files:
+def asp(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _rpc_text(shot, "xml") for shot in scene.shots}
     lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
@@ -124,10 +126,10 @@ def asp(scene: Scene, out: Path) -> Files:
 # --- catalogues and points --------------------------------------------------------------------------------
 
 
-def stac(scene: Scene, out: Path) -> Files:
+def stac(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder.
 
-    UnknownTimeError where nothing tells the day of an image.
+    UnknownTimeError for an image whose day of acquisition is unknown.
     """
     require([shot for shot in scene.shots if not shot.light.time], "day")
     items = {f"{shot.name}.json": _item(scene, shot, out) for shot in scene.shots}
@@ -210,7 +212,7 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
     return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 
 
-def points(scene: Scene, _out: Path) -> Files:
+def points(scene: Scene, _out: Path, _how: ExportOptions) -> Files:
     """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its place, east, north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of

@@ -14,7 +14,7 @@ from barpc.rpcio.acquisition import FIRST_YEAR
 
 
 class UnknownTimeError(InputError):
-    """Nothing tells when images were taken, and the export needs it."""
+    """The time of acquisition of some images is unknown, and the export needs it."""
 
 
 def sun_angles(time: datetime, lon: float, lat: float) -> tuple[float, float]:
@@ -99,23 +99,25 @@ def require(shots: Sequence[Shot], what: str) -> None:
         )
 
 
-def lit(scene: Scene) -> Scene:
+def lit(scene: Scene, needed: bool = True) -> Scene:
     """Return a scene of which every shot has a time and the sun's angles: those stated, else computed.
+
+    Where they are not `needed`, shots of an unknown time stay as they are.
 
     Raises
     ------
     UnknownTimeError
-        Nothing tells the time of an image.
+        The time of an image is unknown.
     InputError
         The sun was below the horizon then.
     """
-    require([shot for shot in scene.shots if moment(shot.light.time) is None], "time")
+    if needed:
+        require([shot for shot in scene.shots if moment(shot.light.time) is None], "time")
     shots = []
     for shot in scene.shots:
         light = shot.light
-        if light.elevation is None or light.azimuth is None:
-            when = moment(light.time)
-            assert when is not None
+        when = moment(light.time)
+        if when is not None and (light.elevation is None or light.azimuth is None):
             lon, lat = scene.middle(shot)[:2]
             elevation, azimuth = sun_angles(when if when.tzinfo else when.replace(tzinfo=UTC), lon, lat)
             if elevation < 0:

@@ -30,6 +30,9 @@ from barpc.scene import IntArray
 from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, triangulate
 from barpc.sensor.rpc import RPC
 
+Window = tuple[int, int, int, int]
+"""col, row of the first pixel, width, height [px]."""
+
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
 _TAIL_PERCENT = 0.5  # per cent of the tie points at either end that do not count for it
@@ -122,10 +125,12 @@ class Scene:
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
-    def samples(self, shot: Shot, checked: bool = False) -> Sampled:
-        """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
+    def samples(self, shot: Shot, part: Window | None = None, checked: bool = False) -> Sampled:
+        """Return the points over an image, or a part of it, and altitudes; to measure errors on, more of them."""
         nodes = (2 * GRID_NODES[0] - 1, 2 * GRID_NODES[1] - 1) if checked else GRID_NODES  # between them, too
-        image, alt = image_grid(shot.size, self.alt_range, nodes)
+        col, row, *size = part or (0, 0, *shot.size)
+        image, alt = image_grid((size[0], size[1]), self.alt_range, nodes)
+        image += [col, row]
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < 12:

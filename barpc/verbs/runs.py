@@ -225,8 +225,8 @@ def export(
     Raises
     ------
     InputError
-        No such tool, no finished adjustment, altitudes that are no interval; `barpc.export.UnknownTimeError`: nothing
-        tells when an image was taken, and the tool needs it.
+        No such tool, no finished adjustment, altitudes that are no interval; `barpc.export.UnknownTimeError`: the time
+        of acquisition of an image is unknown, and the tool needs it.
     OutputError
         The folder is in use, not empty, or the run's own.
 

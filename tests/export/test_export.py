@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.enums import ColorInterp
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.base.verb_options import ExportOptions
 from barpc.cli import main
 from barpc.export import TARGETS, _link_image, export_run
+from barpc.export.colmap import _Pixels
 from barpc.export.light import sun_angles
+from barpc.export.shots import read_scene
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid
@@ -27,7 +33,8 @@ DATED = {"time": ("2013-04-17T22:00:00+02:00",)}  # for images whose files state
 
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
-    export_run(run, target, tmp_path / target, ExportOptions(**DATED | options))
+    exact = {"exact": True} if target == "colmap" else {}  # (the images of these runs do not exist)
+    export_run(run, target, tmp_path / target, ExportOptions(**DATED | exact | options))
     return tmp_path / target
 
 
@@ -184,7 +191,7 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
 @pytest.mark.slow
 def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
     for _ in range(2):  # again: in place of the first
-        export_run(southern, "colmap", tmp_path / "model", ExportOptions(overwrite=True))
+        export_run(southern, "colmap", tmp_path / "model", ExportOptions(overwrite=True, exact=True))
     lines = (tmp_path / "model/sparse/0/images.txt").read_text().splitlines()[::2]
     views = read(southern / "summary.json")["views"]
     for line, view in zip(lines, views, strict=True):
@@ -196,7 +203,7 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
     theirs = tmp_path / "other/images" / lines[0].split()[-1]
     theirs.write_bytes(b"mine")
     with pytest.raises(OutputError):
-        export_run(southern, "colmap", tmp_path / "other", ExportOptions(overwrite=True))
+        export_run(southern, "colmap", tmp_path / "other", ExportOptions(overwrite=True, exact=True))
     assert theirs.read_bytes() == b"mine"
 
 
@@ -224,7 +231,7 @@ def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
     (run / "summary.json").write_text(summary.replace('.tif"', ' a.tif"'))
     seal(run)
     with pytest.raises(InputError, match="space"):
-        export_run(run, "colmap", tmp_path / "out")
+        exported(run, "colmap", tmp_path)
 
 
 def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
@@ -417,3 +424,48 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
             export_run(southern, "s2p", tmp_path / "x", ExportOptions(alt=altitudes))
     assert not (tmp_path / "x").exists()
     assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]
+
+
+@pytest.mark.parametrize(
+    ("target", "flags", "said"),
+    [
+        ("s2p", ["--images"], "--exact, --images and --tolerance go with --to colmap, not s2p"),
+        ("colmap", ["--exact", "--tolerance", "0.2"], "--exact takes the images as they are"),
+        ("colmap", ["--tolerance", "0"], "tolerance"),
+    ],
+)
+def test_flags_that_do_not_go_together_are_wrong_usage(target, flags, said, southern, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(southern), str(tmp_path / "out"), "--to", target, *flags])
+    assert stop.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_of_images_that_are_gone_are_not_made(southern, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(southern), str(tmp_path / "out"), "--to", "colmap"])
+    assert stop.value.code == 1
+    assert re.fullmatch(r"barpc: .*north\.tif: .*\n", capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_a_picture_has_the_colours_of_its_image(southern, tmp_path):
+    rng = np.random.default_rng(0)
+    bands = rng.integers(1, 200, (4, 40, 50)).astype(np.uint8)
+    bands[0, :8] = 0  # a border
+    path = tmp_path / "rgb.tif"
+    with rasterio.open(path, "w", driver="GTiff", width=50, height=40, count=4, dtype="uint8", nodata=0) as file:
+        file.write(bands)
+        file.colorinterp = [getattr(ColorInterp, name) for name in ("blue", "green", "red", "undefined")]
+    (shot, *_) = read_scene(southern).shots
+    pixels = _Pixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
+    shown, valid = pixels.read((5, 4, 30, 20))
+    assert shown.shape == (20, 30, 3)
+    for k, band in enumerate((2, 1, 0)):
+        low, high = np.percentile(bands[band][bands[band] > 0], [0.5, 99.5])
+        expected = np.clip((bands[band, 4:24, 5:35] - low) / (high - low) * 255, 0, 255)
+        assert shown[4:, :, k] == pytest.approx(expected[4:], abs=4)
+    assert not valid[:4].any()
+    assert valid[4:].all()

@@ -105,7 +105,9 @@ def test_where_nothing_tells_the_time_nothing_is_written_and_the_exit_code_is_3(
         said = capsys.readouterr()
         assert stop.value.code == 3
         assert said.out == ""
-        assert re.fullmatch(rf"barpc: exit code 3: nothing is written: view_0001, view_0002: .*give {flag} .*\n", said.err)
+        assert re.fullmatch(
+            rf"barpc: exit code 3: nothing is written: view_0001, view_0002: .*give {flag} .*\n", said.err
+        )
         assert not (tmp_path / "out").exists()
 
 
