@@ -76,7 +76,8 @@ def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
     except UnknownTimeError as error:
         return tell_gate(f"nothing is written: {error}", [])
     tell([str(path) for path in paths], *paths)
-    if not wants_json() and target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
+    alone = target == "points" or flags.get("images")  # names no image of the run
+    if not wants_json() and not alone and any(Path(run_dir).glob("*.vrt")):
         remark("the images are not copied: move them together with both folders, or adjust with --images copy")
     return 0
 

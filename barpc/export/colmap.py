@@ -168,7 +168,7 @@ def _transforms(entries: Iterable[_Entry], masks: bool) -> dict[str, Any]:
 
 
 def _world(scene: Scene, entries: Sequence[_Entry], out: Path) -> dict[str, Any]:
-    """Return where the model lies on Earth, and of what image, by which homography, each picture is."""
+    """Return the place of the model on Earth, and the image and homography of each picture."""
     lon, lat, alt = scene.origin
     found: dict[str, Any] = {
         "frame": "metres east, north, up of the origin; (x, y, z, 1) behind world_to_ecef is ECEF (EPSG:4978), "
@@ -261,13 +261,17 @@ def _colours(scene: Scene, entries: Iterable[_Entry], pixels: dict[str, _Pixels]
     return np.rint(sums / np.maximum(counts, 1)[:, None]).astype(np.uint8)
 
 
-def _resampled(entries: Iterable[_Entry], pixels: dict[str, _Pixels]) -> Files:
-    """Return the pictures and their masks, made when they are written."""
+def _resampled(entries: Sequence[_Entry], pixels: dict[str, _Pixels]) -> Files:
+    """Return the pictures and their masks, made when they are written, one after the other."""
+
+    @lru_cache(1)
+    def render(k: int) -> tuple[ByteImage, BoolArray]:
+        return _rendered(entries[k], pixels[entries[k].shot.name])
+
     files: dict[str, Callable[[], bytes]] = {}
-    for one in entries:
-        render = lru_cache(1)(partial(_rendered, one, pixels[one.shot.name]))
-        files[f"images/{one.name}"] = partial(_png, render, True)
-        files[f"masks/{one.name}"] = partial(_png, render, False)
+    for k, one in enumerate(entries):
+        files[f"images/{one.name}"] = partial(_png, partial(render, k), True)
+        files[f"masks/{one.name}"] = partial(_png, partial(render, k), False)
     return files
 
 

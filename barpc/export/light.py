@@ -75,7 +75,7 @@ def dated(scene: Scene, times: Sequence[str], dates: Sequence[str]) -> Scene:
 
 
 def _given(scene: Scene, text: str, flag: str, length: int | None) -> tuple[str, str]:
-    """Return the image, or none, and the time in UTC of what the user gave."""
+    """Return the image, or none, and the time in UTC that a flag states."""
     name, _, stated = text.rpartition("=")
     try:
         when = datetime.fromisoformat(stated)

@@ -21,6 +21,7 @@ from barpc.ba.parameters.priors import CameraPrior
 from barpc.base.errors import RpcError
 from barpc.base.frozen import from_arrays, load_npz, to_arrays
 from barpc.base.options import read_options
+from barpc.base.verb_options import ExportOptions
 from barpc.cameras import open_camera
 from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
@@ -317,11 +318,14 @@ def _report(path: Path) -> object:
     return report_html(read_summary(path.parent), path.parent)
 
 
+_NOON = ExportOptions(time=("2020-06-01T11:30:00",))
+
+
 def _export(path: Path) -> object:
     seal(path.parent)
     with tempfile.TemporaryDirectory() as folder:
         for target in ("satnerf", "cars", "stac", "points"):
-            export_run(path.parent, target, Path(folder) / target)
+            export_run(path.parent, target, Path(folder) / target, _NOON)
     return None
 
 
