@@ -57,10 +57,10 @@ def report(run_dir: str, other: str | None) -> int:
 def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
-    satnerf: JSON an image with the RPC; colmap: central pinhole cameras, for trainers; s2p, cars, asp: a configuration
-    that is ready to run; stac: a collection for catalogues; points: tie points with their covariance. Images are
-    pointed at, relative to OUT_DIR. Exit code 3: nothing is written, as no file states the time that satnerf and stac
-    need.
+    satnerf: JSON for Sat-NeRF and EOGS; colmap: central pinholes for splatting, nerfstudio; s2p, cars, asp: a
+    configuration that is ready to run; stac: a collection for catalogues; points: tie points with their covariance.
+    Images are pointed at, relative to OUT_DIR. Exit code 3: nothing is written, as no file states the time that
+    satnerf and stac need.
 
     \b
     Examples:
