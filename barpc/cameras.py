@@ -29,7 +29,7 @@ from barpc.pointio.correspondences import (
     read_gcp_grid,
     read_grid,
 )
-from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.raster import driver_at, driver_of, earth_crs, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
 from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
@@ -204,7 +204,7 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
 
 
 def _tagged(path: PathOrUrl) -> tuple[Correspondences | None, tuple[int, int] | None]:
-    if driver_of(read_head(path, IMAGE)) is None or (isinstance(path, Path) and scene_beside(path)):
+    if driver_at(path) is None or (isinstance(path, Path) and scene_beside(path)):
         return None, None
     try:
         read_rpc_source(path)
@@ -238,7 +238,7 @@ def _raster_frame(path: PathOrUrl) -> RasterFrame | None:
 
 
 def _frame(dataset: Any) -> RasterFrame:
-    return RasterFrame((int(dataset.width), int(dataset.height)), dataset.transform, dataset.crs)
+    return RasterFrame((int(dataset.width), int(dataset.height)), dataset.transform, earth_crs(dataset))
 
 
 def _open_rpc(path: PathOrUrl, first_pixel: float | None = None, band: int = 1) -> Camera:
@@ -357,7 +357,7 @@ def _open_physical(
     from barpc.sensor.linescan import read_linescan
 
     path = _on_disk(path, f"a {model} model")
-    file = path if driver_of(read_head(path, IMAGE)) is None else metadata_beside(path)
+    file = path if driver_at(path) is None else metadata_beside(path)
     found = read_linescan(file, **choices)
     low, high = _stated_altitudes(file) if altitudes is None else altitudes
     said, doubts = ("", ()) if found.corners is None else corners_off(found.model, found.corners)

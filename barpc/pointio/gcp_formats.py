@@ -34,7 +34,7 @@ from barpc.pointio.tables import (
     read_columns,
     row_of,
 )
-from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.raster import driver_at, driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 
 GCP_NAMES: Names = {
@@ -443,7 +443,7 @@ def _is_binary(text: str) -> bool:
 
 
 def _read_tagged(path: Path) -> GcpTable:
-    if driver_of(read_head(path, TABLE)) is None:
+    if driver_at(path) is None:
         raise InputError(f"{path}: neither a text nor a file of points that is read ({', '.join(GCP_FORMATS)})")
     table, _ = read_tags(path)
     if not table.names:

@@ -19,7 +19,7 @@ import numpy as np
 from barpc.base.errors import BarpcError
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.safe_io import RPC_FILE, read_head
-from barpc.rasters.raster import driver_of
+from barpc.rasters.raster import MOSAICS, driver_at
 from barpc.rpcio.formats import files_of
 from barpc.rpcio.images import SCANNED
 
@@ -86,7 +86,7 @@ def _metadata(image: PathOrUrl | str, camera: PathOrUrl | str | None) -> Iterato
     for file in (holder, *beside):
         with suppress(BarpcError, OSError):
             status = file.stat()
-            of_pixels = driver_of(read_head(file, RPC_FILE, 64)) not in (None, "VRT")
+            of_pixels = driver_at(file) not in (None, *MOSAICS)
             if not of_pixels and (status.st_dev, status.st_ino) not in seen:
                 seen.add((status.st_dev, status.st_ino))
                 yield read_head(file, RPC_FILE, SCANNED)
