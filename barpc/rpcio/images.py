@@ -113,7 +113,8 @@ def _source_element(source: Source, folder: Path | None) -> str:
     name = str(source.file) if folder is None else os.path.relpath(source.file.resolve(), folder)
     parts = [f'<SourceFilename relativeToVRT="{int(folder is not None)}">{escape(name, quote=False)}</SourceFilename>']
     parts += [f"<SourceBand>{'mask,' * source.mask}{source.band}</SourceBand>"]
-    for tag, rect in (("SrcRect", source.src), ("DstRect", source.dst)):
+    whole = (0, 0, *source.dst[2:]) if source.dst else None
+    for tag, rect in (("SrcRect", source.src or whole), ("DstRect", source.dst)):
         frame = " ".join(f'{key}="{n}"' for key, n in zip(("xOff", "yOff", "xSize", "ySize"), rect or (), strict=False))
         parts += [f"<{tag} {frame} />"] * (rect is not None)
     if source.plain:

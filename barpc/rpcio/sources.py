@@ -269,7 +269,7 @@ def _image_source(path: PathOrUrl, driver: str | None, options: ReadOptions) -> 
         source = RpcSource(domain, "domain", path)
     else:
         raise MissingRpcError(
-            f"{path}: {'no RPC in the image' if driver else unknown_kind(path)} and none beside it"
+            f"{path}: {'no RPC in the image and none' if driver else f'{unknown_kind(path)}, and no RPC'} beside it"
             f" (.RPB, _RPC.TXT, .XML, .geom and others){_with_gcps(path)}"
             + ("" if driver else "; write its coefficients as an _RPC.TXT")
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import numpy as np
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.rpc import RPC as GdalRPC
@@ -21,7 +22,7 @@ def pcidsk(path: Path, rpc: RPC | None, *, numbers: int = 20, cells: dict[str, s
 
     Eighty coefficients of 22 characters (`numbers` a list), offsets and scales before them; `cells` are put instead.
     """
-    write_image(path, driver="PCIDSK", **image)
+    path = _written(path, driver="PCIDSK", **image)
     if rpc is None:
         return path
     data = bytearray(path.read_bytes())
@@ -50,8 +51,7 @@ def pcidsk(path: Path, rpc: RPC | None, *, numbers: int = 20, cells: dict[str, s
 
 def envi(path: Path, rpc: RPC | None, more: str = "", **image) -> Path:
     """Raw pixels by GDAL, and the RPC in their header as ENVI has it."""
-    write_image(path, driver="ENVI", **image)
-    path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
+    _written(path, driver="ENVI", **image)
     if rpc is not None:
         fields = fields_from_rpc(rpc)
         values = [v for key in (*OFFSETS, *SCALES, *COEFFICIENTS) for v in fields[key]] + [0, 0, 1]
@@ -64,7 +64,18 @@ def envi(path: Path, rpc: RPC | None, more: str = "", **image) -> Path:
 def jp2(path: Path, rpc: RPC | None, **image) -> Path:
     """A JPEG 2000 with the RPC in its GeoTIFF box."""
     options = {} if rpc is None else {"rpcs": gdal_rpc(rpc)}
-    write_image(path, driver="JP2OpenJPEG", REVERSIBLE="YES", QUALITY="100", **options, **image)
+    return _written(path, driver="JP2OpenJPEG", REVERSIBLE="YES", QUALITY="100", **options, **image)
+
+
+def _written(path: Path, data: np.ndarray | None = None, **profile: object) -> Path:
+    """An image by GDAL of known pixels, or of `data`, and nothing but it and its header."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if data is None:
+        write_image(path, **profile)
+    else:
+        count, height, width = data.shape
+        with rasterio.open(path, "w", count=count, height=height, width=width, dtype=data.dtype, **profile) as out:
+            out.write(data)
     path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
     return path
 
@@ -81,6 +92,14 @@ def seen_by_gdal(path: Path) -> GdalRPC | None:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with rasterio.open(path) as dataset:
             return dataset.rpcs
+
+
+def gdal_pixels(path: Path) -> np.ndarray:
+    """The pixels that rasterio reads."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as dataset:
+            return np.asarray(dataset.read())
 
 
 MAKERS = {"pix": pcidsk, "img": envi, "dat": envi, "jp2": jp2}
