@@ -33,14 +33,11 @@ def header_beside(path: PathOrUrl) -> Path | None:
     """Return the ENVI header beside a raw image, by the names that GDAL looks for; None without one."""
     if not isinstance(path, Path):
         return None
-    for file in (path.with_suffix(end) if whole else Path(f"{path}{end}") for whole in (1, 0) for end in _ENDS):
-        with suppress(BarpcError, ValueError):  # of a name that is a dot or a slash
+    for file in (path.parent / f"{name}{end}" for name in (path.stem, path.name) for end in (".hdr", ".HDR")):
+        with suppress(BarpcError):
             if file.is_file() and read_head(file, _HEADER, 4) == b"ENVI":
                 return file
     return None
-
-
-_ENDS = (".hdr", ".HDR")
 
 
 def _lines_of(header: Path) -> dict[str, str]:
