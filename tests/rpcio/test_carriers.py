@@ -277,10 +277,10 @@ def test_gdal_sees_of_raw_pixels_no_other_file(rpc: RPC, tmp_path: Path) -> None
     """Overviews, masks and metadata beside an image could be, or name, a web service."""
     for end in MAKERS:
         path = MAKERS[end](tmp_path / end / f"x.{end}", rpc)
-        for suffix in (".ovr", ".msk", ".aux.xml", ".sta"):
-            os.mkfifo(f"{path}{suffix}")  # whoever opens it waits for ever
-            if suffix != ".aux.xml":
-                os.mkfifo(path.with_suffix(suffix))
+        beside = [f"{stem}{end}" for stem in ("x", path.name) for end in (".ovr", ".msk", ".sta", ".rrd", ".aux")]
+        for name in (*beside, f"{path.name}.aux.xml", "x.RPB", "x.IMD", "x.XML", "x_RPC.TXT", "x_rpc.txt"):
+            os.mkfifo(path.with_name(name))  # whoever opens it waits for ever
+        assert read_rpc_source(path).format == "domain"
         with open_raster(path) as dataset:
             assert dataset.overviews(1) == []
             assert dataset.read_masks(1).all()
