@@ -2,12 +2,12 @@
 
 Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
 The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
-A function is called as the verb of the command line: `barpc.fit`, `barpc.dsm` and `barpc.export` are folders, too.
+A function is called as the verb of the command line; `barpc.fit`, `barpc.dsm` and `barpc.export` are verbs, and folders
+for `from barpc.fit import ...` alone.
 """
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 
 TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one would cost
@@ -32,7 +32,7 @@ _PUBLIC_MODULES = {
     "barpc.sensor.image_corrections": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
-    "barpc.fit": "fit_rpc fit_rpc_points",
+    "barpc.fit": "RpcFit fit_rpc fit_rpc_points",
     "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
     "barpc.base.verb_options": "DsmOptions",
     "barpc.base.errors": "BarpcError BarpcWarning",
@@ -40,7 +40,6 @@ _PUBLIC_MODULES = {
 _PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
-    from types import ModuleType
     from typing import Any
 
     from barpc.base.errors import BarpcError as BarpcError
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from barpc.base.options import TieOptions as TieOptions
     from barpc.base.verb_options import DsmOptions as DsmOptions
     from barpc.cameras import open_camera as open_camera
+    from barpc.fit import RpcFit as RpcFit
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import AdjustResult as AdjustResult
@@ -81,41 +81,16 @@ if TYPE_CHECKING:
     from barpc.verbs.runs import export as export
     from barpc.verbs.runs import match as match
     from barpc.verbs.runs import verify as verify
-else:
-    ModuleType = type(sys)
-
 __all__ = ["__version__", *sorted(_PUBLIC)]
-_FOLDERS = frozenset({"dsm", "export", "fit"})
-
-
-class _Verb(ModuleType):
-    """A folder with the name of a verb: called, it is the verb."""
-
-    def __call__(self, *args: Any, **keywords: Any) -> Any:
-        return self.__wrapped__(*args, **keywords)
-
-    @property
-    def __wrapped__(self) -> Any:
-        name = self.__name__.rpartition(".")[2]
-        return getattr(import_module(_PUBLIC[name]), name)
-
-
-class _Package(ModuleType):
-    """barpc itself, in which an import of a folder puts it in the place of its verb."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in _FOLDERS and isinstance(value, ModuleType):
-            value.__class__ = _Verb
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+for _folder in ("dsm", "export", "fit"):  # its first import gives a folder its name, which is its verb's from here on
+    import_module(f"{__name__}.{_folder}")
+    globals().pop(_folder, None)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'barpc' has no attribute {name!r}")
-    return import_module(f"barpc.{name}") if name in _FOLDERS else getattr(import_module(_PUBLIC[name]), name)
+    return getattr(import_module(_PUBLIC[name]), name)
 
 
 def __dir__() -> list[str]:

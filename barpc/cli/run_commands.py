@@ -196,7 +196,7 @@ def dsm(source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    from barpc.dsm import NoSurfaceError
+    from barpc.dsm.stereo import NoSurfaceError
     from barpc.report.records import json_form
     from barpc.verbs import runs
 

@@ -19,7 +19,7 @@ from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 
 if TYPE_CHECKING:
-    from barpc.dsm import Surface
+    from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult
     from barpc.pipeline.outputs import Proved
     from barpc.tie.tasks import Progress
@@ -183,7 +183,7 @@ def dsm(
     >>> surface.gsd, surface.known > 1000
     (2.0, True)
     """
-    from barpc.dsm import make_dsm
+    from barpc.dsm.surface import make_dsm
 
     chosen = with_values(options or DsmOptions(), keywords, "dsm")
     given, _ = one_or_many(source)
@@ -235,7 +235,7 @@ def export(
     >>> [path.name for path in barpc.export("finished", "nerf", "satnerf")][:2]
     ['view_00.json', 'view_01.json']
     """
-    from barpc.export import export_run
+    from barpc.export.targets import export_run
 
     chosen = with_values(ExportOptions(), keywords, "export")
     return export_run(run_dir, to, out_dir, alt_range=chosen.alt, overwrite=chosen.overwrite)

@@ -13,6 +13,7 @@ import pytest
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell_result
 from barpc.cli.fit import _certificate
+from barpc.export import targets
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
@@ -257,7 +258,7 @@ def test_an_export_names_its_files_and_says_where_images_stay(
     if vrt:
         (tmp_path / "a.vrt").touch()
     asked = list[Any]()
-    monkeypatch.setattr("barpc.export.export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")])
+    monkeypatch.setattr(targets, "export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")])
     words = ("export", str(tmp_path), "out", "--to", target)
     assert run(*words) == 0
     said = capsys.readouterr()

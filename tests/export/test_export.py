@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.cli import main
-from barpc.export import TARGETS, _link_image, export_run
+from barpc.export.targets import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid

@@ -14,7 +14,7 @@ from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.cli import cli
 from barpc.cli.terminal import print_summary
-from barpc.export import TARGETS
+from barpc.export.targets import TARGETS
 from barpc.report import Run, Summary
 from barpc.report.next_steps import _REPORT_PARTS, next_steps
 from barpc.report.outcome import Added

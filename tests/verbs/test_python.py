@@ -36,12 +36,6 @@ GROUND = [5.4, 43.3, 120.0]
 PUBLIC = [name for name in barpc.__all__ if name != "__version__"]
 
 
-def public(name: str) -> Any:
-    """What stands behind a name: of a folder the verb that it is when called."""
-    found = getattr(barpc, name)
-    return found.__wrapped__ if inspect.ismodule(found) else found
-
-
 def test_a_terrain_gives_points_their_altitudes():
     def plane(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
         return 10.0 * lon + lat
@@ -63,10 +57,10 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
     for verb in set(COMMANDS) - {"report"}:
         command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
         assert command is not None
-        known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *of_options}
+        known = {*positional, *printed, *inspect.signature(getattr(barpc, verb)).parameters, *of_options}
         for flag in command.params:
             name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
-            assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)
+            assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(getattr(barpc, verb)) or ""), (verb, name)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +78,7 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
 )
 def test_what_a_verb_cannot_take_is_refused_by_the_names_of_both(verb, given, keyword, wrong):
     with pytest.raises(InputError, match=rf"^{verb}: .*{keyword}\b") as caught:
-        public(verb)(*given, **{keyword: wrong})
+        getattr(barpc, verb)(*given, **{keyword: wrong})
     assert "\n" not in str(caught.value)
 
 
@@ -101,23 +95,28 @@ def test_a_flag_that_holds_no_number_is_wrong_usage(flag, words):
     assert f"'{flag}'" in found.output
 
 
-def test_folders_that_are_verbs_are_both():
+def test_folders_with_the_name_of_a_verb_do_not_hide_it():
+    """Whichever is imported first, and of `barpc` nothing that costs."""
     code = (
-        "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); first = barpc.fit; "
-        "import barpc.fit.methods as m, barpc.dsm; from barpc.export import TARGETS; from barpc import fit; "
-        "assert first is fit is barpc.fit is sys.modules['barpc.fit']; assert barpc.fit.methods is m; "
-        "import inspect; assert 'alt_range' in inspect.getdoc(barpc.fit.__wrapped__); "
-        "print(*map(callable, (barpc.fit, barpc.dsm, barpc.export, barpc.ba, barpc.sensor)))"
+        "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); "
+        "from barpc.fit import methods, fit_rpc; import barpc.dsm.surface, barpc.export.targets; "
+        "from barpc import fit; "
+        "assert fit is barpc.fit and fit_rpc is barpc.fit_rpc and methods is sys.modules['barpc.fit.methods']; "
+        "import importlib; importlib.reload(barpc); from barpc.fit.points import terrain_range; "
+        "help(barpc.fit); print(barpc.fit.__name__, barpc.dsm.__name__, barpc.export.__name__)"
     )
     done = subprocess.run(
         [sys.executable, "-S", "-c", f"import site; site.main(); {code}"], capture_output=True, text=True
     )
-    assert done.stdout.split() == ["True"] * 3 + ["False"] * 2, done.stderr
+    *told, names = done.stdout.splitlines() or [done.stderr]
+    assert names == "fit dsm export", done.stderr
+    assert told[0] == "Help on function fit in module barpc.verbs.fitting:"
+    assert "alt_range" in done.stdout
 
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_every_public_name_says_what_it_returns_and_shows_how(name):
-    thing = public(name)
+    thing = getattr(barpc, name)
     text = inspect.getdoc(thing) or ""
     if inspect.isfunction(thing):
         assert re.search(r"^Returns\n-------$", text, re.MULTILINE), name
@@ -398,7 +397,8 @@ def test_jobs_are_processes_a_cluster_or_the_executor_given(monkeypatch):
 
 def test_a_verb_works_in_the_process_that_calls_it_unless_told_otherwise():
     """Processes of its own need a script behind `if __name__ == "__main__":`."""
-    defaults = {name: inspect.signature(public(name)).parameters.get("jobs") for name in COMMANDS if name in PUBLIC}
+    verbs = {name: getattr(barpc, name) for name in COMMANDS if name in PUBLIC}
+    defaults = {name: inspect.signature(verb).parameters.get("jobs") for name, verb in verbs.items()}
     found = {name: parameter.default for name, parameter in defaults.items() if parameter is not None}
     assert set(found) >= {"adjust", "match", "check", "dsm"}
     assert set(found.values()) == {1}
