@@ -90,7 +90,10 @@ for _folder in ("dsm", "export", "fit"):  # its first import gives a folder its 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'barpc' has no attribute {name!r}")
-    return getattr(import_module(_PUBLIC[name]), name)
+    found = getattr(import_module(_PUBLIC[name]), name)
+    if type(found) is type(__getattr__):
+        found = import_module("barpc.verbs.python").of_python(found)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:

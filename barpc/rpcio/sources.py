@@ -6,6 +6,7 @@ barpc sees the camera that every other tool sees. What it found, and what it pas
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -165,7 +166,7 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
                     yield found, image, read_rpc(image)
 
 
-def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
+def read_rpc(path: str | os.PathLike[str], *, first_pixel: float | None = None, band: int = 1) -> RPC:
     """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too.
 
     Parameters
@@ -189,7 +190,7 @@ def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
 
 
-def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
+def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
     """Read the RPC of an image or of an RPC file, and where it came from.
 
     For an image: the vendor's file beside it, the RPC in the image, GDAL's ``.aux.xml``, OSSIM's ``.geom``,

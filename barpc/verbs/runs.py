@@ -19,23 +19,25 @@ from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
     from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult
     from barpc.pipeline.outputs import Proved
     from barpc.tie.tasks import Progress
 
-PathLike = str | Path
-
 
 def adjust(
     images: ImageLike | Iterable[ImageLike],
+    /,
     out_dir: PathLike,
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Correct the cameras of overlapping images and write fresh RPCs.
 
@@ -76,13 +78,14 @@ def adjust(
 
 def match(
     images: ImageLike | Iterable[ImageLike],
+    /,
     out_dir: PathLike,
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Match tie points and stop, for ``adjust(..., matches=...)`` and other tools.
 
@@ -112,12 +115,13 @@ def match(
 
 def check(
     images: ImageLike | Iterable[ImageLike],
+    /,
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
 
@@ -153,7 +157,7 @@ def dsm(
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[DsmKeywords],
 ) -> Surface:
     """Make a first surface model of a finished run, or of images with their cameras.
 
@@ -191,7 +195,7 @@ def dsm(
     if run is None and chosen.minus is not None:
         raise UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
     with executor_for(jobs, executor) as workers:
-        return make_dsm(run or every(given), out, chosen, executor=workers, progress=progress)
+        return make_dsm(run or every(given), os.fspath(out), chosen, executor=workers, progress=progress)
 
 
 def run_folder(source: Sequence[Any]) -> Path | None:
@@ -207,7 +211,7 @@ def export(
     run_dir: PathLike,
     out_dir: PathLike,
     to: str,
-    **keywords: Any,
+    **keywords: Unpack[ExportKeywords],
 ) -> list[Path]:
     """Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
@@ -238,7 +242,7 @@ def export(
     from barpc.export.targets import export_run
 
     chosen = with_values(ExportOptions(), keywords, "export")
-    return export_run(run_dir, to, out_dir, alt_range=chosen.alt, overwrite=chosen.overwrite)
+    return export_run(Path(run_dir), to, Path(out_dir), alt_range=chosen.alt, overwrite=chosen.overwrite)
 
 
 def verify(
@@ -246,7 +250,7 @@ def verify(
     places: PathLike | Sequence[PathLike] = (),
     *,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[VerifyKeywords],
 ) -> list[Proved]:
     """Compare the files of a run or export with its SHA256SUMS, and its cameras with those certified.
 

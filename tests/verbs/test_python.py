@@ -18,6 +18,7 @@ from click.testing import CliRunner
 from rasterio.io import MemoryFile
 
 import barpc
+from barpc.base import keywords
 from barpc.base.declarations import Options, declared
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
@@ -28,6 +29,8 @@ from barpc.simulate import simulate_block
 from barpc.verbs.images import every
 from barpc.verbs.options import FLAG_NAMES, run_options
 from barpc.verbs.points import with_altitudes
+from barpc.verbs.python import in_keywords
+from tests.docs.test_pages import script
 from tests.rpcio.conftest import make_rpc
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
@@ -101,7 +104,8 @@ def test_folders_with_the_name_of_a_verb_do_not_hide_it():
         "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); "
         "from barpc.fit import methods, fit_rpc; import barpc.dsm.surface, barpc.export.targets; "
         "from barpc import fit; "
-        "assert fit is barpc.fit and fit_rpc is barpc.fit_rpc and methods is sys.modules['barpc.fit.methods']; "
+        "assert fit is barpc.fit and methods is sys.modules['barpc.fit.methods']; "
+        "assert fit_rpc is barpc.fit_rpc.__wrapped__; "
         "import importlib; importlib.reload(barpc); from barpc.fit.points import terrain_range; "
         "help(barpc.fit); print(barpc.fit.__name__, barpc.dsm.__name__, barpc.export.__name__)"
     )
@@ -124,6 +128,83 @@ def test_every_public_name_says_what_it_returns_and_shows_how(name):
         assert re.search(r"^Examples\n--------\n>>> ", text, re.MULTILINE), name
 
 
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda out: barpc.adjust(VIEWS, out), r"exists and is not empty; give overwrite=True or another out_dir$"),
+        (lambda out: barpc.dsm(VIEWS, out), r"another out$|out the name of a new file"),
+        (
+            lambda out: barpc.convert(VIEWS, out_dir=out, window=(0, 0, 9, 9)),
+            "^window goes with a TARGET, not with out",
+        ),
+        (lambda out: barpc.localize(VIEWS[0], [5, 5], 1.0, dem=out), "^give either alt or dem$"),
+        (lambda out: barpc.verify(out, expect="12"), "^verify: expect 12: a root has 64"),
+        (lambda out: barpc.adjust(VIEWS[:1], out / "new"), r"ground control points \(gcp\)"),
+        (lambda out: barpc.adjust(["https://a.b/c.tif"] * 2, out / "new"), "give allow_remote a.b"),
+        (lambda out: barpc.info(VIEWS[0], at=(43.3, 5.4, 0.0), alt=0.0), r"^at \(43.3"),
+    ],
+)
+def test_errors_speak_of_keywords(call, words, tmp_path):
+    (tmp_path / "own.txt").touch()
+    with pytest.raises(BarpcError, match=words) as caught:
+        call(tmp_path)
+    assert not re.search(r"(?<!\w)--?[a-z]", str(caught.value).replace(str(tmp_path), ""))
+
+
+def test_commands_and_names_of_files_in_errors_stay_as_they_are():
+    said = "/a --gcp/b--dem.tif, x-o.tif: see 'barpc fit --keep-going', --no-such; give --gcp FILE, -j 2"
+    assert in_keywords(said, "out") == said.replace("give --gcp", "give gcp").replace("-j 2", "jobs 2").replace(
+        "/a --gcp/", "/a gcp/")  # fmt: skip
+
+
+def test_a_warning_points_at_the_line_of_the_caller():
+    calls = (
+        lambda: barpc.project(VIEWS[0], [6.4, 44.3, 120.0]),
+        lambda: barpc.localize(VIEWS[0], [500, 500]),
+    )
+    for call in calls:
+        with pytest.warns(BarpcWarning) as caught:
+            call()
+        assert {one.filename for one in caught} == {__file__}
+
+
+# --- types ------------------------------------------------------------------------------------------------
+
+
+def test_the_keywords_are_what_the_records_declare():
+    """And as the generator writes them: the file is no second declaration."""
+    assert script("generate_options").keywords() == Path(keywords.__file__).read_text()
+    of_run = {name for table in (RunOptions, TieOptions, AdjustOptions, FitOptions) for name in declared(table)}
+    assert keywords.RunKeywords.__annotations__.keys() == of_run | set(FLAG_NAMES.values())
+    for verb in PUBLIC:
+        taken = inspect.signature(getattr(barpc, verb)).parameters.get("keywords") if verb in COMMANDS else None
+        assert taken is None or re.fullmatch(r"Unpack\[\w+Keywords\]", taken.annotation), verb
+
+
+CALLS = """
+import barpc, os, pathlib
+barpc.adjust("a.tif", pathlib.Path("out"), gcp=["a.csv", pathlib.Path("b.csv")], drift=None, images="copy")
+barpc.dsm("run", "out.tif", gsd=2, alt=(0.0, 9.0))
+barpc.fit("a.tif", alt_range=[0, 400], method="ridge")
+barpc.adjust("a.tif", "out", gpc="a.csv")
+barpc.adjust("a.tif", "out", loss="huber")
+barpc.dsm("run", "out.tif", gsd="2")
+barpc.export("run", "out", "s2p", alt_range=(1.0, 2.0))
+barpc.fit("a.tif", matcher="guided")
+"""
+
+
+@pytest.mark.nightly
+def test_mypy_refuses_keywords_that_are_none(tmp_path):
+    """A minute where nothing is cached."""
+    mypy = pytest.importorskip("mypy.api")
+    (tmp_path / "calls.py").write_text(CALLS)
+    told, _, code = mypy.run([str(tmp_path / "calls.py"), "--follow-imports=silent"])
+    wrong = [int(line.split(":")[1]) for line in told.splitlines() if ": error:" in line]
+    assert (code, wrong) == (1, [6, 7, 8, 9, 10]), told
+    assert 'Unexpected keyword argument "gpc" for "adjust"' in told
+
+
 # --- images -----------------------------------------------------------------------------------------------
 
 
@@ -142,6 +223,42 @@ def test_a_path_a_dataset_a_view_and_a_camera_are_one_image():
     assert every(path for path in VIEWS) == list(map(str, VIEWS))
     with pytest.raises(InputError, match="3 is no image: give a path"):
         open_camera(3)
+
+
+class Place:
+    """A path as other libraries have it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+
+def test_open_datasets_and_other_peoples_paths_are_files_everywhere(tmp_path):
+    profile = {"driver": "GTiff", "width": 8, "height": 8, "count": 1, "dtype": "float32", "crs": "EPSG:4326+4979"}
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", **profile, transform=rasterio.Affine(0.01, 0, 5.36, 0, -0.01, 43.34)
+    ) as file:
+        file.write(np.full((1, 8, 8), 120.0, np.float32))
+    expected = barpc.localize(VIEWS[0], [[500, 500]], 120.0)
+    with rasterio.open(VIEWS[0]) as image, rasterio.open(tmp_path / "dem.tif") as dem:
+        for given, terrain in ((image, dem), (Place(VIEWS[0]), Place(tmp_path / "dem.tif")), (VIEWS[0], [dem])):
+            np.testing.assert_allclose(
+                barpc.localize(given, [[500, 500]], dem=terrain, geoid="none"), expected, rtol=0, atol=1e-4
+            )
+            assert barpc.read_rpc(given) == barpc.read_rpc(VIEWS[0])
+            assert barpc.info(given, dem=terrain, geoid="none")["center_alt_m"] == pytest.approx(120.0)
+            barpc.write_rpc(barpc.read_rpc(given), Place(tmp_path / "a.RPB"), overwrite=True)
+        assert barpc.fit(image, Place(tmp_path / "f_RPC.TXT"), dem=[dem], geoid="none").max_ckp.max() < 0.01
+    assert barpc.convert(Place(VIEWS[0]), Place(tmp_path / "b.RPB")).passed
+    assert run_options(Place(write(tmp_path / "o.toml", "[tie]\nband = 2\n"))).tie.band == 2
+
+
+def write(path: Path, text: str) -> Path:
+    """A file with a text."""
+    path.write_text(text)
+    return path
 
 
 def test_a_dataset_in_memory_has_no_file_that_can_be_read():
@@ -277,9 +394,9 @@ def test_an_altitude_that_is_assumed_is_said_and_two_contradict():
     with pytest.warns(Remark, match="terrain height unknown, 250 m assumed"):
         found = barpc.localize(VIEWS[0], [500, 500])
     assert found[2] == 250.0
-    with pytest.raises(UsageError, match="either --alt or --dem"):
+    with pytest.raises(UsageError, match="either alt or dem"):
         barpc.localize(VIEWS[0], [500, 500], 120.0, dem="a.tif")
-    with pytest.raises(UsageError, match="--geoid goes with --dem"):
+    with pytest.raises(UsageError, match="geoid goes with dem"):
         barpc.project(VIEWS[0], GROUND, geoid="egm96")
     with pytest.raises(InputError, match=r"image points of shape \(2, 2\) for 3 images: \(\.\.\., 3, 2\)"):
         barpc.triangulate(VIEWS, np.zeros((2, 2)))
@@ -335,7 +452,7 @@ def test_what_is_converted_is_a_sentence_with_the_worst_reader(tmp_path):
     assert number is not None
     assert 0 <= float(number[1]) < 1e-9
     assert float(number[1]) == float(f"{max(one.max_error for one in done.readings):.1g}")
-    with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and -o DIR"):
+    with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and out_dir DIR"):
         barpc.convert(VIEWS, tmp_path / "a.RPB")
     with pytest.raises(InputError, match=r"unknown option 'windw'; known are .*window"):
         barpc.convert(VIEWS[0], tmp_path / "a.tif", windw=(0, 0, 9, 9))
