@@ -2,8 +2,8 @@
 
 Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
 The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
-A function is called as the verb of the command line; `barpc.fit`, `barpc.dsm` and `barpc.export` are verbs, and folders
-for `from barpc.fit import ...` alone.
+A function is called as the verb of the command line; `barpc.fit`, `dsm`, `export` and `report` are verbs, and
+folders for `from barpc.fit import ...` alone.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one w
 __version__ = "0.4.0"
 
 _PUBLIC_MODULES = {
-    "barpc.verbs.runs": "adjust check dsm export match verify",
+    "barpc.verbs.runs": "adjust check dsm export match open_run report verify",
     "barpc.verbs.points": "localize project triangulate",
     "barpc.verbs.converting": "convert",
     "barpc.verbs.describe": "info",
     "barpc.verbs.fitting": "fit",
     "barpc.verbs.orthoimages": "ortho",
     "barpc.pipeline.calibrate": "calibrate",
-    "barpc.pipeline": "AdjustResult",
+    "barpc.pipeline": "AdjustResult OpenedRun",
     "barpc.cameras": "open_camera",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.rpc": "RPC",
@@ -35,7 +35,7 @@ _PUBLIC_MODULES = {
     "barpc.fit": "RpcFit fit_rpc fit_rpc_points",
     "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
     "barpc.base.verb_options": "DsmOptions",
-    "barpc.base.errors": "BarpcError BarpcWarning",
+    "barpc.base.errors": "BarpcError BarpcWarning ReservationError",
 }
 _PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
 
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     from barpc.base.errors import BarpcError as BarpcError
     from barpc.base.errors import BarpcWarning as BarpcWarning
+    from barpc.base.errors import ReservationError as ReservationError
     from barpc.base.options import AdjustOptions as AdjustOptions
     from barpc.base.options import FitOptions as FitOptions
     from barpc.base.options import RunOptions as RunOptions
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import AdjustResult as AdjustResult
+    from barpc.pipeline import OpenedRun as OpenedRun
     from barpc.pipeline.calibrate import calibrate as calibrate
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
@@ -80,9 +82,11 @@ if TYPE_CHECKING:
     from barpc.verbs.runs import dsm as dsm
     from barpc.verbs.runs import export as export
     from barpc.verbs.runs import match as match
+    from barpc.verbs.runs import open_run as open_run
+    from barpc.verbs.runs import report as report
     from barpc.verbs.runs import verify as verify
 __all__ = ["__version__", *sorted(_PUBLIC)]
-for _folder in ("dsm", "export", "fit"):  # its first import gives a folder its name, which is its verb's from here on
+for _folder in ("dsm", "export", "fit", "report"):  # its first import takes the name, its verb's from here on
     import_module(f"{__name__}.{_folder}")
     globals().pop(_folder, None)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from barpc.base.errors import InputError, OutputError
+from barpc.base.keywords import PathLike
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
 from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
@@ -28,9 +29,9 @@ TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
 
 
 def export_run(
-    folder: Path | str,
+    folder: PathLike,
     target: str,
-    out: Path | str,
+    out: PathLike,
     *,
     alt_range: tuple[float, float] | None = None,
     overwrite: bool = False,

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
@@ -20,8 +19,7 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consist
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
-from barpc.base.frozen import html_table
-from barpc.base.geodesy import ground_from_ecef
+from barpc.base.geodesy import feature_collection, ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
 from barpc.base.remote import here
@@ -48,8 +46,9 @@ from barpc.pipeline.inputs import (
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures
+from barpc.pipeline.results import RunResult
 from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
@@ -57,10 +56,8 @@ from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
-from barpc.report.records import json_form, table
-from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE
+from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE, outline_features
 from barpc.report.summary import InputEntry, StageEntry
-from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import plain_source
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
@@ -75,7 +72,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AdjustResult:
+class AdjustResult(RunResult):
     """The result of a run.
 
     Parameters
@@ -99,29 +96,6 @@ class AdjustResult:
     record: Summary
     root: str = ""
 
-    @cached_property
-    def summary(self) -> dict[str, Any]:
-        """Content of summary.json."""
-        found: dict[str, Any] = json_form(self.record)
-        return found
-
-    def __repr__(self) -> str:
-        tracks, place = self.run.tracks, self.run.out_dir
-        counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
-        written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
-        return f"AdjustResult({self.run.kind}: {counts}, {self.record.status}{written})"
-
-    def _repr_html_(self) -> str:
-        record, adjusted = self.record, self.record.adjusted
-        shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
-        heads, *rows = shown.texts
-        return html_table(shown.caption, rows, heads)
-
-    @property
-    def passed(self) -> bool:
-        """Whether every image was used and every quality gate met."""
-        return self.record.passed
-
     @property
     def adjustment(self) -> Adjustment:
         """The adjustment itself; its views are `run.views`."""
@@ -133,14 +107,9 @@ class AdjustResult:
         """The tie points; `Tracks.view` counts `run.views`."""
         return self.run.tracks
 
-    def report(self) -> Path:
-        """Make report.html of this run again from the files in its folder (extra `report`); return its path.
-
-        A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
-        """
-        if not self.run.out_dir:
-            raise InputError("a check writes no files, so there is nothing to make a report of")
-        return remake_report(Path(self.run.out_dir))
+    def to_geojson(self) -> dict[str, Any]:
+        """Return the outlines of the images with their figures, as GeoJSON."""
+        return feature_collection(outline_features(self.run, self.record))
 
 
 @one_blas_thread()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from barpc import pipeline
 from barpc.base.declarations import with_values
-from barpc.base.errors import UsageError
+from barpc.base.errors import ReservationError, UsageError
 from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
 from barpc.cameras import ImageLike
 from barpc.verbs.images import every, one_or_many
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
     from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult
-    from barpc.pipeline.outputs import Proved
+    from barpc.pipeline.outputs import Verification
+    from barpc.pipeline.results import OpenedRun
     from barpc.tie.tasks import Progress
 
 
@@ -34,6 +35,7 @@ def adjust(
     out_dir: PathLike,
     options: OptionsLike = None,
     *,
+    check: bool = False,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
@@ -48,6 +50,7 @@ def adjust(
         `barpc.open_camera`; a View brings its own model (a frozen dataclass, so that results can be cached).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``, ``report.html``
     options : RunOptions, mapping as of a TOML file, or path of one; None: the defaults
+    check : bool, raise ReservationError where the result has not `passed`: the files are written, and are its `result`
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
     jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
         ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
@@ -73,7 +76,10 @@ def adjust(
     """
     chosen, where = run_options(options, **keywords), os.fspath(out_dir)
     with executor_for(jobs, executor) as workers:
-        return pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
+        done = pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
+    if check and not done.passed:
+        raise ReservationError(" ".join((done.record.headline, *done.record.reasons)), done)
+    return done
 
 
 def match(
@@ -242,7 +248,74 @@ def export(
     from barpc.export.targets import export_run
 
     chosen = with_values(ExportOptions(), keywords, "export")
-    return export_run(Path(run_dir), to, Path(out_dir), alt_range=chosen.alt, overwrite=chosen.overwrite)
+    return export_run(run_dir, to, out_dir, alt_range=chosen.alt, overwrite=chosen.overwrite)
+
+
+def open_run(run_dir: PathLike) -> OpenedRun:
+    """Open a finished run: what `adjust` or `match` returned, from the files in its folder.
+
+    Parameters
+    ----------
+    run_dir : path of a finished run
+
+    Returns
+    -------
+    OpenedRun, with `views`, `tracks`, `tables`, `summary`, `record`, `passed`, `report()`, `to_geojson()`
+
+    Raises
+    ------
+    InputError
+        The folder holds no finished run, or a file that is asked for was changed since.
+
+    Examples
+    --------
+    >>> _ = barpc.match("data_samples/view_0[01].tif", "opened", points_per_image=500)
+    >>> run = barpc.open_run("opened")
+    >>> len(run.tracks) == len(run.tables.observations.xy), run.summary["kind"]
+    (True, 'match')
+    """
+    from barpc.pipeline.results import OpenedRun
+
+    return OpenedRun.open(Path(run_dir))
+
+
+def report(run_dir: PathLike, *others: PathLike, csv: bool = False) -> Any:
+    """Make report.html of a finished run again, compare two runs, or list any number of runs.
+
+    Parameters
+    ----------
+    run_dir, *others : path of a finished run; of two to compare, of the same images; with `csv` of any number
+    csv : bool, a row for each run instead
+
+    Returns
+    -------
+    Path, of report.html; of two runs a dict, the figures of `barpc report --json A B`; with `csv` a list of dicts, the
+    rows of `barpc report --csv`: verdict, figures and reasons of each run
+
+    Raises
+    ------
+    InputError
+        No finished run, or one that was changed since; with `csv` its `status` is "none", with the reason.
+
+    Examples
+    --------
+    >>> _ = barpc.match("data_samples/view_0[01].tif", "listed", points_per_image=500)
+    >>> [(row["status"], row["images"]) for row in barpc.report("listed", "data_samples", csv=True)]
+    [('good', 2), ('none', None)]
+    """
+    if csv:
+        from barpc.report.overview import overview
+
+        return overview((run_dir, *others))
+    if len(others) > 1:
+        raise UsageError(f"{len(others) + 1} runs: give one, two to compare, or any number with --csv")
+    if others:
+        from barpc.report.compare import compare_runs
+
+        return compare_runs(run_dir, *others)
+    from barpc.pipeline.outputs import remake_report
+
+    return remake_report(run_dir)
 
 
 def verify(
@@ -251,7 +324,7 @@ def verify(
     *,
     progress: Progress | None = None,
     **keywords: Unpack[VerifyKeywords],
-) -> list[Proved]:
+) -> Verification:
     """Compare the files of a run or export with its SHA256SUMS, and its cameras with those certified.
 
     Parameters
@@ -264,7 +337,7 @@ def verify(
 
     Returns
     -------
-    list of Proved, a file each: `kind`, `file`, `now`, `note`, `passed`
+    Verification, a tuple of a row for each file: `kind`, `file`, `now`, `note`, `passed`; false where one has changed
 
     Raises
     ------
@@ -274,10 +347,10 @@ def verify(
     Examples
     --------
     >>> _ = barpc.match("data_samples/view_0[01].tif", "tied", points_per_image=500)
-    >>> all(one.passed for one in barpc.verify("tied"))
-    True
+    >>> barpc.verify("tied")
+    Verification(... files, none has changed)
     """
-    from barpc.pipeline.outputs import prove
+    from barpc.pipeline.outputs import Verification, prove
 
     chosen = with_values(VerifyOptions(), keywords, "verify")
     folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect
@@ -286,4 +359,4 @@ def verify(
         from barpc.verbs.figures import reread_figures
 
         found += reread_figures(Path(run_dir))
-    return found
+    return Verification(found)
