@@ -15,14 +15,14 @@ TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one w
 __version__ = "0.4.0"
 
 _PUBLIC_MODULES = {
-    "barpc.verbs.runs": "adjust check dsm export match open_run report verify",
+    "barpc.verbs.runs": "adjust check dsm export match open_run plan report verify",
     "barpc.verbs.points": "localize project triangulate",
     "barpc.verbs.converting": "convert",
     "barpc.verbs.describe": "info",
     "barpc.verbs.fitting": "fit",
     "barpc.verbs.orthoimages": "ortho",
     "barpc.pipeline.calibrate": "calibrate",
-    "barpc.pipeline": "AdjustResult OpenedRun",
+    "barpc.pipeline": "AdjustResult OpenedRun Plan",
     "barpc.cameras": "open_camera",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.rpc": "RPC",
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import AdjustResult as AdjustResult
     from barpc.pipeline import OpenedRun as OpenedRun
+    from barpc.pipeline import Plan as Plan
     from barpc.pipeline.calibrate import calibrate as calibrate
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
     from barpc.verbs.runs import export as export
     from barpc.verbs.runs import match as match
     from barpc.verbs.runs import open_run as open_run
+    from barpc.verbs.runs import plan as plan
     from barpc.verbs.runs import report as report
     from barpc.verbs.runs import verify as verify
 __all__ = ["__version__", *sorted(_PUBLIC)]

@@ -29,7 +29,7 @@ TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": Fit
 
 HEAD = """# Options
 
-<!-- Written by docs/generate_options.py. Edit barpc/base/options.py, verb_options.py and the verbs' help texts, then run it again. -->
+<!-- Written by docs/generate_options.py from barpc/base/options.py, verb_options.py and the verbs. -->
 
 Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong
 type or a value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
@@ -42,14 +42,12 @@ rpc_formats = ["txt", "geom"]
 points_per_image = 8000
 ```
 
-From Python the same, with the records named in the headings (`barpc.base.declarations.schema(barpc.RunOptions)`: the JSON
-schema of such a file):
+From Python the same, as keywords of `barpc.adjust` or with the records named in the headings:
 
 ```python
 import barpc
 
-options = barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
-print(options)  # what differs from the defaults
+barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
 ```
 """
 

@@ -1,4 +1,4 @@
-"""Results of runs: what a run that has just ended and one opened from its folder have in common; `OpenedRun`."""
+"""Results of runs, in memory and opened from folders: their common base, and `OpenedRun`."""
 
 from __future__ import annotations
 

@@ -48,6 +48,7 @@ from barpc.pipeline.inputs import (
 from barpc.pipeline.loading import Image, image_path, load_views
 from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures
+from barpc.pipeline.planning import Plan, planned
 from barpc.pipeline.results import RunResult
 from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
@@ -64,6 +65,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
+from barpc.tie.pairing.overlaps import Pair, best_pairs, possible_pairs
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, timed
@@ -277,6 +279,29 @@ def check(
     if (found := _agreeing(run, options.adjust)) is not None:
         run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
+
+
+def plan(
+    images: Sequence[Image],
+    out_dir: str | Path | None = None,
+    options: RunOptions | None = None,
+    *,
+    processes: int = 1,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Plan:
+    """Return the plan of `adjust`; files are opened as there, and nothing is matched or written."""
+    options = with_located(options or RunOptions())
+    run = _with_views("adjust", images, options, Work(executor, progress))
+    if out_dir is not None:
+        names, keep = _planned_files(run, options, Path(out_dir))
+        Workspace.require_free(out_dir, options.overwrite, keep, names)
+    dem, pairs = side_inputs(options, run.views), list[Pair]()
+    if len(run.views) > 1 and not options.matches_only:
+        scope = _scope(run, options, dem)
+        pairs = possible_pairs(run.views, options.tie, scope)
+        pairs = pairs if scope.only else best_pairs(pairs, len(run.views), options.tie.neighbours)
+    return planned(run, options, dem, pairs, processes)
 
 
 def _agreeing(run: Run, options: AdjustOptions) -> BoolArray | None:
@@ -499,14 +524,7 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    old = _is_old(run)
-    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
-    if options.overlap_list is not None:
-        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
-    elif run.earlier is not None:
-        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
-    if options.aoi is not None:
-        scope = replace(scope, area=read_area(options.aoi))
+    scope = _scope(run, options, terrain)
     if options.matches:
         scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
     try:
@@ -520,6 +538,17 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return _with_ties(kept, options, work, terrain)
     detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
     return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
+
+
+def _scope(run: Run, options: RunOptions, terrain: Dem | None) -> Scope:
+    """Return the pairs and the area in which tie points are looked for."""
+    views, old = run.views, _is_old(run)
+    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
+    if options.overlap_list is not None:
+        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
+    elif run.earlier is not None:
+        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
+    return scope if options.aoi is None else replace(scope, area=read_area(options.aoi))
 
 
 def _with_own_cameras(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:

@@ -32,7 +32,7 @@ def of_python(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _file(value: Any) -> Any:
-    """Return the path of an open dataset, or of what stands for a path, also in a list; anything else as it is."""
+    """Return the path of an open dataset or path-like object, also in a list; anything else as it is."""
     if type(value) in (list, tuple):
         return type(value)(map(_file, value))
     if isinstance(value, os.PathLike) and not isinstance(value, PurePath):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
     from barpc.dsm.surface import Surface
-    from barpc.pipeline import AdjustResult
+    from barpc.pipeline import AdjustResult, Plan
     from barpc.pipeline.outputs import Verification
     from barpc.pipeline.results import OpenedRun
     from barpc.tie.tasks import Progress
@@ -55,7 +55,8 @@ def adjust(
     jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
         ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``
+    **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``;
+        for dry_run see `barpc.plan`
 
     Returns
     -------
@@ -80,6 +81,46 @@ def adjust(
     if check and not done.passed:
         raise ReservationError(" ".join((done.record.headline, *done.record.reasons)), done)
     return done
+
+
+def plan(
+    images: ImageLike | Iterable[ImageLike],
+    /,
+    out_dir: PathLike | None = None,
+    options: OptionsLike = None,
+    *,
+    executor: Executor | None = None,
+    jobs: int | str = 1,
+    progress: Progress | None = None,
+    **keywords: Unpack[RunKeywords],
+) -> Plan:
+    """Return the plan of `barpc.adjust`: pairs, time, memory, the datum assumed, doubts on the input.
+
+    Parameters
+    ----------
+    images, options, executor, jobs, progress, **keywords : as of `barpc.adjust`; all files are opened as there
+    out_dir : path, optional, where results are to go: what is in the way there is said
+
+    Returns
+    -------
+    Plan; nothing is matched or written
+
+    Raises
+    ------
+    BarpcError
+        As of `barpc.adjust`, before it starts to match.
+
+    Examples
+    --------
+    >>> found = barpc.plan("data_samples/*.tif", points_per_image=500)
+    >>> found.views, found.doubts
+    (('view_00', 'view_01', 'view_02'), ())
+    """
+    chosen, processes = run_options(options, **keywords), jobs + (jobs > 1) if isinstance(jobs, int) else 1
+    where = None if out_dir is None else os.fspath(out_dir)
+    with executor_for(jobs, executor) as workers:
+        how: dict[str, Any] = {"processes": processes, "executor": workers, "progress": progress}
+        return pipeline.plan(every(images), where, chosen, **how)
 
 
 def match(
@@ -252,7 +293,7 @@ def export(
 
 
 def open_run(run_dir: PathLike) -> OpenedRun:
-    """Open a finished run: what `adjust` or `match` returned, from the files in its folder.
+    """Open a finished run: the result of `adjust` or `match`, from the files in its folder.
 
     Parameters
     ----------
