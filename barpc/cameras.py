@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
@@ -28,11 +29,11 @@ from barpc.pointio.correspondences import (
     read_gcp_grid,
     read_grid,
 )
-from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.raster import driver_at, driver_of, earth_crs, open_raster
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.grids import SIGN, read_correction
-from barpc.rpcio.plausible import RasterFrame, doubts_of
-from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical
+from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
+from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical, scene_beside
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
@@ -203,7 +204,7 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
 
 
 def _tagged(path: PathOrUrl) -> tuple[Correspondences | None, tuple[int, int] | None]:
-    if driver_of(read_head(path, IMAGE)) is None:
+    if driver_at(path) is None or (isinstance(path, Path) and scene_beside(path)):
         return None, None
     try:
         read_rpc_source(path)
@@ -237,7 +238,7 @@ def _raster_frame(path: PathOrUrl) -> RasterFrame | None:
 
 
 def _frame(dataset: Any) -> RasterFrame:
-    return RasterFrame((int(dataset.width), int(dataset.height)), dataset.transform, dataset.crs)
+    return RasterFrame((int(dataset.width), int(dataset.height)), dataset.transform, earth_crs(dataset))
 
 
 def _open_rpc(path: PathOrUrl, first_pixel: float | None = None, band: int = 1) -> Camera:
@@ -335,10 +336,19 @@ def _interval(text: str) -> tuple[float, float]:
 
 
 def _is_physical(path: PathOrUrl, head: bytes, choices: Mapping[str, Any]) -> bool:
-    """Return whether the physical model is asked for, or is all that an XML holds."""
+    """Return whether the physical model is asked for, or is all that an XML, or an image of a SPOT scene, has."""
     if "model" in choices or not isinstance(path, Path):
         return choices.get("model") == "physical"
-    return _has_vendor_root(head) is not None and only_physical(path)
+    if driver_of(head) is None:
+        return _has_vendor_root(head) is not None and only_physical(path)
+    return scene_beside(path) is not None and not _has_rpc(path)
+
+
+def _has_rpc(path: Path) -> bool:
+    with suppress(MissingRpcError):
+        read_rpc_source(path)
+        return True
+    return False
 
 
 def _open_physical(
@@ -347,10 +357,11 @@ def _open_physical(
     from barpc.sensor.linescan import read_linescan
 
     path = _on_disk(path, f"a {model} model")
-    file = path if driver_of(read_head(path, IMAGE)) is None else metadata_beside(path)
+    file = path if driver_at(path) is None else metadata_beside(path)
     found = read_linescan(file, **choices)
     low, high = _stated_altitudes(file) if altitudes is None else altitudes
-    return Camera(found.model, file, found.kind, found.size, (low, high))
+    said, doubts = ("", ()) if found.corners is None else corners_off(found.model, found.corners)
+    return Camera(found.model, file, found.kind, found.size, (low, high), (said,) if said else (), doubts)
 
 
 def _stated_altitudes(file: Path) -> tuple[float, float]:
@@ -384,6 +395,7 @@ OPENERS: dict[str, Opener] = {
             "model": str,
             "band": str,
             "altitudes": _interval,
+            "attitudes": str,
             **dict.fromkeys(("aberration", "refraction"), _YES_NO),
         },
         whole=True,

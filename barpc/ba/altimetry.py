@@ -97,7 +97,7 @@ def _covariance_without_heights(covariance: Covariance, found: Solution, ties: I
 def _is_held(found: Solution, block: Block) -> bool:
     """Return whether other control, an earlier run or fixed views know the scene's place."""
     problem = found.problem
-    others = block.gcps.names or block.reference is not None or problem.joint_prior is not None
+    others = block.gcps.names or block.reference is not None or found.goes_on
     return bool(others) or not problem.free.all()
 
 

@@ -62,7 +62,7 @@ class Solution:
     @property
     def goes_on(self) -> bool:
         """Whether it goes on from an earlier block."""
-        return self.problem.joint_prior is not None
+        return self.problem.joint_prior is not None and self.problem.joint_prior.earlier
 
     @property
     def seen(self) -> BoolArray:

@@ -148,6 +148,11 @@ class ExportKeywords(TypedDict, total=False):
     """Keywords of `ExportOptions`."""
 
     alt: Sequence[float] | None
+    time: Sequence[str]
+    date: Sequence[str]
+    images: bool
+    tolerance: float | None
+    exact: bool
     overwrite: bool
 
 

@@ -153,6 +153,26 @@ class ExportOptions(Options):
         unit="m",
         metavar="LOW HIGH",
     )
+    time: tuple[str, ...] = option(
+        (),
+        "UTC time of images whose files state none (`satnerf` asks for it), or of one: 2013-04-17T10:36:44.",
+        metavar="[IMAGE=]TIME",
+    )
+    date: tuple[str, ...] = option((), "Their day, where the time is not known (`stac`).", metavar="[IMAGE=]DAY")
+    images: bool = option(
+        False,
+        "`colmap`: resample the images into pictures and masks. Without, `warp.sh` lets GDAL do it.",
+    )
+    tolerance: float | None = option(
+        None,
+        "`colmap`: largest error of a pinhole; images are cut into parts for it. Without: 0.1.",
+        unit="px",
+        above=0,
+    )
+    exact: bool = option(
+        False,
+        "`colmap`: the nearest pinholes of the images as they are, principal points far outside.",
+    )
     overwrite: bool = option(False, "Replace what an earlier export wrote.")
 
 

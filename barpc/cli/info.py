@@ -30,7 +30,8 @@ def info(images: tuple[str, ...], at: tuple[float, float, float] | None, outline
     ",pol=vv", ",burst=3", ",orbit=X.EOF", ",atmosphere=yes", ",bistatic=full" (Sentinel-1); ",altitudes=0:500"
     (grid, CSM).
     ",model=physical" takes the orbit and attitude in Maxar's or Airbus' XML, given or beside an image, in place of the
-    RPC; with it ",aberration=no", ",refraction=no", ",band=N", ",altitudes=0:500".
+    RPC; with it ",aberration=no", ",refraction=no", ",band=N", ",altitudes=0:500". SPOT 1 to 5 (METADATA.DIM) need no
+    choice; of 1 to 4 ",attitudes=raw".
 
     \b
     Examples:

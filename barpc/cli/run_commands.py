@@ -60,21 +60,27 @@ def report(run_dirs: tuple[str, ...], csv: bool) -> int:
 def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
     r"""Export a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
-    satnerf: JSON an image with the RPC; colmap: pinhole cameras that approximate the RPCs, with the largest error of
-    each; s2p, cars, asp: a configuration that is ready to run; stac: a collection for catalogues; points: tie points
-    with their covariance. Images are pointed at, relative to OUT_DIR, and never copied.
+    satnerf: JSON for Sat-NeRF and EOGS; colmap: central pinholes for splatting, nerfstudio; s2p, cars, asp: a
+    configuration that is ready to run; stac: a collection for catalogues; points: tie points with their covariance.
+    Images are pointed at, relative to OUT_DIR. Exit code 3: nothing is written, as no file states the time that
+    satnerf and stac need.
 
     \b
     Examples:
-      barpc export adjusted nerf --to satnerf
-      barpc export adjusted sparse --to colmap --alt 80 320
+      barpc export adjusted nerf --to satnerf --time 2013-04-17T10:36:44
+      barpc export adjusted splats --to colmap --images --tolerance 0.05
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
+    from barpc.export.light import UnknownTimeError
     from barpc.verbs import runs
 
-    paths = runs.export(run_dir, out_dir, target, **given_flags(flags))
+    try:
+        paths = runs.export(run_dir, out_dir, target, **given_flags(flags))
+    except UnknownTimeError as error:
+        return tell_gate(f"nothing is written: {error}", [])
     tell([str(path) for path in paths], *paths)
-    if not wants_json() and target != "points" and any(Path(run_dir).glob("*.vrt")):  # (points name no image)
+    alone = target == "points" or flags.get("images")  # names no image of the run
+    if not wants_json() and not alone and any(Path(run_dir).glob("*.vrt")):
         remark("the images are not copied: move them together with both folders, or adjust with --images copy")
     return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,18 +13,20 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, wrap_longitude
+from barpc.base.verb_options import ExportOptions
+from barpc.export.light import lit, moment, require
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.report.records import json_form
 from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
 
-Files = dict[str, bytes]
+Files = Mapping[str, bytes | Callable[[], bytes]]
+"""Content of files by name, or what makes it when it is written."""
 
 _COLLECTION = "collection.json"
-_EXTENSIONS = ("projection/v2.0.0", "view/v1.0.0")
-_UNKNOWN_TIME = {"start_datetime": "1957-10-04T00:00:00Z", "end_datetime": "9999-12-31T23:59:59Z"}
-"""When an image was taken of which no file says it: since there are satellites."""
+_EXTENSIONS = {"proj": "projection/v2.0.0", "view": "view/v1.0.0", "processing": "processing/v1.2.0"}
+"""STAC extensions by the prefix of their fields."""
 _TYPES = {
     ".tif": "image/tiff; application=geotiff",
     ".vrt": "application/xml",
@@ -47,7 +49,8 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
     """Return the record of an image that Sat-NeRF and its relatives read."""
     low, high = scene.alt_range
     ring = footprint(shot.rpc, shot.size, scene.origin[2])
-    middle = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(scene.origin[2]))
+    middle, when = scene.middle(shot), moment(shot.light.time)
+    assert when is not None
     top = shot.rpc.localize(shot.xy, np.full(len(shot.xy), high))
     depth = np.linalg.norm(ecef_from_ground(top) - ecef_from_ground(scene.points[shot.index]), axis=1)
     return {
@@ -56,7 +59,7 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
         "width": shot.size[0],
         "sun_elevation": shot.light.elevation,
         "sun_azimuth": shot.light.azimuth,
-        "acquisition_date": shot.light.time,
+        "acquisition_date": f"{when:%Y%m%d%H%M%S}",  # as STDIDC in NITF has it, and its scripts parse
         "geojson": {**(polygon(ring) or {}), "center": [float(wrap_longitude(middle[0])), float(middle[1])]},
         "min_alt": low,
         "max_alt": high,
@@ -65,8 +68,12 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
     }
 
 
-def satnerf(scene: Scene, out: Path) -> Files:
-    """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``."""
+def satnerf(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+    """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``; EOGS reads them.
+
+    UnknownTimeError for an image whose time of acquisition is unknown.
+    """
+    scene = lit(scene)
     rows = zip(scene.shots, scene.file_names(out), strict=True)
     files = {f"{shot.name}.json": as_json(_record(scene, shot, img)) for shot, img in rows}
     names = list(files)
@@ -91,13 +98,13 @@ def _rpc_text(shot: Shot, name: str) -> bytes:
     return write(shot.rpc).encode()
 
 
-def s2p(scene: Scene, out: Path) -> Files:
+def s2p(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
     images = [{"img": _image(shot, out), "rpc": shot.rpc.to_rpcm_dict()} for shot in scene.shots]
     return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
 
 
-def cars(scene: Scene, out: Path) -> Files:
+def cars(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
     sensors = {}
     for shot in scene.shots:
@@ -109,7 +116,7 @@ def cars(scene: Scene, out: Path) -> Files:
     return {**files, "inputs.yaml": as_json(found)}  # (JSON is YAML)
 
 
-def asp(scene: Scene, out: Path) -> Files:
+def asp(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _rpc_text(shot, "xml") for shot in scene.shots}
     lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
@@ -119,8 +126,12 @@ def asp(scene: Scene, out: Path) -> Files:
 # --- catalogues and points --------------------------------------------------------------------------------
 
 
-def stac(scene: Scene, out: Path) -> Files:
-    """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder."""
+def stac(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+    """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder.
+
+    UnknownTimeError for an image whose day of acquisition is unknown.
+    """
+    require([shot for shot in scene.shots if not shot.light.time], "day")
     items = {f"{shot.name}.json": _item(scene, shot, out) for shot in scene.shots}
     if _COLLECTION in items:
         raise InputError(f"an image is called {_COLLECTION[:-5]}, as the collection of its catalogue is: rename it")
@@ -134,7 +145,8 @@ def _stac_collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
     east = west + np.mod(boxes[:, 2] - boxes[:, 0], 360.0)
     first, last = (float(wrap_longitude(lon)) for lon in (west.min(), east.max()))
     ends = [first, boxes[:, 1].min(), last, boxes[:, 3].max()]
-    times = sorted(time for item in items.values() if (time := item["properties"]["datetime"]) is not None)
+    times = [[item["properties"].get(f"{end}_datetime", item["properties"]["datetime"]) for item in items.values()]
+             for end in ("start", "end")]  # fmt: skip
     return {
         "type": "Collection",
         "stac_version": "1.1.0",
@@ -143,7 +155,7 @@ def _stac_collection(scene: Scene, items: Mapping[str, Any]) -> dict[str, Any]:
         "license": "other",
         "extent": {
             "spatial": {"bbox": [ends]},
-            "temporal": {"interval": [[times[0], times[-1]] if times else [None, None]]},
+            "temporal": {"interval": [[min(times[0]), max(times[1])]]},
         },
         "links": [
             {"rel": "root", "href": f"./{_COLLECTION}", "type": "application/json"},
@@ -156,8 +168,10 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
     view = shot.entry
     ring = footprint(shot.rpc, shot.size, scene.origin[2])
     west, east = (float(wrap_longitude(lon)) for lon in (ring[:, 0].min(), ring[:, 0].max()))
-    time = shot.light.time
-    when = {"datetime": time if time is None or "T" in time else f"{time}T00:00:00Z"}
+    when: dict[str, Any] = {"datetime": shot.light.time}
+    if moment(shot.light.time) is None:  # a day alone
+        when = {"datetime": None, **{f"{end}_datetime": f"{shot.light.time}T{clock}Z"
+                for end, clock in (("start", "00:00:00"), ("end", "23:59:59"))}}  # fmt: skip
     seen = {
         "gsd": view.gsd_m,
         "view:incidence_angle": view.incidence_deg,
@@ -165,23 +179,23 @@ def _item(scene: Scene, shot: Shot, out: Path) -> dict[str, Any]:
         "view:sun_azimuth": shot.light.azimuth,
         "view:sun_elevation": shot.light.elevation,
     }
-    schemas = [f"https://stac-extensions.github.io/{name}/schema.json" for name in _EXTENSIONS]
+    properties = {
+        **when,
+        **{key: value for key, value in seen.items() if value is not None},
+        "proj:code": None,
+        "proj:shape": [shot.size[1], shot.size[0]],
+        "processing:software": {"barpc": scene.summary.barpc},
+        "rpc": shot.rpc.to_rpcm_dict(),
+    }
+    used = sorted({key.partition(":")[0] for key in properties} & _EXTENSIONS.keys())
     return {
         "type": "Feature",
         "stac_version": "1.1.0",
-        "stac_extensions": schemas,
+        "stac_extensions": [f"https://stac-extensions.github.io/{_EXTENSIONS[one]}/schema.json" for one in used],
         "id": shot.name,
         "geometry": polygon(ring),
         "bbox": [west, float(ring[:, 1].min()), east, float(ring[:, 1].max())],
-        "properties": {
-            **when,
-            **(_UNKNOWN_TIME if time is None else {}),
-            **{key: value for key, value in seen.items() if value is not None},
-            "proj:code": None,
-            "proj:shape": [shot.size[1], shot.size[0]],
-            "processing:software": {"barpc": scene.summary.barpc},
-            "rpc": shot.rpc.to_rpcm_dict(),
-        },
+        "properties": properties,
         "collection": scene.folder.resolve().name or "barpc",
         "links": [
             {"rel": rel, "href": f"./{_COLLECTION}", "type": "application/json"}
@@ -198,7 +212,7 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
     return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 
 
-def points(scene: Scene, _out: Path) -> Files:
+def points(scene: Scene, _out: Path, _how: ExportOptions) -> Files:
     """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its place, east, north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of

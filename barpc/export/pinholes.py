@@ -1,4 +1,4 @@
-"""For COLMAP: the pinhole camera nearest to each RPC, without skew, with its largest error.
+"""Pinhole cameras nearest to RPCs: of whole images as they are, and central ones of pictures made of their parts.
 
 A pinhole sees points in metres east, north, up of the scene's origin, and image points as barpc counts them.
 """
@@ -6,20 +6,19 @@ A pinhole sees points in metres east, north, up of the scene's origin, and image
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
-from barpc.base.remote import is_url
-from barpc.export.files import Files, as_json
-from barpc.export.shots import Sampled, Scene, Shot, relative_link
+from barpc.export.shots import Sampled, Scene, Shot, Window
+from barpc.sensor.geometry import image_grid
 
 _DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
 _PINHOLE_STEPS = 100  # at most
-_CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
+_LARGEST = 1600  # px a side of a picture: trainers reduce larger ones, and with them what they learn
+_SMALLEST = 64  # px a side of a part: below, relief asks for thousands of pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +36,8 @@ class Pinhole:
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
 
 
-def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pinhole:
-    """Return the pinhole camera without skew that shows the points nearest to their image points, in least squares.
+def fit_camera(samples: Sampled, sight: Array, far: float | None = None, skewed: bool = False) -> Array:
+    """Return the projective camera (3, 4) that shows the points nearest to their image points, in least squares.
 
     A camera (a.X + a4, b.X + b4) / (c.X + 1) has no skew where (a x c).(b x c) = 0. From the direct linear
     transformation (Abdel-Aziz and Karara 1971), Gauss-Newton steps that hold this constraint in its linear form
@@ -50,6 +49,7 @@ def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pin
     sight : (3,), unit vector to the sensor
     far : float, optional, the distance along it that the camera shall have [m]; else the best one, which may be
         behind the ground, as an image says little of its distance
+    skewed : bool, any skew will do
     """
     span, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
     world, image = samples.world / span, samples.image - middle
@@ -60,7 +60,7 @@ def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pin
         slope = _derivative(world, seen, depth)
         size = np.linalg.norm(slope, axis=0)
         skew, normal = _skew(unknowns)
-        gaps, normals = np.array([skew]), normal[None]
+        gaps, normals = np.array([skew] * (not skewed)), np.array([normal] * (not skewed)).reshape(-1, 11)
         if far is not None:
             gaps = np.append(gaps, unknowns[8:] @ sight + span / far)
             normals = np.vstack([normals, np.append(np.zeros(8), sight)])
@@ -76,7 +76,9 @@ def fit_pinhole(samples: Sampled, sight: Array, far: float | None = None) -> Pin
         unknowns = unknowns + step / size
         if np.linalg.norm(step) < 1e-12 * np.linalg.norm(unknowns * size):
             break
-    return _of_unknowns(unknowns, span, middle)
+    camera: Array = np.append(unknowns, 1.0).reshape(3, 4) / [span, span, span, 1.0]
+    camera[:2] += np.outer(middle, camera[2])
+    return camera
 
 
 def _derivative(world: Array, seen: Array, depth: Array) -> Array:
@@ -96,27 +98,24 @@ def _skew(unknowns: Array) -> tuple[float, Array]:
     return float((a @ b) * (c @ c) - (a @ c) * (b @ c)), normal
 
 
-def _of_unknowns(unknowns: Array, span: float, middle: Array) -> Pinhole:
-    """Return the camera of the unknowns, of places in `span` metres and image points from `middle`."""
-    rows = unknowns[:8].reshape(2, 4)
-    far = 1.0 / np.linalg.norm(unknowns[8:])
-    forward = far * unknowns[8:]
-    center = far * rows[:, :3] @ forward
-    across = far * rows[:, :3] - np.outer(center, forward)
+def pinhole_camera(camera: Array) -> Pinhole:
+    """Return a projective camera (3, 4) without skew as a rotation, a translation and K."""
+    far = 1.0 / np.linalg.norm(camera[2, :3])
+    forward = far * camera[2, :3]
+    center = far * camera[:2, :3] @ forward
+    across = far * camera[:2, :3] - np.outer(center, forward)
     right = across[0] / np.linalg.norm(across[0])
     rotation = np.array([right, np.cross(forward, right), forward])
     focal = (across * rotation[:2]).sum(axis=1)
-    return Pinhole(focal, center + middle, rotation, np.append((rows[:, 3] - center) / focal, 1.0) * far * span)
-
-
-# --- the model ----------------------------------------------------------------------------------------------
+    away = far * camera[:, 3] / camera[2, 3]
+    return Pinhole(focal, center, rotation, np.append((away[:2] - center * away[2]) / focal, away[2]))
 
 
 def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
     """Return the nearest pinhole of a shot, and its largest error over the scene [px]."""
     samples, checked = scene.samples(shot), scene.samples(shot, checked=True)
     sight, far = scene.sight_of(shot)
-    found = [fit_pinhole(samples, sight, times and times * far) for times in _DISTANCE_FACTORS]
+    found = [pinhole_camera(fit_camera(samples, sight, times and times * far)) for times in _DISTANCE_FACTORS]
     shown = [(checked.error(one.project(checked.world)), n) for n, one in enumerate(found) if (one.focal > 0).all()]
     error, best = min(shown, default=(np.inf, 0))
     if not np.isfinite(error):
@@ -124,57 +123,126 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
     return found[best], error
 
 
-def colmap(scene: Scene, out: Path) -> Files:
-    """Write a text model of pinhole cameras, tie points and their places; ``world.json`` places it on Earth.
+# --- pictures -----------------------------------------------------------------------------------------------
 
-    Images are called by their names in the folder ``images`` (`image_links`).
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A part of an image, `window`, seen by a pinhole camera with square pixels and its principal point in the middle.
+
+    `homography` (3, 3) takes points of the picture to the image, both counted from the corner of the first pixel;
+    `error`: the largest distance [px] of a ground point in the picture from its projection by `pinhole`.
     """
-    world = scene.world(scene.points)
-    cameras, images, errors = [], [], {}
-    seen: dict[int, list[tuple[int, int, float]]] = {}
-    for number, (shot, name) in enumerate(zip(scene.shots, _called(scene), strict=True), start=1):
-        if any(char.isspace() for char in name):
-            raise InputError(
-                f"{shot.file}: COLMAP ends the name of an image at a space; rename it, or give a link without one"
-            )
-        pinhole, errors[name] = pinhole_of(scene, shot)
-        center = pinhole.center + _CORNER
-        numbers = [*shot.size, *pinhole.focal.tolist(), *center.tolist()]
-        cameras.append(_text_line(number, "PINHOLE", *numbers))
-        turn = Rotation.from_matrix(pinhole.rotation).as_quat(canonical=True, scalar_first=True).tolist()
-        images.append(_text_line(number, *turn, *pinhole.translation.tolist(), number, name))
-        places = zip((shot.xy + _CORNER).tolist(), (shot.index + 1).tolist(), strict=True)
-        images.append(" ".join(_text_line(*xy, point) for xy, point in places))
-        miss = np.linalg.norm(pinhole.project(world[shot.index]) - shot.xy, axis=1)
-        for place, (point, error) in enumerate(zip(shot.index.tolist(), miss.tolist(), strict=True)):
-            seen.setdefault(point, []).append((number, place, error))
-    points = []
-    for point in sorted(seen):
-        track = [value for image, place, _ in seen[point] for value in (image, place)]
-        mean = float(np.mean([error for *_, error in seen[point]]))
-        points.append(_text_line(point + 1, *world[point].tolist(), 128, 128, 128, mean, *track))
-    about = {"world_to_ecef": scene.world_to_ecef, "alt_range": scene.alt_range, "pinhole_error_px": errors}
-    named = zip(scene.shots, _called(scene), strict=True)
-    about["images"] = {name: relative_link(shot.file, out) for shot, name in named}
-    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
-    return {f"sparse/0/{name}": ("\n".join(lines) + "\n").encode() for name, lines in texts.items()} | {
-        "world.json": as_json(about)
-    }
+
+    window: Window
+    size: tuple[int, int]
+    pinhole: Pinhole
+    homography: Array
+    error: float
+
+    @property
+    def inverse(self) -> Array:
+        """The homography from the image to the picture."""
+        return np.asarray(np.linalg.inv(self.homography))
 
 
-def _called(scene: Scene) -> list[str]:
-    """Return the names of the images in the model: of their files where these differ, else of the run."""
-    names = [PurePath(shot.file).name for shot in scene.shots]
-    if len(set(names)) == len(names):
-        return names
-    return [shot.name + PurePath(shot.file).suffix for shot in scene.shots]
+def mapped(homography: Array, points: Array) -> Array:
+    """Return points (N, 2) behind a homography (3, 3)."""
+    found = points @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(found[:, :2] / found[:, 2:])
 
 
-def image_links(scene: Scene) -> dict[str, str]:
-    """Return the links in the folder of a COLMAP model and the local images that they point at: nothing is copied."""
-    rows = zip(scene.shots, _called(scene), strict=True)
-    return {f"images/{name}": shot.file for shot, name in rows if not is_url(shot.file)}
+def pictures_of(scene: Scene, shot: Shot, tolerance: float) -> list[Picture]:
+    """Return the fewest equal parts of a shot of which central pinholes miss nothing by more than a tolerance [px].
+
+    Raises
+    ------
+    InputError
+        They would be too small, or no pinhole camera comes near the RPC.
+    """
+    side, error = float(_LARGEST), np.inf
+    while side >= _SMALLEST:
+        error, pictures = 0.0, list[Picture]()
+        for window in _parts(shot.size, side):
+            pictures.append(central_picture(scene, shot, window))
+            error = max(error, pictures[-1].error)
+            if error > tolerance:
+                break
+        if error <= tolerance:
+            return pictures
+        side *= min(0.9, max(0.3, 0.95 * tolerance / error))  # the error is nearly linear in it
+    raise InputError(
+        f"{shot.name}: parts of {_SMALLEST} px are not within {tolerance:g} px of a central pinhole over altitudes "
+        f"{scene.alt_range[0]:g} to {scene.alt_range[1]:g} m: a larger --tolerance, a narrower --alt"
+    )
 
 
-def _text_line(*values: float | str) -> str:
-    return " ".join(value if isinstance(value, str) else repr(value) for value in values)
+def _parts(size: tuple[int, int], side: float) -> list[Window]:
+    """Return the windows of equal parts of an image, at most `side` large, row by row."""
+    ends = [np.linspace(0, n, int(np.ceil(n / side)) + 1).round().astype(int).tolist() for n in size]
+    (lefts, tops) = ([(a, b - a) for a, b in pairwise(e)] for e in ends)
+    return [(left, top, width, height) for top, height in tops for left, width in lefts]
+
+
+def central_picture(scene: Scene, shot: Shot, window: Window) -> Picture:
+    """Return the picture of a part of a shot.
+
+    Cameras of one centre differ by a homography of their pictures: what counts is the centre, that of the projective
+    camera nearest to the RPC. The picture keeps its axes and the size of its pixels as far as it can.
+    """
+    samples = scene.samples(shot, window)
+    sight, far = scene.sight_of(shot)
+    middle = np.array(window[:2]) + (np.array(window[2:]) - 1.0) / 2
+    ground = shot.rpc.localize(middle, np.array(scene.origin[2]))
+    pictures = []
+    for times in _DISTANCE_FACTORS:
+        camera = fit_camera(samples, sight, times and times * far, skewed=True)
+        if np.isfinite(camera).all() and np.linalg.cond(camera[:, :3]) < 1e15:
+            center = -np.linalg.solve(camera[:, :3], camera[:, 3])
+            aim = scene.world(ground[None])[0] - center
+            if aim @ sight < 0:  # above the ground
+                pictures.append(_seen_from(scene, shot, window, camera, aim))
+    if not pictures:
+        raise InputError(f"{shot.name}: no pinhole camera comes near its RPC")
+    return min(pictures, key=lambda one: one.error)
+
+
+def _seen_from(scene: Scene, shot: Shot, window: Window, camera: Array, aim: Array) -> Picture:
+    """Return the picture that a projective camera (3, 4) sees towards the ground, `aim` (3,) from its centre."""
+    forward = aim / np.linalg.norm(aim)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.array([right, np.cross(forward, right), forward])
+    shape = camera[:, :3] @ rotation.T  # of directions, as this camera turns them, to the image
+    where = shape[:2, 2] / shape[2, 2]
+    spread = (shape[:2, :2] - np.outer(where, shape[2, :2])) / shape[2, 2]
+    left, values, axes = np.linalg.svd(spread)
+    if np.linalg.det(left @ axes) < 0:  # an image that shows the ground mirrored
+        left[:, 1] *= -1
+    turn = np.eye(3)
+    turn[:2, :2] = left @ axes
+    rotation, focal = turn @ rotation, float(np.sqrt(values.prod()))
+    inner = np.diag([focal, focal, 1.0])
+    to_image = camera[:, :3] @ rotation.T @ np.linalg.inv(inner)
+    to_image /= to_image[2, 2]
+    col, row, width, height = window
+    corners = np.array([[col, row], [col + width, row], [col, row + height], [col + width, row + height]]) - 0.5
+    half = np.abs(mapped(np.linalg.inv(to_image), corners)).max(axis=0)
+    size = tuple(int(n) for n in np.ceil(2 * half - 1e-6))
+    shift, corner = np.eye(3), np.eye(3)
+    shift[:2, 2], corner[:2, 2] = -np.array(size) / 2, 0.5
+    center = -np.linalg.solve(camera[:, :3], camera[:, 3])
+    pinhole = Pinhole(np.full(2, focal), (np.array(size) - 1.0) / 2, rotation, -rotation @ center)
+    homography = corner @ to_image @ shift
+    return Picture(window, (size[0], size[1]), pinhole, homography, _error(scene, shot, size, pinhole, homography))
+
+
+def _error(scene: Scene, shot: Shot, size: tuple[int, ...], pinhole: Pinhole, homography: Array) -> float:
+    """Return the largest error [px] of a picture's pinhole over the pixels that the image has in it."""
+    nodes, alt = image_grid((size[0] + 1, size[1] + 1), scene.alt_range, (21, 9))  # from border to border
+    image = mapped(homography, nodes) - 0.5
+    inside = ((image >= -0.5) & (image <= np.array(shot.size) - 0.5)).all(axis=1)
+    ground = shot.rpc.localize(image[inside], alt[inside])
+    seen = np.isfinite(ground).all(axis=1)
+    missed = pinhole.project(scene.world(ground[seen])) + 0.5 - nodes[inside][seen]
+    return float(np.linalg.norm(missed, axis=1).max())

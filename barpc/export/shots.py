@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import InputError
+from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
-from barpc.rasters.raster import sources_of
+from barpc.rasters.raster import open_raster, sources_of
 from barpc.report.compare import is_own, written_rpc
 from barpc.report.finished import FinishedRun
 from barpc.report.ranking import sure_pairs
@@ -29,6 +29,9 @@ from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
 from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, triangulate
 from barpc.sensor.rpc import RPC
+
+Window = tuple[int, int, int, int]
+"""col, row of the first pixel, width, height [px]."""
 
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -122,20 +125,25 @@ class Scene:
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
-    def samples(self, shot: Shot, checked: bool = False) -> Sampled:
-        """Return the points over an image and the scene's altitudes; to measure errors on, more of them."""
+    def samples(self, shot: Shot, part: Window | None = None, checked: bool = False) -> Sampled:
+        """Return the points over an image, or a part of it, and altitudes; to measure errors on, more of them."""
         nodes = (2 * GRID_NODES[0] - 1, 2 * GRID_NODES[1] - 1) if checked else GRID_NODES  # between them, too
-        image, alt = image_grid(shot.size, self.alt_range, nodes)
+        col, row, *size = part or (0, 0, *shot.size)
+        image, alt = image_grid((size[0], size[1]), self.alt_range, nodes)
+        image += [col, row]
         ground = shot.rpc.localize(image, alt)
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < 12:
             raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
         return Sampled(self.world(ground[known]), image[known])
 
+    def middle(self, shot: Shot) -> Array:
+        """Return the ground (3,) in the middle of a shot, at the altitude of the origin."""
+        return np.asarray(shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(self.origin[2])))
+
     def sight_of(self, shot: Shot) -> tuple[Array, float]:
         """Return the unit vector (3,) in the world from a shot's ground middle to its sensor, and the distance [m]."""
-        ground = shot.rpc.localize((np.array(shot.size) - 1.0) / 2, np.array(self.origin[2]))
-        away = camera_center(shot.rpc, shot.size, self.alt_range).ecef - ecef_from_ground(ground)
+        away = camera_center(shot.rpc, shot.size, self.alt_range).ecef - ecef_from_ground(self.middle(shot))
         far = float(np.linalg.norm(away))
         return enu_basis(self.origin) @ away / far, far
 
@@ -245,10 +253,23 @@ def _shot(newest: FinishedRun, run: FinishedRun, view: ViewEntry, of_images: boo
     file, light = str(run.sealed.located(view.path)), Acquisition()
     if of_images:
         file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
-        light = read_acquisition(file, source or None)
+        light = _light(view, file, source)
     none: IntArray = np.empty(0, dtype=np.int64)
     carrier = _carrier(writer, view.name, files)
     return Shot(view, run, rpc, writer, files, file, carrier, light, none, np.empty((0, 2)))
+
+
+def _light(view: ViewEntry, file: str, source: str) -> Acquisition:
+    """Return the sensor, time and sun of an image by its files; the day that the run was given where these state none.
+
+    The date of a TIFF is that of the file: it is none of an acquisition.
+    """
+    tags: Mapping[str, str] = {}
+    if not is_url(file):
+        with suppress(BarpcError), open_raster(file) as dataset:
+            tags = dataset.tags()
+    light = read_acquisition(file, source or None, tags)
+    return light if light.time or view.date == light.day(tags) else replace(light, time=view.date)
 
 
 def _written(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[FinishedRun, tuple[str, ...], RPC]:

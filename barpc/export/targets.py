@@ -9,45 +9,41 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from barpc.base.errors import InputError, OutputError
+from barpc.base.errors import InputError, OutputError, UsageError
 from barpc.base.keywords import PathLike
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
+from barpc.base.verb_options import ExportOptions
+from barpc.export.colmap import colmap, image_links
 from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
-from barpc.export.pinholes import colmap, image_links
+from barpc.export.light import dated
 from barpc.export.shots import Scene, read_scene, relative_link
 from barpc.workspace import Workspace
 
 __all__ = ["TARGETS", "export_run"]
 
 logger = logging.getLogger(__name__)
+_DEFAULTS = ExportOptions()
 
-TARGETS: dict[str, Callable[[Scene, Path], Files]] = {
+TARGETS: dict[str, Callable[[Scene, Path, ExportOptions], Files]] = {
     make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, stac, points)
 }
-"""Tool -> the files made for it, by name, of a scene and the folder where they will lie."""
+"""Tool -> the files made for it, by name, of a scene, the folder where they will lie, and options."""
 
 
-def export_run(
-    folder: PathLike,
-    target: str,
-    out: PathLike,
-    *,
-    alt_range: tuple[float, float] | None = None,
-    overwrite: bool = False,
-) -> list[Path]:
+def export_run(folder: PathLike, target: str, out: PathLike, how: ExportOptions = _DEFAULTS) -> list[Path]:
     """Hand a finished run to another tool, a row of `TARGETS`; return the files written: see `barpc.export`."""
     folder, out = Path(folder), Path(out)
-    scene = _checked_scene(folder, target, out, alt_range)
-    files = TARGETS[target](scene, out.absolute())
+    scene = _checked_scene(folder, target, out, how)
+    files = TARGETS[target](scene, out.absolute(), how)
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
-    links = image_links(scene) if target == "colmap" else {}
+    links = image_links(scene) if how.exact else {}
     content = {shot.file: one.sha256 for shot in scene.shots if (one := shot.run.inputs.get(shot.entry.path))}
     known = {name: content[image] for name, image in links.items() if image in content}
-    with Workspace(out, overwrite=overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
+    with Workspace(out, overwrite=how.overwrite, keep=inputs, names=[*files, SUMS]) as workspace:
         for name, data in files.items():
             with workspace.output(name) as partial:
-                partial.write_bytes(data)
+                partial.write_bytes(data() if callable(data) else data)
         workspace.remove_stale()
         for name, image in links.items():
             _link_image(out / name, relative_link(image, (out / name).parent))
@@ -55,13 +51,15 @@ def export_run(
     return [out / name for name in files]
 
 
-def _checked_scene(folder: Path, target: str, out: Path, alt_range: tuple[float, float] | None) -> Scene:
+def _checked_scene(folder: Path, target: str, out: Path, how: ExportOptions) -> Scene:
     if target not in TARGETS:
         raise InputError(f"{target}: no export of that name; there are {', '.join(TARGETS)}")
-    if alt_range is not None and not alt_range[0] < alt_range[1]:
-        raise InputError(f"altitudes {alt_range}: the lower one first, in metres")
+    if how.alt is not None and not how.alt[0] < how.alt[1]:
+        raise InputError(f"altitudes {how.alt}: the lower one first, in metres")
+    if target != "colmap" and (how.exact or how.images or how.tolerance is not None):
+        raise UsageError(f"--exact, --images and --tolerance go with --to colmap, not {target}")
     plain_path(out.absolute())
-    scene = read_scene(folder, alt_range, of_images=target != "points")
+    scene = dated(read_scene(folder, how.alt, of_images=target != "points"), how.time, how.date)
     if out.resolve() == folder.resolve():
         raise OutputError(f"{out}: the folder of the run; give the export one of its own")
     return scene

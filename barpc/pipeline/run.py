@@ -59,7 +59,7 @@ from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
 from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE, outline_features
 from barpc.report.summary import InputEntry, StageEntry
-from barpc.rpcio import plain_source
+from barpc.rpcio import local_image
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_centers
@@ -384,7 +384,7 @@ def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[st
         require_pair_names([view.name for view in views])
     if options.images == "vrt" and options.stop_after == "all":
         for view in views:
-            plain_source(view.path)
+            local_image(view.path)
     inputs = [*(view.path for view in run.views), *(source.path for source in run.sources)]
     inputs += [path for one in run.carried for path in (one.view.path, one.source.path)]
     keep = {*here(inputs), *input_files(options)}

@@ -34,7 +34,7 @@ from barpc.pointio.tables import (
     read_columns,
     row_of,
 )
-from barpc.rasters.raster import driver_of, open_raster
+from barpc.rasters.raster import driver_at, driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 
 GCP_NAMES: Names = {
@@ -161,6 +161,7 @@ class GcpFormat(NamedTuple):
     sniff: Callable[[str, bytes], bool]  # of a file's beginning, as a text and as bytes
     read: Callable[[Path], GcpTable]
     more: float = 0.0
+    holds: str = ""  # words of docs/formats.md
 
 
 def open_gcps(path: Path) -> tuple[str, GcpTable]:
@@ -443,7 +444,7 @@ def _is_binary(text: str) -> bool:
 
 
 def _read_tagged(path: Path) -> GcpTable:
-    if driver_of(read_head(path, TABLE)) is None:
+    if driver_at(path) is None:
         raise InputError(f"{path}: neither a text nor a file of points that is read ({', '.join(GCP_FORMATS)})")
     table, _ = read_tags(path)
     if not table.names:
@@ -519,17 +520,30 @@ def _read_micmac(path: Path) -> GcpTable:
 
 
 GCP_FORMATS: dict[str, GcpFormat] = {
-    "GeoPackage or Shapefile": GcpFormat(lambda _, head: head.startswith((GEOPACKAGE, SHAPEFILE)), _read_vector),
-    "image with GCP tags": GcpFormat(lambda text, head: driver_of(head) is not None or _is_binary(text), _read_tagged),
-    "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson),
-    MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac),
-    "ENVI .pts": GcpFormat(lambda text, _: text.startswith(";"), _read_envi_points, 1.5),  # from the corner, as 1
-    "QGIS .points": GcpFormat(lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5),
-    "ODM gcp_list.txt": GcpFormat(lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5),
-    "Metashape CSV": GcpFormat(
-        lambda text, _: _AGISOFT.search(text) is not None and _header(text)[0] >= 0, _read_csv, 0.5
+    "GeoPackage or Shapefile": GcpFormat(
+        lambda _, head: head.startswith((GEOPACKAGE, SHAPEFILE)), _read_vector, 0.0, "points; CSV's columns or `ji`"
     ),
-    "CSV": GcpFormat(lambda text, _: _header(text)[0] >= 0, _read_csv),
-    "ASP .gcp": GcpFormat(lambda *_: True, _read_asp),
-}
+    "image with GCP tags": GcpFormat(
+        lambda text, head: driver_of(head) is not None or _is_binary(text), _read_tagged, 0.0,
+        "GDAL's GCPs; first pixel by extent",
+    ),
+    "GeoJSON": GcpFormat(lambda text, _: text.startswith("{"), read_geojson, 0.0, "points; CSV's columns or `ji`"),
+    MICMAC: GcpFormat(lambda text, _: text.startswith("<"), _read_micmac, 0.0, "perhaps two files"),
+    "ENVI .pts": GcpFormat(
+        lambda text, _: text.startswith(";"), _read_envi_points, 1.5, "`x y col row`"  # from the corner, as 1
+    ),
+    "QGIS .points": GcpFormat(
+        lambda text, _: "mapX" in text[:4096] and _header(text)[0] >= 0, _read_qgis, 0.5,
+        "`mapX,mapY,sourceX,sourceY`, rows negative",
+    ),
+    "ODM gcp_list.txt": GcpFormat(
+        lambda text, _: _ODM.match(text) is not None, _read_odm, 0.5, "CRS; `x y z col row image`"
+    ),
+    "Metashape CSV": GcpFormat(
+        lambda text, _: _AGISOFT.search(text) is not None and _header(text)[0] >= 0, _read_csv, 0.5,
+        "`# CoordinateSystem`",
+    ),
+    "CSV": GcpFormat(lambda text, _: _header(text)[0] >= 0, _read_csv, 0.0, "named columns; `# CRS: ...`"),
+    "ASP .gcp": GcpFormat(lambda *_: True, _read_asp, 0.0, "`id lat lon height sx sy sz image col row scol srow ...`"),
+}  # fmt: skip
 """Name -> row: the first that knows the beginning reads the file. QGIS, ODM and Metashape count from the corner."""

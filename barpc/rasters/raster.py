@@ -2,8 +2,9 @@
 
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it read other
 files or the network. So the first bytes choose the one driver that may open a file, GDAL does not look at the files
-beside it, and a VRT is never shown to it: `barpc.rasters.vrt` reads it, and `Mosaic` puts the pixels together. Of a
-file on another host GDAL asks this process for bytes, and it alone speaks with the host.
+beside it, and a VRT or a list of tiles is never shown to it: `barpc.rasters.vrt` and `barpc.rasters.composed` read
+it, and `Mosaic` puts the pixels together. Of a file on another host, and of raw pixels with a header, GDAL asks this
+process for bytes: it sees nothing else, and only this process speaks with the host.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from __future__ import annotations
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +39,8 @@ from barpc.base.errors import ImageError, InputError
 from barpc.base.geodesy import Array, utm
 from barpc.base.identity import Input
 from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
-from barpc.base.safe_io import IMAGE, read_head
+from barpc.base.safe_io import IMAGE, opened, read_head
+from barpc.rasters.composed import header_beside, is_raw, placed_tiles, refuse_foreign_channels, shown_header
 from barpc.rasters.crs import crs_of, plain_crs, refuse_opening_crs
 from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Rect, Source, Vrt, read_vrt
 
@@ -51,9 +55,13 @@ DRIVERS: dict[bytes, str] = {
     b"NSIF": "NITF",
     b"\x89PNG": "PNG",
     b"\xff\xd8\xff": "JPEG",
+    b"PCIDSK  ": "PCIDSK",
+    b"bandId": "TIL",
     MAGIC: "VRT",
 }
-"""First bytes of a file -> the driver that may open it."""
+"""First bytes of a file -> the driver that may open it; raw pixels with an ENVI header have none."""
+MOSAICS = ("VRT", "TIL")
+"""Texts that name rasters, which GDAL is never shown."""
 
 GDAL_OPTIONS: dict[str, Any] = {
     "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",  # nothing is fetched
@@ -84,7 +92,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
     try:
         with (
             rasterio.Env(**GDAL_OPTIONS, **_NO_SIDECAR_OPTIONS),
-            _open_mosaic(file, name) if driver == "VRT" else _open_dataset(file, driver) as dataset,
+            _open_mosaic(file, driver, name) if driver in MOSAICS else _open_dataset(file, driver) as dataset,
         ):
             yield dataset
     except RasterioError as error:
@@ -94,8 +102,12 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
 
 def _open_dataset(file: PathOrUrl, driver: str) -> Any:
     refuse_opening_crs(file, driver)
+    if driver == "PCIDSK":
+        refuse_foreign_channels(file)
     if isinstance(file, Remote):
         return _opened_remote(file, driver)
+    if driver == "ENVI":
+        return _opened_raw(file)
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(file, driver=driver)
@@ -118,24 +130,15 @@ class _Asked(RemoteFile):
             return 0
 
 
-_VISIBLE_NAME = "remote"  # the one file that GDAL finds
+_VISIBLE_NAME = "remote"  # the one file that GDAL finds, and, of raw pixels, its header
 
 
 @contextmanager
 def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
     """Some drivers make pixels of a file that ends too early: whatever they say, no failed reading ends well."""
     failures: list[OSError] = []
-
-    def opener(name: str, _mode: str = "rb", **_given: Any) -> _Asked:
-        if name != _VISIBLE_NAME:
-            raise FileNotFoundError(name)
-        return _Asked(file, failures)
-
     try:
-        with _WARNINGS, warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = rasterio.open(_VISIBLE_NAME, driver=driver, opener=opener)
-        with dataset:
+        with _open_visible(driver, {_VISIBLE_NAME: partial(_Asked, file, failures)}) as dataset:
             yield dataset
     except RasterioError:
         if not failures:
@@ -144,18 +147,78 @@ def _opened_remote(file: Remote, driver: str) -> Iterator[Any]:
         raise ImageError(f"{file}: cannot be read ({failures[0]})") from failures[0]
 
 
-def _open_mosaic(file: PathOrUrl, name: str) -> Mosaic:
-    """Return a VRT whose sources are all rasters that are read here."""
+def _open_visible(driver: str, files: Mapping[str, Callable[[], Any]]) -> Any:
+    """Return a dataset of which GDAL sees these files and no other."""
+
+    def opener(name: str, _mode: str = "rb", **_given: Any) -> Any:
+        if name not in files:
+            raise FileNotFoundError(name)
+        return files[name]()
+
+    with _WARNINGS, warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        return rasterio.open(_VISIBLE_NAME, driver=driver, opener=opener)
+
+
+@contextmanager
+def _opened_raw(file: Path) -> Iterator[Any]:
+    with ExitStack() as stack:
+        header = partial(BytesIO, shown_header(file))
+        files: dict[str, Callable[[], Any]] = {
+            _VISIBLE_NAME: lambda: stack.enter_context(opened(file, IMAGE)),
+            f"{_VISIBLE_NAME}.hdr": header,
+        }
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE"):  # not longer: other files may be opened meanwhile
+            dataset = _open_visible("ENVI", files)
+        with dataset:
+            yield dataset
+
+
+def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Mosaic:
+    """Return a VRT, or a list of tiles as one, whose sources are all rasters that are read here."""
     if isinstance(file, Remote):
-        raise ImageError(f"{name}: a VRT is read from disk only; give the images it is made of")
-    vrt = read_vrt(file, name=name)
+        raise ImageError(f"{name}: a {driver} is read from disk only; give the images it is made of")
+    vrt = read_vrt(file, name=name) if driver == "VRT" else _vrt_of_tiles(file)
     drivers: dict[Path, str] = {}
     for source in vrt.sources:
         if source.file not in drivers:
             drivers[source.file] = identify(source.file)[1]
-            if drivers[source.file] == "VRT":
-                raise ImageError(f"{name}: a VRT of a VRT is not read; give the images it is made of")
+            if drivers[source.file] in MOSAICS:
+                raise ImageError(f"{name}: a {driver} of a VRT is not read; give the images it is made of")
     return Mosaic(name, vrt, lambda source: _open_dataset(source, drivers[source]))
+
+
+def _vrt_of_tiles(file: Path) -> Vrt:
+    """Return the VRT of a list of tiles, whose bands and place are those of its first tile."""
+    placed = placed_tiles(file)
+    first = min(placed, key=lambda tile: placed[tile][:2])
+    if identify(first)[1] in MOSAICS:
+        raise ImageError(f"{file}: its tile {first.name} is no image")
+    with open_raster(first) as tile:
+        whole = vrt_of(tile, first)
+    bands = tuple(
+        replace(band, sources=tuple(Source(tile, n, dst=place) for tile, place in placed.items()))
+        for n, band in enumerate(whole.bands, 1)
+    )
+    size = max(x + width for x, _, width, _ in placed.values()), max(y + h for _, y, _, h in placed.values())
+    return replace(whole, size=size, bands=bands, mask=None)
+
+
+def vrt_of(dataset: Any, file: Path) -> Vrt:
+    """Return the VRT that shows an opened raster whole; of one that is a VRT its own."""
+    if isinstance(dataset, Mosaic):
+        return dataset.vrt
+    whole = (0, 0, dataset.width, dataset.height)
+    rows = zip(dataset.dtypes, dataset.nodatavals, dataset.colorinterp, strict=True)
+    bands = tuple(
+        Band(dtype, nodata, nodata or 0.0, color.name, None, (1.0, 0.0), (Source(file, n, False, whole, whole),))
+        for n, (dtype, nodata, color) in enumerate(rows, 1)
+    )
+    mask = Band("uint8", None, 0.0, "undefined", None, (1.0, 0.0), (Source(file, 1, True, whole, whole),))
+    crs = earth_crs(dataset)
+    srs = "" if crs is None else crs.to_wkt()
+    transform = tuple(dataset.transform.to_gdal()) if srs else None
+    return Vrt((dataset.width, dataset.height), bands, mask if has_mask(dataset) else None, srs, transform, {}, "", ())
 
 
 def map_crs(given: str | None, middle: Array) -> CRS:
@@ -195,6 +258,20 @@ def transformed(transform: Affine, x: Any, y: Any) -> tuple[Any, Any]:
     return a * x + b * y + c, d * x + e * y + f
 
 
+def earth_crs(dataset: Any) -> CRS | None:
+    """Return the CRS that places a raster on the Earth; None of a local one, which a JPEG 2000 without any is given."""
+    found: CRS | None = dataset.crs
+    return None if found is None or found.to_wkt().startswith(_LOCAL) else found
+
+
+_LOCAL = "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS"
+
+
+def has_mask(dataset: Any) -> bool:
+    """Return whether a raster has a mask of its own, apart from an alpha band."""
+    return MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
+
+
 def hashed(path: PathOrUrl | str) -> Input:
     """Hash a file, of a VRT the sources that it shows, too; ImageError where one cannot be read."""
     try:
@@ -211,10 +288,16 @@ def hashed(path: PathOrUrl | str) -> Input:
 
 
 def sources_of(path: PathOrUrl | str) -> tuple[PathOrUrl, ...]:
-    """Return the files that a VRT shows; none for another raster. ImageError where it cannot be read."""
-    if isinstance(path, Remote) or driver_of(read_head(path, IMAGE, 64)) != "VRT":
-        return ()
-    return tuple(dict.fromkeys(source.file for source in read_vrt(Path(path)).sources))
+    """Return the files that a VRT or a list of tiles shows, the header of raw pixels; none for another raster.
+
+    ImageError where it cannot be read.
+    """
+    driver = None if isinstance(path, Remote) else driver_at(path)
+    if driver == "ENVI":
+        return tuple(filter(None, [header_beside(Path(path))]))
+    if driver == "TIL":
+        return tuple(placed_tiles(Path(path)))
+    return tuple(dict.fromkeys(source.file for source in read_vrt(Path(path)).sources)) if driver == "VRT" else ()
 
 
 def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[PathOrUrl, str]:
@@ -223,16 +306,29 @@ def identify(path: str | os.PathLike[str], driver: str | None = None) -> tuple[P
     if not isinstance(path, Remote) and INDIRECT.match(name) and not os.path.lexists(name):
         raise ImageError(f"{name}: remote and virtual paths are not read")
     head = read_head(name, IMAGE, 64)  # (os.fspath leaves a Remote as it is)
-    driver = driver or driver_of(head)
+    driver = driver or driver_at(name, head)
     if driver is None:
-        known = ", ".join(sorted(set(DRIVERS.values())))
-        raise ImageError(f"{name}: not a raster that is read here (kinds known: {known})")
+        raise ImageError(f"{name}: {unknown_kind(name)}")
     return location(path).absolute(), driver
+
+
+def unknown_kind(path: PathOrUrl | str) -> str:
+    """Return why a file is no raster to this package, in words."""
+    if header := header_beside(location(path)):
+        return f"not a raster that is read here (its length is not what {header.name} says of its pixels)"
+    known = ", ".join(sorted({*DRIVERS.values(), "ENVI"}))
+    return f"not a raster that is read here (kinds known: {known})"
 
 
 def driver_of(head: bytes) -> str | None:
     """Return the driver for a file with these first bytes; None where no raster begins so."""
     return next((driver for magic, driver in DRIVERS.items() if head.startswith(magic)), None)
+
+
+def driver_at(path: PathOrUrl | str, head: bytes | None = None) -> str | None:
+    """Return the driver for a file by its first bytes, or by an ENVI header beside it; None where it is no raster."""
+    driver = driver_of(read_head(path, IMAGE, 64) if head is None else head)
+    return driver or ("ENVI" if is_raw(location(path)) else None)
 
 
 # --- the raster that a VRT describes ----------------------------------------------------------------------
@@ -245,10 +341,13 @@ _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as
 
 
 class Mosaic:
-    """A VRT, called `name`, opened for reading, with the methods of a dataset in use here, under rasterio's names."""
+    """A VRT, called `name`, opened for reading, with the methods of a dataset in use here, under rasterio's names.
+
+    A list of tiles is one, too.
+    """
 
     def __init__(self, name: str, vrt: Vrt, opener: Callable[[Path], Any]) -> None:
-        self.name, self._vrt, self._opener = name, vrt, opener
+        self.name, self.vrt, self._opener = name, vrt, opener
         self._stack, self._open = ExitStack(), dict[Path, Any]()
         self.width, self.height = vrt.size
         self.shape, self.count = (self.height, self.width), len(vrt.bands)
@@ -281,7 +380,7 @@ class Mosaic:
     @property
     def units(self) -> tuple[str | None, ...]:
         """Units of the bands: of their first source where the VRT states none, as gdalbuildvrt leaves them out."""
-        firsts = [(band.unit, next(iter(band.sources), None)) for band in self._vrt.bands]
+        firsts = [(band.unit, next(iter(band.sources), None)) for band in self.vrt.bands]
         return tuple(
             self._of_source(source).units[source.band - 1] if unit is None and source else unit
             for unit, source in firsts
@@ -291,14 +390,14 @@ class Mosaic:
     def gcps(self) -> tuple[list[GroundControlPoint], CRS | None]:
         """Ground control points and their CRS."""
         points = []
-        for row in self._vrt.gcps:
+        for row in self.vrt.gcps:
             line, pixel, x, y, z = (float(row.get(key, "0")) for key in ("Line", "Pixel", "X", "Y", "Z"))
             points.append(GroundControlPoint(line, pixel, x, y, z, row.get("Id"), row.get("Info")))
-        return points, self._crs(self._vrt.gcp_srs)
+        return points, self._crs(self.vrt.gcp_srs)
 
-    def tags(self) -> dict[str, str]:
-        """Return the metadata of the default domain."""
-        return dict(self._vrt.metadata.get("", {}))
+    def tags(self, ns: str | None = None) -> dict[str, str]:
+        """Return the metadata of a domain, by default of that without a name."""
+        return dict(self.vrt.metadata.get(ns or "", {}))
 
     def read(
         self, indexes: int | Sequence[int] | None = None, window: Window | None = None, masked: bool = False
@@ -306,7 +405,7 @@ class Mosaic:
         """Read the pixels of one band (H, W), or of several (bands, H, W); masked where they mean nothing, if asked."""
         wanted = [indexes] if isinstance(indexes, int) else list(indexes or self.indexes)
         box = self._box(window)
-        pixels = np.stack([self._assembled(self._vrt.bands[i - 1], box) for i in wanted])
+        pixels = np.stack([self._assembled(self.vrt.bands[i - 1], box) for i in wanted])
         if masked:
             mask = np.stack([self.read_masks(i, window) == 0 for i in wanted])
             pixels = np.ma.MaskedArray(pixels, mask=mask, fill_value=self.nodatavals[wanted[0] - 1])
@@ -314,30 +413,15 @@ class Mosaic:
 
     def read_masks(self, index: int, window: Window | None = None) -> npt.NDArray[np.uint8]:
         """Read the mask of a band (H, W), 0 where a pixel is invalid: by the VRT's mask, nodata or alpha band."""
-        box, band = self._box(window), self._vrt.bands[index - 1]
-        if self._vrt.mask is not None:
-            return np.asarray(self._assembled(self._vrt.mask, box), np.uint8)
+        box, band = self._box(window), self.vrt.bands[index - 1]
+        if self.vrt.mask is not None:
+            return np.asarray(self._assembled(self.vrt.mask, box), np.uint8)
         if band.nodata is not None:
             return np.where(_equal(self._assembled(band, box), band.nodata), 0, 255).astype(np.uint8)
         if ColorInterp.alpha in self.colorinterp and self.colorinterp[index - 1] != ColorInterp.alpha:
-            alpha = self._vrt.bands[self.colorinterp.index(ColorInterp.alpha)]
+            alpha = self.vrt.bands[self.colorinterp.index(ColorInterp.alpha)]
             return np.asarray(self._assembled(alpha, box), np.uint8)
         return np.full((box[3], box[2]), 255, np.uint8)
-
-    def plain_source(self) -> Path | None:
-        """Return the raster that the VRT shows whole and unchanged; None if there is no such."""
-        files = {source.file for source in self._vrt.sources}
-        if len(files) != 1:
-            return None
-        dataset = self._dataset(file := files.pop())
-        whole = (0, 0, self.width, self.height)
-        wanted = [(Source(file, number, False, whole, whole),) for number in self.indexes]
-        wanted += [(Source(file, 1, True, whole, whole),)] * (self._vrt.mask is not None)
-        shown = [tuple(replace(s, src=s.src or whole, dst=s.dst or whole) for s in b.sources) for b in self._vrt.all]
-        same = (dataset.shape, dataset.dtypes) == (self.shape, self.dtypes)
-        nodata = ([v if v is None else float(v) for v in d.nodatavals] for d in (dataset, self))
-        same &= len({str(values) for values in nodata}) == 1  # as text: NaN is NaN
-        return file if same and shown == wanted else None
 
     def _box(self, window: Window | None) -> Rect:
         if window is None:
@@ -374,7 +458,8 @@ class Mosaic:
         src, dst = source.src or whole, source.dst or (0, 0, self.width, self.height)
         if src[2:] != dst[2:]:
             raise ImageError(
-                f"{self.name}: the VRT resamples {os.fspath(source.file)}, which is not read; write it out as a GeoTIFF"
+                f"{self.name}: {os.fspath(source.file)} is {src[2]} x {src[3]} px and would be resampled to {dst[2]} x "
+                f"{dst[3]} px, which is not done; write it out as a GeoTIFF"
             )
         right, down = dst[0] - src[0], dst[1] - src[1]
         inside = _intersection(dst, (right, down, dataset.width, dataset.height))

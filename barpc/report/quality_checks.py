@@ -64,7 +64,7 @@ def _reservations(view: ViewEntry, run: Run) -> Causes:
         yield from _of_camera(view, run, adjustment)
         yield from _of_tie_points(view, run, adjustment)
         for part in unseen_parts(run, run.number[view.name]):
-            yield "along_lines", {"place": part.place, "metres": metres(part.metres), "lines": part.words}
+            yield "along_lines", {"place": part.place, "metres": metres(part.metres)}
         yield from _beyond_one_rpc(view, run)
     error = known(view.rmse_after if run.kind == "adjust" else view.rmse_before)
     if view.num_observations and not error <= GOOD_RMSE:

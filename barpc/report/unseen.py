@@ -1,8 +1,9 @@
 """Heights behind a displaced part of an image, where no line of sight shows all of its displacement.
 
 Two images show a displacement across their epipolar lines and none along them: there the points of the part move up or
-down with it. Rows that are displaced as a whole (lines lost, a clock that jumps) are displaced along the rows' axis;
-the part along the lines then follows from that across them.
+down with it. Rows that are displaced as a whole (a clock that jumps) are displaced along the rows' axis; the part along
+the lines then follows from that across them. A whole number of lines is taken for lost and held
+(`barpc.ba.select.image_terms.with_lines_lost`).
 """
 
 from __future__ import annotations
@@ -19,22 +20,15 @@ from barpc.sensor.geometry import Several
 from barpc.sensor.image_corrections import Splined
 
 _PARALLEL = 0.05  # sine of the angle between lines and axis under which a part across tells nothing of that along
-_WHOLE = 0.1  # lines: a number of lost lines is whole to this; the noise of a median of ties over sin of the angle
 _SAMPLE = 200  # tie points at which the direction of the lines is measured
 
 
 @dataclass(frozen=True)
 class UnseenPart:
-    """Rows or columns of an image, by how much their heights may be off [m], and lost lines that would explain it."""
+    """Rows or columns of an image, and by how much their heights may be off [m]."""
 
     place: str
     metres: float
-    lines: int
-
-    @property
-    def words(self) -> str:
-        """The lost lines in a clause, empty without any."""
-        return f"; {self.lines} line{'s' * (self.lines > 1)} lost there would explain it" if self.lines else ""
 
 
 def unseen_parts(run: Run, i: int) -> Iterator[UnseenPart]:
@@ -63,9 +57,8 @@ def unseen_parts(run: Run, i: int) -> Iterator[UnseenPart]:
         displaced = float(moved[:, n] @ across / across[axis])  # along the axis, were that all of it
         metres = abs(displaced * along[axis]) * _metres_a_pixel(run, i, along)
         low, high = max(start, 0.0), min(stop, run.views[i].size[axis] - 1.0)
-        lines = round(abs(displaced)) if axis == 1 and abs(abs(displaced) - round(abs(displaced))) < _WHOLE else 0
         if abs(displaced * along[axis]) > LEAST_MOVED and np.isfinite(metres):
-            yield UnseenPart(f"{AXES[axis]} {low:.0f}-{high:.0f}", metres, lines)
+            yield UnseenPart(f"{AXES[axis]} {low:.0f}-{high:.0f}", metres)
 
 
 def _metres_a_pixel(run: Run, i: int, along: Array) -> float:

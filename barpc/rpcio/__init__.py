@@ -7,7 +7,7 @@ precedence. See ``docs/formats.md``.
 from __future__ import annotations
 
 from barpc.rpcio.formats import CARRIERS, FORMATS, WRITABLE, Carrier, find_rpc, format_for, write_camera, write_rpc
-from barpc.rpcio.images import plain_source, write_crop, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio.images import local_image, write_crop, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.sources import hidden_by, read_rpc, read_rpc_source, shadows, sidecars
 
 __all__ = [
@@ -18,7 +18,7 @@ __all__ = [
     "find_rpc",
     "format_for",
     "hidden_by",
-    "plain_source",
+    "local_image",
     "read_rpc",
     "read_rpc_source",
     "shadows",

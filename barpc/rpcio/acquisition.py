@@ -19,11 +19,12 @@ import numpy as np
 from barpc.base.errors import BarpcError
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.safe_io import RPC_FILE, read_head
-from barpc.rasters.raster import driver_of
+from barpc.rasters.raster import MOSAICS, driver_at
 from barpc.rpcio.formats import files_of
 from barpc.rpcio.images import SCANNED
 
-_FIRST_YEAR = 1957  # no satellite took an image before
+FIRST_YEAR = 1957
+"""No satellite took an image before."""
 _BEFORE, _LENGTH = 8, 250  # bytes of a match before its word ("mean_sun"), and from there on at most
 
 
@@ -85,7 +86,7 @@ def _metadata(image: PathOrUrl | str, camera: PathOrUrl | str | None) -> Iterato
     for file in (holder, *beside):
         with suppress(BarpcError, OSError):
             status = file.stat()
-            of_pixels = driver_of(read_head(file, RPC_FILE, 64)) not in (None, "VRT")
+            of_pixels = driver_at(file) not in (None, *MOSAICS)
             if not of_pixels and (status.st_dev, status.st_ino) not in seen:
                 seen.add((status.st_dev, status.st_ino))
                 yield read_head(file, RPC_FILE, SCANNED)
@@ -151,15 +152,16 @@ _SENSOR = {
         "band": (b"bandid", b"band_id", b"spectral_processing", b"instrument"),
     }.items()
 }
-_CLOCK = rb"(\d\d:\d\d:\d\d(?:\.\d{1,9})?)"
+_CLOCK = rb"([01]\d|2[0-3]):?([0-5]\d):?([0-5]\d(?:\.\d{1,9})?)"
 _WHEN = _Keyed(
-    (b"first", b"earliest", b"tlc_time", b"tlctime", b"imaging_date", b"acquisition", b'"acquired'),
+    (b"first", b"earliest", b"tlc_time", b"tlctime", b"image_date", b"imaging_date", b"acquisition", b'"acquired',
+     b"idatim"),
     re.compile(
-        rb"(?:first_?line_?time|earliest_?acq_?time|tlc_?time|imaging_date|acquisition_?date(?:_?time)?|\"acquired)\"?"
-        rb"\s{0,9}[>=:]\s{0,9}\"?(\d{4}-\d\d-\d\d)(?:T" + _CLOCK + rb")?",
+        rb"(?:first_?line_?time|earliest_?acq_?time|tlc_?time|imag(?:e|ing)_date|acquisition_?date(?:_?time)?|idatim"
+        rb"|\"acquired)\"?\s{0,9}[>=:]\s{0,9}\"?(\d{4})-?(\d\d)-?(\d\d)(?:[T ]?" + _CLOCK + rb")?",
         re.IGNORECASE,
     ),
-)
+)  # fmt: skip
 _STRIP = _Keyed(
     (b"ds_",), re.compile(rb"(?<![A-Za-z0-9])DS_(PHR1[AB]|SPOT[67]|PNEO[3-6])_(\d{8})(\d{6})\d?_")
 )  # the acquisition by which Airbus names what it delivers: sensor, day, time
@@ -170,13 +172,13 @@ _DAY_TAG = re.compile(r"(\d{4})[-:/]?(\d\d)[-:/]?(\d\d)")
 
 def _time(text: _Text) -> str:
     stated = next(_WHEN.matches(text), None)
-    day = _day(stated[1].decode()) if stated else ""
+    day = _day(b"-".join(stated.groups()[:3]).decode()) if stated else ""
     if not (stated and day):
         return ""
-    clock = stated[2]
-    if clock is None and (later := _IMAGING_TIME.search(text.whole, stated.end(), stated.end() + 500)):
-        clock = later[1]
-    return f"{day}T{clock.decode()}Z" if clock else day
+    clock = stated.groups()[3:]
+    if clock[0] is None and (later := _IMAGING_TIME.search(text.whole, stated.end(), stated.end() + 500)):
+        clock = later.groups()
+    return f"{day}T{b':'.join(clock).decode()}Z" if clock[0] else day
 
 
 def _of_digits(day: str, clock: str) -> str:
@@ -188,6 +190,6 @@ def _of_digits(day: str, clock: str) -> str:
 def _day(text: str) -> str:
     """Return a day, if it is one of a time with satellites; else empty."""
     try:
-        return text if date.fromisoformat(text).year >= _FIRST_YEAR else ""
+        return text if date.fromisoformat(text).year >= FIRST_YEAR else ""
     except ValueError:
         return ""

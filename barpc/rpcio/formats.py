@@ -33,6 +33,8 @@ class Format:
     beside: str = ""  # end of the name of the file that a run writes for an image, after the image's name
     consumers: tuple[str, ...] = ()  # besides barpc, of what is written: rows of `verify_outputs.CONSUMERS`
     sized: bool = False  # whether it states the size of its image
+    reads: str = ""  # what of it is read, and how it is written: words of docs/formats.md
+    writes: str = ""
 
 
 def _has(*patterns: str, markup: bool = False) -> Callable[[str], bool]:
@@ -59,22 +61,54 @@ _GEOM = _has(r"(?m)^[ \t]*+(\w++\.)?line_num_coeff_00[ \t]*+:")
 _is_maxar = _has(r"<(\w+:)?LINENUMCOEF", markup=True)
 _JSON = _has(r"\A\s*+\{", r'"row_num"|(?i:"line_num_coeff")|"rowNum"')
 _SYNTAXES = (
-    Format("txt", _TEXT_ENDS, _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm")),
-    Format("rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,)),
-    Format("geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc")),
-    Format("xml", (".XML",), _is_maxar, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True),
-    Format("json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",)),
     Format(
-        "dimap", (), _has(r"<(\w+:)?Global_RFM", markup=True), xml.read_dimap
-    ),  # a Dimap_Document, or the model alone
-    Format("enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>", markup=True), xml.read_enmap),
-    Format("radarsat", (), _has(r"<(\w+:)?rationalFunctions\b", markup=True), xml.read_radarsat),
-    Format("gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"', markup=True), xml.read_gdal),
-    Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml),
-    Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi),
-    Format("bare", (), text.is_bare_rpc, text.read_bare),
-    Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos),
-)
+        "txt", _TEXT_ENDS, _TXT, text.read_txt, text.write_txt, "_RPC.TXT", (_BESIDE, "rpcm"),
+        reads="`KEY: value`, all with one prefix (`RPC_`) or none; coefficients from 1 or 0; units (feet and radians "
+        "are converted, others refused), signs, `=`, D exponents, UTF-8, UTF-16, Latin-1; denominators that do not "
+        "start with 1. Planet, SkySat, BlackSky, IKONOS, GeoEye, OrbView, KOMPSAT, EROS; ZY-3, Jilin-1 as described; "
+        "WHU-TLC's inverse is not used",
+        writes="shortest exact decimals, no units",
+    ),
+    Format(
+        "rpb", (".RPB",), _RPB, text.read_rpb, text.write_rpb, ".RPB", (_BESIDE,),
+        reads="Maxar's lists in parentheses; RPC00A reordered, SpecIds of converters (XXX) as RPC00B",
+        writes="`RPC00B`; unknown accuracies left out",
+    ),
+    Format(
+        "geom", (".geom",), _GEOM, text.read_geom, text.write_geom, ".geom", ("keywords", "shareloc"),
+        reads="OSSIM's `polynomial_format` B, A; adjustments (`adj_param_N`) applied, a rotation only where rows and "
+        "columns share a denominator; speaks of the FULL image ([crops](conventions.md#crops))",
+        writes="all keys",
+    ),
+    Format(
+        "xml", (".XML",), _is_maxar, xml.read_maxar, xml.write_maxar, ".rpc.xml", (_BESIDE,), sized=True,
+        reads="Maxar's `<isd><RPB>`, with or without namespace",
+    ),
+    Format(
+        "json", (".json",), _JSON, text.read_rpc_json, text.write_json, ".rpc.json", ("rpcm",),
+        reads="names of rpcm, rasterio, VisSat", writes="rpcm's",
+    ),
+    Format(  # a Dimap_Document, or the model alone
+        "dimap", (), _has(r"<(\w+:)?Global_RFM", markup=True), xml.read_dimap,
+        reads="v1, v2, v3: the inverse model; the direct one never",
+    ),
+    Format(
+        "enmap", (), _has(r"<bandID\s", r"(?i)<ROW_NUM_0?1>", markup=True), xml.read_enmap, reads="`band=N`"
+    ),
+    Format(
+        "radarsat", (), _has(r"<(\w+:)?rationalFunctions\b", markup=True), xml.read_radarsat, reads="RADARSAT-2, RCM"
+    ),
+    Format(
+        "gdal", (), _has(r"<(VRTDataset|PAMDataset)\b", r'domain="RPC"', markup=True), xml.read_gdal,
+        reads="VRT, `.aux.xml`",
+    ),
+    Format("yaml", (), _has(r"(?m)^[ \t]++line_num_coeff:"), text.read_yaml, reads="orthority's"),
+    Format("envi", (), _has(r"(?im)^[ \t]*+rpc info\s*+=\s*+\{"), text.read_envi, reads="its header"),
+    Format(
+        "bare", (), text.is_bare_rpc, text.read_bare, reads="90, 92 (tag 50844) or 93 numbers without names"
+    ),
+    Format("alos", (), _has(r"\A[\d+\-. ]{66}[\d+\-. Ee]{960}"), text.read_alos, reads="PRISM, AVNIR"),
+)  # fmt: skip
 FORMATS: dict[str, Format] = {row.name: row for row in _SYNTAXES}
 """Name -> format. One row a syntax; readers are tried in this order."""
 
@@ -89,14 +123,22 @@ class Carrier:
     suffixes: tuple[str, ...]
     write: Callable[[RPC, PathOrUrl, Path, Path, bool], None]  # rpc, image, path, where it will stand, overwrite
     consumers: tuple[str, ...] = ("gdal", "rpcm", "shareloc", "orthority")
+    reads: str = ""  # as of a `Format`
+    writes: str = ""
 
 
 CARRIERS: dict[str, Carrier] = {
     "vrt": Carrier(
-        (".vrt",), lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over)
+        (".vrt",),
+        lambda rpc, image, path, place, over: write_rpc_vrt(rpc, image, path, place=place, overwrite=over),
+        reads="[below](#vrt)",
     ),
     "copy": Carrier(
-        (".tif", ".tiff"), lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over)
+        (".tif", ".tiff"),
+        lambda rpc, image, path, _, over: write_rpc_copy(rpc, image, path, overwrite=over),
+        reads="tag 50844, to the bit",
+        writes="the source's bytes, a new directory behind them (a cloud-optimised header then says so); refused near "
+        "4 GB of classic TIFF; other rasters are converted",
     ),
 }
 """Name -> raster that carries an RPC."""
@@ -183,7 +225,7 @@ def parse_rpc(data: bytes, name: str, options: ReadOptions | None = None) -> tup
 
 
 _PART_OF_MAXAR = re.compile(r"(?im)^[ \t]*+BEGIN_GROUP\s*+=\s*+(ATTITUDE|EPHEMERIS|GEOMETRIC|OPTICAL|PRINCIPAL)")
-holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model)\b", markup=True)
+holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model|Scene_Source)\b", markup=True)  # the last: of DIMAP 1
 
 
 def write_rpc(

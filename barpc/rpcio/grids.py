@@ -27,8 +27,8 @@ from barpc.base.errors import ImageError, RpcError, RpcFormatError
 from barpc.base.geodesy import MAX_COORDINATE, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, Kind
-from barpc.rasters.raster import BLOCK_SIZE, PixelArray, open_raster
-from barpc.rpcio.images import TIFF_PROFILE, copying, created, has_mask, printable, put_tag, read_tag, require_pixels
+from barpc.rasters.raster import BLOCK_SIZE, PixelArray, has_mask, open_raster
+from barpc.rpcio.images import TIFF_PROFILE, copying, created, printable, put_tag, read_tag, require_pixels
 from barpc.scene import BoolArray
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid

@@ -1,5 +1,7 @@
 """RPCs that rasters carry: a VRT that points at the untouched image, a GeoTIFF's tag (50844); a NITF's RPC00B is read.
 
+Any other raster's is what GDAL shows of it (`read_domain`).
+
 The tag is read from the file's directory itself, to the bit: GDAL prints its numbers with 15 digits on the way. A copy
 is made of the source's bytes; only its first directory is written anew, behind the pixels, so that compression, tiles,
 overviews and masks stay as they are, in TIFF and BigTIFF alike.
@@ -25,7 +27,6 @@ from zlib import crc32
 import numpy as np
 import rasterio
 from rasterio._err import CPLE_BaseError
-from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.shutil import copy as raster_copy
 from rasterio.windows import Window
@@ -35,10 +36,19 @@ from barpc.base.errors import ImageError, OutputError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import IMAGE, opened, plain_path, read_head
-from barpc.rasters.raster import Mosaic, identify, open_raster, transformed
-from barpc.rasters.vrt import GDAL_TYPES
-from barpc.rpcio.text import COEFFICIENTS, SINGLE, WIDTHS, cells_of, fields_from_rpc, fields_in_order, rpc_from_fields
-from barpc.rpcio.xml import rpc_domain
+from barpc.rasters.raster import Mosaic, earth_crs, has_mask, identify, open_raster, transformed, vrt_of
+from barpc.rasters.vrt import GDAL_TYPES, Source
+from barpc.rpcio.text import (
+    COEFFICIENTS,
+    SINGLE,
+    WIDTHS,
+    ReadOptions,
+    cells_of,
+    fields_from_rpc,
+    fields_in_order,
+    rpc_from_fields,
+)
+from barpc.rpcio.xml import rpc_domain, rpc_from_domain
 from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
@@ -71,57 +81,57 @@ def write_rpc_vrt(
     ImageError, OutputError
         The image cannot be read; the VRT exists or cannot be written.
     """
-    source, target = plain_source(image_path), Path(place or vrt_path).absolute()
-    plain_path(source)
+    image, target = local_image(image_path), Path(place or vrt_path).absolute()
     plain_path(target)
-    _refuse_same(source, target)
-    name = os.path.relpath(source.resolve(), target.parent.resolve()) if relative else str(source)
-    with open_raster(source) as dataset:
-        width, height = dataset.width, dataset.height
-        file = f'<SourceFilename relativeToVRT="{int(relative)}">{escape(name, quote=False)}</SourceFilename>'
-        frame = f'xOff="0" yOff="0" xSize="{width}" ySize="{height}"'
-        rects = f"<SrcRect {frame} /><DstRect {frame} />"
-        lines = [f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">']
-        if dataset.crs is not None:
-            numbers = ", ".join(repr(v) for v in dataset.transform.to_gdal())
-            lines.append(f"  <SRS>{escape(dataset.crs.to_wkt(), quote=False)}</SRS>")
-            lines.append(f"  <GeoTransform>{numbers}</GeoTransform>")
+    _refuse_same(image, target)
+    with open_raster(image) as dataset:
+        shown = vrt_of(dataset, image)
+        for file in {source.file for source in shown.sources}:
+            plain_path(file)
+            _refuse_same(file, target)
+        folder = target.parent.resolve() if relative else None
+        lines = [f'<VRTDataset rasterXSize="{shown.size[0]}" rasterYSize="{shown.size[1]}">']
+        if shown.srs:
+            lines += [f"  <SRS>{escape(shown.srs, quote=False)}</SRS>"]
+            lines += [f"  <GeoTransform>{', '.join(map(repr, shown.transform or ()))}</GeoTransform>"]
         lines.append(rpc_domain(rpc))
-        bands = zip(dataset.indexes, dataset.dtypes, dataset.nodatavals, dataset.colorinterp, strict=True)
-        for index, dtype, nodata, color in bands:
-            lines += [f'  <VRTRasterBand dataType="{GDAL_TYPES.get(dtype, dtype.capitalize())}" band="{index}">']
-            lines += [] if nodata is None else [f"    <NoDataValue>{nodata!r}</NoDataValue>"]
-            lines += [f"    <ColorInterp>{color.name.capitalize()}</ColorInterp>"]
-            lines += [f"    <SimpleSource>{file}<SourceBand>{index}</SourceBand>{rects}</SimpleSource>"]
+        for index, band in enumerate(shown.bands, 1):
+            lines += [f'  <VRTRasterBand dataType="{GDAL_TYPES[band.dtype]}" band="{index}">']
+            hidden = "<HideNoDataValue>1</HideNoDataValue>" if band.nodata is None else ""
+            lines += [f"    <NoDataValue>{band.fill!r}</NoDataValue>{hidden}"] if band.fill or not hidden else []
+            lines += [f"    <ColorInterp>{band.color.capitalize()}</ColorInterp>"]
+            lines += [f"    {_source_element(source, folder)}" for source in band.sources]
             lines += ["  </VRTRasterBand>"]
-        if has_mask(dataset):
-            mask = f"<SimpleSource>{file}<SourceBand>mask,1</SourceBand>{rects}</SimpleSource>"
+        if shown.mask is not None:
+            mask = "".join(_source_element(source, folder) for source in shown.mask.sources)
             lines += [f'  <MaskBand><VRTRasterBand dataType="Byte">{mask}</VRTRasterBand></MaskBand>']
     write_text(vrt_path, "\n".join([*lines, "</VRTDataset>"]) + "\n", overwrite=overwrite)
 
 
-def plain_source(image_path: Path | str) -> Path:
-    """Return the file with an image's pixels: itself, or the source of a VRT written here (or ImageError)."""
-    source, driver = identify(image_path)
-    if not isinstance(source, Path):
-        raise ImageError(
-            f"{source}: a VRT points at files on disk only; have copies written, or no images (--images copy, none)"
-        )
-    if driver != "VRT":
-        return source
-    with open_raster(source) as mosaic:
-        found: Path | None = mosaic.plain_source()
-    if found is None:
-        raise ImageError(
-            f"{image_path}: a VRT that is more than one whole image is not pointed at; give the image that it is "
-            "made of, or have copies written"
-        )
-    return found.resolve()
+def _source_element(source: Source, folder: Path | None) -> str:
+    """Return a source of a VRT in XML, named relative to a folder, if any."""
+    name = str(source.file) if folder is None else os.path.relpath(source.file.resolve(), folder)
+    parts = [f'<SourceFilename relativeToVRT="{int(folder is not None)}">{escape(name, quote=False)}</SourceFilename>']
+    parts += [f"<SourceBand>{'mask,' * source.mask}{source.band}</SourceBand>"]
+    whole = (0, 0, *source.dst[2:]) if source.dst else None
+    for tag, rect in (("SrcRect", source.src or whole), ("DstRect", source.dst)):
+        frame = " ".join(f'{key}="{n}"' for key, n in zip(("xOff", "yOff", "xSize", "ySize"), rect or (), strict=False))
+        parts += [f"<{tag} {frame} />"] * (rect is not None)
+    if source.plain:
+        return f"<SimpleSource>{''.join(parts)}</SimpleSource>"
+    parts += [] if source.nodata is None else [f"<NODATA>{source.nodata!r}</NODATA>"]
+    parts += [f"<ScaleOffset>{source.scale[1]!r}</ScaleOffset><ScaleRatio>{source.scale[0]!r}</ScaleRatio>"]
+    return f"<ComplexSource>{''.join(parts)}</ComplexSource>"
 
 
-def has_mask(dataset: Any) -> bool:
-    """Return whether a raster has a mask of its own, apart from an alpha band."""
-    return MaskFlags.per_dataset in dataset.mask_flag_enums[0] and ColorInterp.alpha not in dataset.colorinterp
+def local_image(image_path: Path | str) -> Path:
+    """Return the file of an image that a VRT can point at (or ImageError)."""
+    image, _ = identify(image_path)
+    if not isinstance(image, Path):
+        raise ImageError(
+            f"{image}: a VRT points at files on disk only; have copies written, or no images (--images copy, none)"
+        )
+    return image
 
 
 def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, overwrite: bool = False) -> None:
@@ -148,7 +158,7 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
                 shutil.copyfileobj(file, copy)
         else:
             _translate(dataset, partial, Path(copy_path))
-        put_tag(partial, printable(rpc), placed=dataset.crs is not None)
+        put_tag(partial, printable(rpc), placed=earth_crs(dataset) is not None)
 
 
 def write_crop(
@@ -185,7 +195,7 @@ def write_crop(
                 f"{image_path}: window {window} is not inside the image of {dataset.width} x {dataset.height}"
             )
         _copy_window(dataset, partial, Path(crop_path), Window(col, row, width, height))
-        put_tag(partial, cropped, placed=dataset.crs is not None)
+        put_tag(partial, cropped, placed=earth_crs(dataset) is not None)
     return cropped
 
 
@@ -215,11 +225,11 @@ def _translate(dataset: Any, partial: Path, target: Path) -> None:
 def _copy_window(dataset: Any, partial: Path, target: Path, window: Window) -> None:
     profile = {"width": window.width, "height": window.height, "count": dataset.count, **TIFF_PROFILE}
     profile |= {"dtype": dataset.dtypes[0], "nodata": dataset.nodata}
-    if dataset.crs is not None:
+    if (crs := earth_crs(dataset)) is not None:
         a, b, _, d, e, _ = dataset.transform[:6]
         x, y = transformed(dataset.transform, window.col_off, window.row_off)
         moved = rasterio.Affine(a, b, x, d, e, y)
-        profile |= {"crs": dataset.crs, "transform": moved}
+        profile |= {"crs": crs, "transform": moved}
 
     def part(block: Window) -> Window:
         return Window(window.col_off + block.col_off, window.row_off + block.row_off, block.width, block.height)
@@ -455,3 +465,16 @@ def read_nitf(path: PathOrUrl) -> RPC | None:
     return rpc_from_fields(
         cells_of(record[1:], _RPC_FIELD_WIDTHS, SINGLE, name, f"RPC00{match.group(1).decode()}"), name
     )
+
+
+# --- any raster -------------------------------------------------------------------------------------------
+
+
+def read_domain(path: PathOrUrl, options: ReadOptions) -> RPC | None:
+    """Read the RPC that GDAL shows of a raster without its side files, None without one.
+
+    ImageError where it cannot be opened, RpcFormatError where numbers are missing or none.
+    """
+    with open_raster(path) as dataset:
+        items, driver = dataset.tags(ns="RPC"), dataset.driver
+    return rpc_from_domain(items, f"{path} (RPC by GDAL's driver {driver})", options) if items else None

@@ -14,8 +14,9 @@ from rasterio.crs import CRS
 from rasterio.errors import RasterioError
 from rasterio.warp import transform as warp_points
 
-from barpc.base.geodesy import Array, wrap_longitude
+from barpc.base.geodesy import Array, ecef_from_ground, wrap_longitude
 from barpc.scene import Doubt
+from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 
 BEYOND, FAR_BEYOND = 1.5, 4.0
@@ -26,6 +27,7 @@ _ANOTHER_SIZE = 0.02  # of a side: vendors' scales are half the sides to a pixel
 _MAP_SHAPE = 0.005, 0.05  # of the longer side: a map on its axes is exact, a turned geotransform fitted to corners
 _MAP_SHIFT = 0.1, 0.5  # of the longer side: by the pointing that somebody corrected in one of both
 _LEAST_SHAPE = 4.0  # px
+_OFF_CORNERS = 30.0  # m: seven public SPOT scenes 2.7 at most; corners rounded to seconds are 22 off
 _LEVELS = 33  # altitudes of the RPC at which its image may lie on the map
 
 
@@ -42,6 +44,16 @@ def doubts_of(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None = None)
     """Return the reasons why an RPC is not that of an image of a size [px], and of a geotransform, if it has one."""
     found = (_another_map(rpc, size, frame), _another_ground(rpc, size), _another_size(rpc, size))
     return tuple(sorted((one for one in found if one is not None), key=lambda one: not one.refused))
+
+
+def corners_off(model: SensorModel, corners: Array) -> tuple[str, tuple[Doubt, ...]]:
+    """Return the distance of a camera from its producer's corners (N, 4), `Linescan.corners`, in words, and doubts."""
+    stated = np.column_stack([corners[:, :2], np.zeros(len(corners))])
+    ground = ecef_from_ground(model.localize(corners[:, 2:], np.zeros(len(corners))))
+    off = float(np.linalg.norm(ground - ecef_from_ground(stated), axis=1).max())
+    said = f"the corners that its producer states are met within {off:.1f} m"
+    doubtful = not off <= _OFF_CORNERS
+    return said, (Doubt(f"the corners that its producer states lie {off:.0f} m from the camera's"),) * doubtful
 
 
 def reach(rpc: RPC, size: tuple[int, int]) -> float:

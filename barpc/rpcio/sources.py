@@ -1,7 +1,8 @@
 """Where an image's RPC comes from: the file itself, or one of the files beside it.
 
 The order is GDAL's: a vendor's file beside an image goes before what the image itself carries, so that
-barpc sees the camera that every other tool sees. What it found, and what it passed over, is always said.
+barpc sees the camera that every other tool sees; last stands what GDAL shows of a raster of any other kind. What it
+found, and what it passed over, is always said.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from pathlib import Path
 from barpc.base.errors import BarpcError, ImageError, MissingRpcError, RpcError, RpcFormatError
 from barpc.base.remote import PathOrUrl, beside, location
 from barpc.base.safe_io import IMAGE, RPC_FILE, encoding_of, read_bytes, read_head
-from barpc.rasters.raster import driver_of, identify, open_raster
-from barpc.rasters.vrt import MAGIC, read_vrt
+from barpc.rasters.composed import tiles_of
+from barpc.rasters.raster import MOSAICS, driver_at, earth_crs, identify, open_raster, unknown_kind
+from barpc.rasters.vrt import read_vrt
 from barpc.rpcio.formats import FORMATS, files_of, holds_physical, parse_rpc
-from barpc.rpcio.images import read_nitf, read_tag
+from barpc.rpcio.images import read_domain, read_nitf, read_tag
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.rpcio.xml import rpc_from_domain
 from barpc.sensor.rpc import RPC
@@ -30,7 +32,7 @@ class RpcSource:
     """An RPC and where it came from."""
 
     rpc: RPC
-    format: str  # tag, nitf, or a row of FORMATS
+    format: str  # tag, nitf, domain, or a row of FORMATS
     path: PathOrUrl  # the file that holds it: the image, or one beside it
     notes: tuple[str, ...] = ()  # what the user should know: an origin that was applied, files passed over
     size: tuple[int, int] | None = None  # width and height [px] of the mosaic whose tiles a file lists
@@ -68,13 +70,24 @@ def sidecars(image: Path | str) -> list[Sidecar]:
 
 
 def metadata_beside(image: Path) -> Path:
-    """Return the XML beside an image that may hold its physical model: Maxar's of its name, Airbus' ``DIM_*.XML``."""
+    """Return the XML beside an image that may hold its physical model: Maxar's or SPOT's, Airbus' ``DIM_*.XML``."""
     present, product = files_of(image.parent), image.stem[4:]  # of IMG_<product>_R1C1
     names = (f"{image.stem}.xml", f"dim_{product}.xml", f"dim_{product.rpartition('_')[0]}.xml")
+    if (scene := scene_beside(image)) is not None:
+        return scene
     for name in names:
         if name.lower() in present:
             return image.parent / present[name.lower()]
     raise ImageError(f"{image}: no metadata with a physical model beside it ({' or '.join(names[:2])})")
+
+
+def scene_beside(image: Path) -> Path | None:
+    """Return the ``.DIM`` of a SPOT scene: of the image's name, or ``METADATA.DIM`` beside ``IMAGERY.*``."""
+    present = files_of(image.parent)
+    for name in (f"{image.stem}.dim".lower(), *["metadata.dim"] * (image.stem.lower() == "imagery")):
+        if name in present:
+            return image.parent / present[name]
+    return None
 
 
 def described(path: PathOrUrl) -> tuple[tuple[int, int] | None, bool]:
@@ -144,9 +157,9 @@ def shadows(image: Path | str) -> list[Sidecar]:
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
     """
     image = location(image)
-    head = read_head(image, IMAGE, 64)
-    vrt = _is_vrt(head)
-    own = vrt or _own_rpc(image, head) is not None
+    driver = _driver_of(image)
+    vrt = driver == "VRT"
+    own = vrt or _own_rpc(image, driver) is not None
     found = (s for s in sidecars(image) if s.kind != "strip")  # which no tool reads for one tile
     return [s for s in found if s.kind == "geom" or (s.before_tag and not vrt) or not own]
 
@@ -193,8 +206,8 @@ def read_rpc(path: str | os.PathLike[str], *, first_pixel: float | None = None, 
 def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
     """Read the RPC of an image or of an RPC file, and where it came from.
 
-    For an image: the vendor's file beside it, the RPC in the image, GDAL's ``.aux.xml``, OSSIM's ``.geom``,
-    in this order. Any other file is read by what its content says it is.
+    For an image: the vendor's file beside it, the RPC in a GeoTIFF or NITF, GDAL's ``.aux.xml``, OSSIM's ``.geom``,
+    and what GDAL shows of a raster of another kind, in this order. Any other file is read by what its content is.
 
     Parameters
     ----------
@@ -211,53 +224,55 @@ def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None =
     path = location(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
+    driver = _driver_of(path)
     text = encoding_of(head)[:6] == "utf-16" or b"\0" not in head  # no other text holds a zero byte near its start
-    if not text or driver_of(head) not in (None, "VRT"):
-        return _image_source(path, head, options)
-    if _is_vrt(head) and isinstance(path, Path):
+    if not text or driver not in (None, *MOSAICS):
+        return _image_source(path, driver, options)
+    if driver == "VRT" and isinstance(path, Path):
         items = read_vrt(path).metadata.get("RPC")
         if items is None:
-            return _image_source(path, head, options)
+            return _image_source(path, driver, options)
         return RpcSource(rpc_from_domain(items, str(path), options), "gdal", path)
     data = read_bytes(path, RPC_FILE)
-    if tiles := _tile_extents(decode_text(data), path):
+    if tiles := tiles_of(decode_text(data), path):
         width, height = (max(corners[i] for corners in tiles.values()) + 1 for i in (2, 3))
-        found = _image_source(path, head, options)
+        found = _image_source(path, driver, options)
         return replace(found, notes=(f"a mosaic of {len(tiles)} tiles", *found.notes), size=(width, height))
     rpc, name = parse_rpc(data, str(path), options)
     return RpcSource(rpc, name, path)
 
 
-def _is_vrt(head: bytes) -> bool:
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(MAGIC)
+def _driver_of(path: PathOrUrl) -> str | None:
+    """Return the driver of an image; a VRT may begin with a byte order mark or blanks."""
+    return driver_at(path, read_head(path, IMAGE, 64).removeprefix(b"\xef\xbb\xbf").lstrip())
 
 
-def _image_source(path: PathOrUrl, head: bytes, options: ReadOptions) -> RpcSource:
+def _image_source(path: PathOrUrl, driver: str | None, options: ReadOptions) -> RpcSource:
     found = sidecars(path)
     first = next((sidecar for sidecar in found if sidecar.before_tag), None)
     own: RPC | None = None
     try:
-        own = _own_rpc(path, head)
+        own = _own_rpc(path, driver)
     except RpcError:
         if first is None:
             raise
     if first is None and own is None and found:
         first = found[0]
+    shown = driver not in (None, *MOSAICS) and own is None and (first is None or driver not in _OWN)
+    domain = _domain(path, options, alone=first is None) if shown else None
     ignored = [s.path.name for s in found if s is not first]
     if first is not None:
         source = _sidecar_source(path, first, options)
-        ignored = ["the image's own RPC"] * (own is not None) + ignored
+        ignored = ["the image's own RPC"] * (own is not None or domain is not None) + ignored
     elif own is not None:
-        source = RpcSource(own, "tag" if driver_of(head) == "GTiff" else "nitf", path)
+        source = RpcSource(own, "tag" if driver == "GTiff" else "nitf", path)
+    elif domain is not None:
+        source = RpcSource(domain, "domain", path)
     else:
         raise MissingRpcError(
-            f"{path}: no RPC in the image and none beside it (.RPB, _RPC.TXT, .XML, .geom and others)"
-            + _with_gcps(path)
-            + (
-                "; HDF5 files are not read: write its coefficients as an _RPC.TXT"
-                if head.startswith(_HDF5_MAGIC)
-                else ""
-            )
+            f"{path}: {'no RPC in the image and none' if driver else f'{unknown_kind(path)}, and no RPC'} beside it"
+            f" (.RPB, _RPC.TXT, .XML, .geom and others){_with_gcps(path)}"
+            + ("" if driver else "; write its coefficients as an _RPC.TXT")
         )
     return replace(source, notes=source.notes + ((f"not used: {', '.join(ignored)}",) if ignored else ()))
 
@@ -269,9 +284,20 @@ def _with_gcps(path: PathOrUrl) -> str:
     return ""
 
 
-def _own_rpc(path: PathOrUrl, head: bytes) -> RPC | None:
-    reader = {"GTiff": read_tag, "NITF": read_nitf}.get(driver_of(head) or "")
-    return reader(path) if reader else None
+_OWN = {"GTiff": read_tag, "NITF": read_nitf}  # in these GDAL's order puts it before some files beside the image
+
+
+def _own_rpc(path: PathOrUrl, driver: str | None) -> RPC | None:
+    return _OWN[driver](path) if driver in _OWN else None
+
+
+def _domain(path: PathOrUrl, options: ReadOptions, alone: bool) -> RPC | None:
+    """Return the RPC that GDAL shows of an image; errors are those of the image where no other file has one."""
+    if alone:
+        return read_domain(path, options)
+    with suppress(BarpcError):
+        return read_domain(path, options)
+    return None
 
 
 def _sidecar_source(image: PathOrUrl, sidecar: Sidecar, options: ReadOptions) -> RpcSource:
@@ -284,7 +310,6 @@ def _sidecar_source(image: PathOrUrl, sidecar: Sidecar, options: ReadOptions) ->
     return RpcSource(rpc.window(*window), name, sidecar.path, (f"{note} applied",))
 
 
-_HDF5_MAGIC = b"\x89HDF"
 _RpcWindow = tuple[tuple[float, float, float, float], str] | None
 """Corner and steps of a window of the image that an RPC speaks of, and what it is; None for the whole."""
 
@@ -293,7 +318,7 @@ def _crop_origin(image: PathOrUrl, _path: PathOrUrl) -> _RpcWindow:
     """Return where a crop is by its geotransform without CRS: a ``.geom`` speaks of the full image."""
     with open_raster(image) as dataset:
         step_x, _, x, _, step_y, y = dataset.transform[:6]
-        has_crs = dataset.crs is not None
+        has_crs = earth_crs(dataset) is not None
     if has_crs or (abs(step_x), abs(step_y), x, y) == (1.0, 1.0, 0.0, 0.0):
         return None
     if step_x <= 0 or step_y == 0:
@@ -336,18 +361,6 @@ def _file_beside(file: PathOrUrl, name: str) -> PathOrUrl | None:
     return None if found is None else file.parent / found
 
 
-def _tile_extents(text: str, path: PathOrUrl) -> dict[str, tuple[int, int, int, int]]:
-    """Return the first and last col, row of every tile that Maxar's ``.TIL`` lists, by name in lower case."""
-    found = {}
-    for number, part in enumerate(re.split(r"BEGIN_GROUP\s*+=\s*+TILE_\d++", text)[1:], start=1):
-        words = {word.lower(): value for word, value in re.findall(r'(\w++)\s*+=\s*+"?([^";\n]*+)"?;', part)}
-        cells = [words.get(f"{key}offset", "").strip() for key in ("ulcol", "ulrow", "lrcol", "lrrow")]
-        if not (words.get("filename") and all(re.fullmatch(r"\d{1,7}", cell) for cell in cells)):
-            raise RpcFormatError(f"{path}: tile {number} has no file name, or no corners UL and LR in pixels")
-        found[words["filename"].strip().lower()] = (int(cells[0]), int(cells[1]), int(cells[2]), int(cells[3]))
-    return found
-
-
 def _strip_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
     """Return the origin of a tile in the strip whose RPC `path` is: by the ``.TIL`` beside either."""
     name, place = f"{_strip_name(image.stem)}.TIL", _TILE.search(image.stem)
@@ -358,7 +371,7 @@ def _strip_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
         raise RpcFormatError(
             f"{path}: the RPC of a strip, and where its tile {image.name} lies is not known: {name} is missing"
         )
-    corners = _tile_extents(decode_text(read_bytes(til, RPC_FILE)), til).get(image.name.lower())
+    corners = tiles_of(decode_text(read_bytes(til, RPC_FILE)), til).get(image.name.lower())
     with open_raster(image) as dataset:
         size = dataset.width, dataset.height
     if corners is None or size != (corners[2] - corners[0] + 1, corners[3] - corners[1] + 1):

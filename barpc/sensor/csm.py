@@ -25,8 +25,8 @@ from barpc.base.safe_io import CAMERA_STATE, parse_json, read_text
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.document import LINE_TIME_TOLERANCE, XmlFields, padded
-from barpc.sensor.linescan import ATTITUDE_STEP, Detector, Samples, camera_of_samples, unit
 from barpc.sensor.pushbroom import Frame, Pushbroom
+from barpc.sensor.samples import ATTITUDE_STEP, Detector, Samples, camera_of_samples, unit
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

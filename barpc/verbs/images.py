@@ -13,7 +13,7 @@ from typing import Any
 from barpc.base.errors import BarpcError, InputError, Remark
 from barpc.base.manifest import LAST
 from barpc.base.remote import PathOrUrl, is_url
-from barpc.base.safe_io import IMAGE, read_head, unread
+from barpc.base.safe_io import unread
 from barpc.cameras import ImageLike, file_of, open_camera, split_spec
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
@@ -42,7 +42,7 @@ def place_of(image: ImageLike | SensorModel) -> PathOrUrl:
 # --- folders and patterns ---------------------------------------------------------------------------------
 
 
-_ENDS = (".tif", ".tiff", ".ntf", ".nitf", ".nsf", ".jp2", ".j2k", ".vrt")
+_ENDS = (".tif", ".tiff", ".ntf", ".nitf", ".nsf", ".jp2", ".j2k", ".pix", ".img", ".dat", ".vrt")
 
 
 def expanded(specs: Sequence[str]) -> list[str]:
@@ -103,8 +103,8 @@ def _matching_files(name: str) -> list[str]:
 
 
 def _is_raster(path: Path) -> bool:
-    from barpc.rasters.raster import driver_of
+    from barpc.rasters.raster import driver_at
 
     with suppress(BarpcError):
-        return driver_of(read_head(path, IMAGE, 64)) is not None
+        return driver_at(path) is not None
     return False

@@ -267,7 +267,7 @@ def export(
     run_dir : path of a finished adjustment
     out_dir : path, a new folder; files in it point at images and run relative to it
     to : str, the tool: satnerf, colmap, s2p, cars, asp, stac, points
-    **keywords : fields of `ExportOptions`: alt, overwrite
+    **keywords : fields of `ExportOptions`: alt, time, overwrite, ...
 
     Returns
     -------
@@ -276,20 +276,20 @@ def export(
     Raises
     ------
     InputError
-        No such tool, no finished adjustment, altitudes that are no interval.
+        No such tool, no finished adjustment, altitudes that are no interval; its child `UnknownTimeError`: the time of
+        acquisition of an image is unknown, and the tool needs it.
     OutputError
         The folder is in use, not empty, or the run's own.
 
     Examples
     --------
     >>> _ = barpc.adjust("data_samples/*.tif", "finished", points_per_image=500)
-    >>> [path.name for path in barpc.export("finished", "nerf", "satnerf")][:2]
+    >>> [path.name for path in barpc.export("finished", "nerf", "satnerf", time=["2020-06-01T10:30:00"])][:2]
     ['view_00.json', 'view_01.json']
     """
     from barpc.export.targets import export_run
 
-    chosen = with_values(ExportOptions(), keywords, "export")
-    return export_run(run_dir, to, out_dir, alt_range=chosen.alt, overwrite=chosen.overwrite)
+    return export_run(run_dir, to, out_dir, with_values(ExportOptions(), keywords, "export"))
 
 
 def open_run(run_dir: PathLike) -> OpenedRun:

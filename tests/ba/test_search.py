@@ -494,6 +494,8 @@ def test_tie_points_among_some_views_are_linearised_where_they_are_not_too_many(
     sized(unknowns_together=3 * a_view)
     assert linearised_among(one.outcome, one.block, views) is not None
     assert linearised_among(one.outcome, one.block, np.arange(4)) is None
+    control = replace(one.block, use=one.block.use & False)  # an image alone by its control: no tie points to search
+    assert linearised_among(one.outcome, control, views) is None
     sized(elements_linearised=1)
     assert linearised_among(one.outcome, one.block, views) is None
 

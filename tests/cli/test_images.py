@@ -110,7 +110,7 @@ def test_a_folder_says_by_which_ends_images_are_known(tmp_path):
     (tmp_path / "deep.tif").mkdir()
     with pytest.raises(InputError) as error:
         expanded([str(tmp_path)])
-    ends = ".tif, .tiff, .ntf, .nitf, .nsf, .jp2, .j2k, .vrt"
+    ends = ".tif, .tiff, .ntf, .nitf, .nsf, .jp2, .j2k, .pix, .img, .dat, .vrt"
     assert str(error.value) == f"{tmp_path}: a folder without images ({ends})"
     write_image(tmp_path / "B.TIF")
     assert expanded([str(tmp_path)]) == [str(tmp_path / "B.TIF")]

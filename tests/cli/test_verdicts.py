@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from barpc.base.verb_options import ExportOptions
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell_result
 from barpc.cli.fit import _certificate
@@ -269,6 +270,6 @@ def test_an_export_names_its_files_and_says_where_images_stay(
     said = capsys.readouterr()
     assert (json.loads(said.out), said.err) == (["x", "y"], "")
     assert asked == [
-        ((str(tmp_path), target, "out"), {"alt_range": None, "overwrite": False}),
-        ((str(tmp_path), target, "out"), {"alt_range": (80.0, 320.0), "overwrite": True}),
+        ((str(tmp_path), target, "out", ExportOptions()), {}),
+        ((str(tmp_path), target, "out", ExportOptions(alt=(80.0, 320.0), overwrite=True)), {}),
     ]

@@ -72,3 +72,19 @@ def test_a_table_is_what_its_command_prints(page: Path, command: str, end: int, 
     said = text[end:] if page.parent == DOCS and not text[:end].count("|") else text[end:].partition("\n\n")[0]
     assert rows(said)
     assert not unlike(said, done.stdout)
+
+
+FIGURE = re.compile(r"\b\d+(?:\.\d+)? ?(?:px|%|s|m|km|MB|minutes?|hours?)(?![\w/])")
+
+
+def test_every_figure_of_the_readme_stands_on_the_page_that_it_links_to() -> None:
+    text = re.sub(r"```.*?```", "", (ROOT / "README.md").read_text(encoding="utf-8"), flags=re.DOTALL)
+    found = [
+        (figure[0], re.search(r"\]\((docs/[\w/]+\.md)(?:#[\w-]+)?\)", paragraph[figure.end() :]))
+        for paragraph in text.split("\n\n")
+        for figure in FIGURE.finditer(paragraph)
+    ]
+    assert [figure for figure, _ in found] == ["4.8 px", "20 %", "94 %"]
+    for figure, link in found:
+        assert link is not None, figure
+        assert figure in (ROOT / link[1]).read_text(encoding="utf-8")

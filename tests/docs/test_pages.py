@@ -14,7 +14,9 @@ from types import ModuleType
 import pytest
 
 import barpc
+from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.report.runfiles import TABLES
+from barpc.rpcio import FORMATS
 from tests.docs.pages import DOCS, PAGES, ROOT, anchors, links
 
 
@@ -90,6 +92,17 @@ def test_the_limits_are_those_of_the_code():
     told = dict(generator.rows())
     assert told["an XML file"] == "32 MiB, 100 levels, 2,000,000 elements"
     assert len(told) == len(generator.rows())
+
+
+def test_the_tables_of_formats_are_those_of_the_code():
+    generator = script("generate_formats")
+    text = (DOCS / "formats.md").read_text(encoding="utf-8")
+    assert generator.page(text) == text
+    assert "7. **the image's own** (GTiff, NITF), 8. `X.tif.aux.xml`" in text
+    assert all(row.reads for row in FORMATS.values())
+    assert all(row.holds for row in GCP_FORMATS.values())
+    with pytest.raises(ValueError, match="no place for 3 tables"):
+        generator.page(text.replace(generator.END, ""))
 
 
 def test_the_page_of_the_report_names_every_table_of_a_run():

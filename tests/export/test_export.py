@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.enums import ColorInterp
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
+from barpc.base.verb_options import ExportOptions
 from barpc.cli import main
+from barpc.export.colmap import _Pixels
+from barpc.export.light import sun_angles
+from barpc.export.shots import read_scene
 from barpc.export.targets import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
@@ -20,9 +29,12 @@ from barpc.sensor.geometry import image_grid
 from tests.lanes import rest_slow
 from tests.sealing import seal
 
+DATED = {"time": ("2013-04-17T22:00:00+02:00",)}  # for images whose files state no time
+
 
 def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
-    export_run(run, target, tmp_path / target, **options)
+    exact = {"exact": True} if target == "colmap" else {}  # (the images of these runs do not exist)
+    export_run(run, target, tmp_path / target, ExportOptions(**DATED | exact | options))
     return tmp_path / target
 
 
@@ -77,9 +89,12 @@ def test_satnerf_files_hold_what_its_loader_reads(run_dir, tmp_path):
     records = [read(out / name) for name in names]
     paths = [Path(view["path"]) for view in read(run_dir / "summary.json")["views"]]
     assert [(out / one["img"]).resolve() for one in records] == paths  # in several folders: from OUT
-    assert [one["sun_elevation"] for one in records] == [52.25, None, None]
-    assert [one["sun_azimuth"] for one in records] == [150.5, None, None]
-    assert [one["acquisition_date"] for one in records] == ["2013-04-17T10:32:15.5Z", None, None]
+    times = [datetime.strptime(one["acquisition_date"], "%Y%m%d%H%M%S") for one in records]  # as its scripts read it
+    assert [f"{time:%d %H:%M:%S}" for time in times] == ["17 10:32:15", "17 20:00:00", "17 20:00:00"]
+    angles = np.array([[float(one["sun_elevation"]), float(one["sun_azimuth"])] for one in records])
+    assert angles[0] == pytest.approx([52.25, 150.5])  # as its file states it
+    lon, lat = records[1]["geojson"]["center"]
+    assert angles[1:] == pytest.approx(np.array([sun_angles(times[1].replace(tzinfo=UTC), lon, lat)] * 2), abs=0.02)
     pyproj = pytest.importorskip("pyproj")
     back = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
     for one in records:
@@ -176,7 +191,7 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
 @pytest.mark.slow
 def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
     for _ in range(2):  # again: in place of the first
-        export_run(southern, "colmap", tmp_path / "model", overwrite=True)
+        export_run(southern, "colmap", tmp_path / "model", ExportOptions(overwrite=True, exact=True))
     lines = (tmp_path / "model/sparse/0/images.txt").read_text().splitlines()[::2]
     views = read(southern / "summary.json")["views"]
     for line, view in zip(lines, views, strict=True):
@@ -188,7 +203,7 @@ def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp
     theirs = tmp_path / "other/images" / lines[0].split()[-1]
     theirs.write_bytes(b"mine")
     with pytest.raises(OutputError):
-        export_run(southern, "colmap", tmp_path / "other", overwrite=True)
+        export_run(southern, "colmap", tmp_path / "other", ExportOptions(overwrite=True, exact=True))
     assert theirs.read_bytes() == b"mine"
 
 
@@ -216,7 +231,7 @@ def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
     (run / "summary.json").write_text(summary.replace('.tif"', ' a.tif"'))
     seal(run)
     with pytest.raises(InputError, match="space"):
-        export_run(run, "colmap", tmp_path / "out")
+        exported(run, "colmap", tmp_path)
 
 
 def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
@@ -254,9 +269,9 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     np.testing.assert_allclose(np.diag(scatter), np.diag(matrix[7]), rtol=0.15)
 
 
-def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, tmp_path):
+def test_stac_items_are_valid_of_a_day_and_across_the_date_line(run_dir, tmp_path):
     pystac = pytest.importorskip("pystac")
-    out = exported(run_dir, "stac", tmp_path)
+    out = exported(run_dir, "stac", tmp_path, time=(), date=("2013-04-17",))
     views = read(run_dir / "summary.json")["views"]
     for view in views:
         content = read(out / f"{view['name']}.json")
@@ -283,12 +298,14 @@ def test_stac_items_are_valid_without_a_date_and_across_the_date_line(run_dir, t
         assert south <= item.bbox[1] < item.bbox[3] <= north
         assert 0.0 <= (item.bbox[0] - west) % turn <= (item.bbox[2] - west) % turn <= (east - west) % turn + 1e-9
     assert read(out / f"{views[0]['name']}.json")["properties"]["datetime"] == "2013-04-17T10:32:15.5Z"
-    assert read(out / f"{views[1]['name']}.json")["properties"]["datetime"] is None
+    day = pystac.Item.from_file(str(out / f"{views[1]['name']}.json"))
+    assert day.datetime is None
+    assert f"{day.common_metadata.end_datetime:%F %T}" == "2013-04-17 23:59:59"
 
 
 @pytest.mark.slow
 def test_altitudes_may_be_given(southern, tmp_path):
-    out = exported(southern, "colmap", tmp_path, alt_range=(-200.0, 2000.0))
+    out = exported(southern, "colmap", tmp_path, alt=(-200.0, 2000.0))
     assert read(out / "world.json")["alt_range"] == [-200.0, 2000.0]
 
 
@@ -298,13 +315,13 @@ def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp
     out = exported(southern, target, tmp_path)
     before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
     with pytest.raises(OutputError, match="not empty"):
-        export_run(southern, target, out)
-    export_run(southern, target, out, overwrite=True)
+        exported(southern, target, tmp_path)
+    exported(southern, target, tmp_path, overwrite=True)
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
     foreign = sorted(before)[0]
     (out / foreign).write_text("mine")
     with pytest.raises(OutputError, match="not replaced"):
-        export_run(southern, target, out, overwrite=True)
+        exported(southern, target, tmp_path, overwrite=True)
     assert (out / foreign).read_text() == "mine"
 
 
@@ -320,7 +337,7 @@ def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
 
 def test_the_run_s_own_folder_is_never_an_export(southern):
     with pytest.raises(OutputError, match="one of its own"):
-        export_run(southern, "s2p", southern, overwrite=True)
+        export_run(southern, "s2p", southern, ExportOptions(overwrite=True))
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", "x\0y"])
@@ -404,6 +421,51 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
         export_run(southern, "obj", tmp_path / "x")
     for altitudes in ((5.0, 5.0), (6.0, 5.0)):
         with pytest.raises(InputError, match="the lower one first"):
-            export_run(southern, "s2p", tmp_path / "x", alt_range=altitudes)
+            export_run(southern, "s2p", tmp_path / "x", ExportOptions(alt=altitudes))
     assert not (tmp_path / "x").exists()
     assert export_run(southern, "s2p", tmp_path / "x") == [tmp_path / "x" / "config.json"]
+
+
+@pytest.mark.parametrize(
+    ("target", "flags", "said"),
+    [
+        ("s2p", ["--images"], "--exact, --images and --tolerance go with --to colmap, not s2p"),
+        ("colmap", ["--exact", "--tolerance", "0.2"], "--exact takes the images as they are"),
+        ("colmap", ["--tolerance", "0"], "tolerance"),
+    ],
+)
+def test_flags_that_do_not_go_together_are_wrong_usage(target, flags, said, southern, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(southern), str(tmp_path / "out"), "--to", target, *flags])
+    assert stop.value.code == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_pictures_of_images_that_are_gone_are_not_made(southern, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["export", str(southern), str(tmp_path / "out"), "--to", "colmap"])
+    assert stop.value.code == 1
+    assert re.fullmatch(r"barpc: .*north\.tif: .*\n", capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_a_picture_has_the_colours_of_its_image(southern, tmp_path):
+    rng = np.random.default_rng(0)
+    bands = rng.integers(1, 200, (4, 40, 50)).astype(np.uint8)
+    bands[0, :8] = 0  # a border
+    path = tmp_path / "rgb.tif"
+    with rasterio.open(path, "w", driver="GTiff", width=50, height=40, count=4, dtype="uint8", nodata=0) as file:
+        file.write(bands)
+        file.colorinterp = [getattr(ColorInterp, name) for name in ("blue", "green", "red", "undefined")]
+    (shot, *_) = read_scene(southern).shots
+    pixels = _Pixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
+    shown, valid = pixels.read((5, 4, 30, 20))
+    assert shown.shape == (20, 30, 3)
+    for k, band in enumerate((2, 1, 0)):
+        low, high = np.percentile(bands[band][bands[band] > 0], [0.5, 99.5])
+        expected = np.clip((bands[band, 4:24, 5:35] - low) / (high - low) * 255, 0, 255)
+        assert shown[4:, :, k] == pytest.approx(expected[4:], abs=4)
+    assert not valid[:4].any()
+    assert valid[4:].all()

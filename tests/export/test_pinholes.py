@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from barpc.export.pinholes import Pinhole, fit_pinhole
-from barpc.export.shots import Sampled
+from barpc.base.errors import InputError
+from barpc.export import pinholes
+from barpc.export.pinholes import Pinhole, fit_camera, pinhole_camera
+from barpc.export.shots import Sampled, Scene, read_scene
 from barpc.sensor.curve import rotation_matrix
 
 TURN = rotation_matrix(np.array([np.pi - 0.2, 0.1, 0.05]))  # looks down
@@ -17,6 +21,10 @@ SIGHT = -TURN.T @ TRUE.translation / FAR
 
 def world(num: int = 60) -> np.ndarray:
     return np.random.default_rng(0).uniform(-400, 400, (num, 3)) * [1.0, 1.0, 0.2]
+
+
+def fit_pinhole(samples: Sampled, sight: np.ndarray, far: float | None = None) -> Pinhole:
+    return pinhole_camera(fit_camera(samples, sight, far))
 
 
 def test_a_pinhole_divides_by_the_depth():
@@ -103,3 +111,85 @@ def test_a_pinhole_of_noisy_points_is_where_their_squares_are_least():
     for step in np.diag([1e-5] * 3 + [0.1] * 3 + [1e-5] * 2 + [0.1] * 2):
         high, low = cost(step), cost(-step)
         assert (high - low) ** 2 / 8 / (high + low - 2 * least) < 1e-6 * least
+
+
+# --- pictures -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scenes(southern, on_date_line) -> list[Scene]:
+    return [read_scene(southern), read_scene(on_date_line)]
+
+
+def test_a_skewed_camera_is_found_where_there_is_one():
+    camera = np.array([[9000.0, 40.0, 480.0], [0.0, 8500.0, 300.0], [0.0, 0.0, 1.0]]) @ np.column_stack(
+        [TRUE.rotation, TRUE.translation]
+    )
+    points = world()
+    seen = np.column_stack([points, np.ones(len(points))]) @ camera.T
+    found = fit_camera(Sampled(points, seen[:, :2] / seen[:, 2:]), SIGHT, skewed=True)
+    assert found / found[2, 3] == pytest.approx(camera / camera[2, 3], rel=1e-6, abs=1e-9)
+
+
+def missed(scene: Scene, shot, picture, margin: float = 0.0) -> np.ndarray:
+    """How far [px] the plain arithmetic of a reader is from the ground that the RPC sees in a picture, by PROJ."""
+    pyproj = pytest.importorskip("pyproj")
+    to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    rng, (col, row, width, height) = np.random.default_rng(5), picture.window
+    image = rng.uniform([col, row], [col + width - 1, row + height - 1], (4000, 2))
+    alt = rng.uniform(*scene.alt_range, 4000)
+    ecef = np.column_stack(to_ecef.transform(*shot.rpc.localize(image, alt).T[:2], alt))
+    matrix = np.linalg.inv(scene.world_to_ecef)
+    x, y, z = ((ecef @ matrix[:3, :3].T + matrix[:3, 3]) @ picture.pinhole.rotation.T + picture.pinhole.translation).T
+    (fx, fy), (w, h) = picture.pinhole.focal, picture.size
+    assert fx == fy  # square
+    shown = np.column_stack([fx * x / z + w / 2, fx * y / z + h / 2])
+    assert (shown >= 0).all()
+    assert (shown <= [w, h]).all()
+    back = np.column_stack([shown, np.ones(4000)]) @ picture.homography.T
+    scale = np.sqrt(abs(np.linalg.det(picture.homography)))  # of pixels: near 1
+    assert scale == pytest.approx(1.0, abs=0.01)
+    return np.linalg.norm(back[:, :2] / back[:, 2:] - 0.5 - image, axis=1)
+
+
+def test_a_central_camera_misses_what_it_says_and_parts_as_much_less_as_they_are_smaller(scenes):
+    for scene in scenes:
+        for shot in scene.shots:
+            errors = []
+            for window in ((0, 0, 900, 700), (450, 0, 450, 350)):
+                picture = pinholes.central_picture(scene, shot, window)
+                errors.append(missed(scene, shot, picture).max())
+                assert 0.7 * picture.error < errors[-1] < 1.05 * picture.error
+            assert errors[0] < 0.2
+            assert errors[1] < 0.6 * errors[0]
+
+
+def test_the_centre_is_above_the_ground_and_the_picture_keeps_the_axes_of_the_image(scenes):
+    for shot in scenes[0].shots:
+        picture = pinholes.central_picture(scenes[0], shot, (100, 50, 300, 200))
+        assert -picture.pinhole.rotation.T[2] @ picture.pinhole.translation > 300e3
+        assert picture.homography[:2, :2] == pytest.approx(np.eye(2), abs=0.1)
+        assert np.array(picture.size) == pytest.approx([300, 200], rel=0.1)
+
+
+def test_an_image_that_shows_the_ground_mirrored_gets_a_picture_that_does_not(scenes):
+    scene, shot = scenes[0], scenes[0].shots[0]
+    mirrored = replace(shot, rpc=replace(shot.rpc, image_scale=shot.rpc.image_scale * [1, -1]))
+    picture = pinholes.central_picture(scene, mirrored, (0, 0, 900, 700))
+    assert np.linalg.det(picture.pinhole.rotation) == pytest.approx(1.0)
+    assert np.linalg.det(picture.homography[:2, :2]) < 0
+    assert missed(scene, mirrored, picture).max() < 1.05 * picture.error < 0.2
+
+
+def test_parts_are_the_fewest_that_stay_within_the_tolerance(scenes):
+    scene, shot = scenes[0], scenes[0].shots[0]
+    for tolerance, most in ((0.2, 1), (0.1, 4)):
+        pictures = pinholes.pictures_of(scene, shot, tolerance)
+        assert len(pictures) <= most
+        assert max(missed(scene, shot, one).max() for one in pictures) < tolerance
+        covered = np.zeros((700, 900), int)
+        for col, row, width, height in (one.window for one in pictures):
+            covered[row : row + height, col : col + width] += 1
+        assert (covered == 1).all()
+    with pytest.raises(InputError, match=r"parts of 64 px are not within 0\.001 px of .* a larger --tolerance"):
+        pinholes.pictures_of(scene, shot, 0.001)

@@ -16,15 +16,18 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.base.sealed import Sealed
+from barpc.base.verb_options import ExportOptions
 from barpc.export import files as made_of
 from barpc.export import pinholes
 from barpc.export import shots as scene
+from barpc.export.colmap import colmap
+from barpc.export.light import UnknownTimeError, dated
 from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import read_rpc
-from barpc.rpcio.acquisition import Acquisition
 from barpc.sensor.geometry import camera_center, image_grid
 
 OUT = Path("/elsewhere/out")
+HOW = ExportOptions()
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +183,7 @@ def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, sou
 
 
 def test_a_record_of_sat_nerf(south):
-    files = made_of.satnerf(south, OUT)
+    files = made_of.satnerf(dated(south, ["2013-04-17T20:00:00"], []), OUT, HOW)
     shot = south.shots[0]
     one = json.loads(files[f"{shot.name}.json"])
     assert (one["height"], one["width"], one["min_alt"], one["max_alt"]) == (700, 900, *south.alt_range)
@@ -188,7 +191,7 @@ def test_a_record_of_sat_nerf(south):
     assert (one["sun_elevation"], one["sun_azimuth"], one["acquisition_date"]) == (
         52.25,
         150.5,
-        "2013-04-17T10:32:15.5Z",
+        "20130417103215",
     )
     middle = shot.rpc.localize(np.array([449.5, 349.5]), np.array(south.origin[2]))
     assert one["geojson"]["center"] == pytest.approx(middle[:2])
@@ -225,8 +228,10 @@ def test_a_camera_that_shows_the_ground_mirrored_is_no_pinhole(south, sign):
 def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
     """COLMAP's texts of the scene, its lines by file."""
     of = replace(south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots)))
-    files = pinholes.colmap(of, OUT)
-    assert set(files) == {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")} | {"world.json"}
+    files = colmap(of, OUT, ExportOptions(exact=True))
+    texts = {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
+    assert set(files) == texts | {"sparse/0/points3D.ply", "transforms.json", "world.json"}
+    del files["sparse/0/points3D.ply"]
     files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
     return (
         of,
@@ -289,25 +294,25 @@ def test_colmap_s_texts_hold_the_scene(model):
 
 def test_stereo_pipelines_get_images_and_cameras(south, southern):
     carried = with_shot(south, carrier=southern / "a.vrt")
-    config = json.loads(made_of.s2p(carried, southern)["config.json"])
+    config = json.loads(made_of.s2p(carried, southern, HOW)["config.json"])
     assert (config["out_dir"], config["full_img"]) == ("s2p_out", True)
     assert config["images"][0]["img"] == "a.vrt"  # the run's raster goes before the image
     assert config["images"][1]["img"] == relative_link(south.shots[1].file, southern)
     assert read_rpc_of(config["images"][1]["rpc"]).off(south.shots[1].rpc).max() < 1e-6
-    files = made_of.asp(carried, southern)
+    files = made_of.asp(carried, southern, HOW)
     names = [shot.name for shot in south.shots]
     assert files["cameras.txt"].decode() == "".join(f"{name}.xml\n" for name in names)
     assert files["images.txt"].decode().split("\n")[:2] == ["a.vrt", relative_link(south.shots[1].file, southern)]
     assert files["images.txt"].endswith(b"\n")
     assert set(files) == {*(f"{name}.xml" for name in names), "cameras.txt", "images.txt"}
-    for end, made in (("xml", files), ("geom", made_of.cars(south, southern))):
+    for end, made in (("xml", files), ("geom", made_of.cars(south, southern, HOW))):
         path = southern.parent / f"check.{end}"
         path.write_bytes(made[f"{names[0]}.{end}"])
         assert read_rpc(path).off(south.shots[0].rpc).max() < 1e-5
 
 
 def test_the_yaml_of_cars(south):
-    text = made_of.cars(south, OUT)["inputs.yaml"].decode()
+    text = made_of.cars(south, OUT, HOW)["inputs.yaml"].decode()
     found = json.loads(text)
     assert pytest.importorskip("yaml").safe_load(text) == found  # as CARS reads it
     first = south.shots[0]
@@ -323,7 +328,8 @@ def test_the_yaml_of_cars(south):
 
 
 def test_a_stac_item_says_where_when_and_how(south, southern):
-    name, texts = south.shots[0].name, made_of.stac(south, OUT)
+    of = dated(south, [], ["2013-04-17"])
+    name, texts = south.shots[0].name, made_of.stac(of, OUT, HOW)
     item = json.loads(texts[f"{name}.json"])
     boxes = np.array([json.loads(text)["bbox"] for key, text in texts.items() if key != "collection.json"])
     ends = [*boxes[:, :2].min(axis=0), *boxes[:, 2:].max(axis=0)]
@@ -332,7 +338,12 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
     assert [(one["rel"], one["href"]) for one in item["links"]] == [
         (rel, "./collection.json") for rel in ("root", "parent", "collection")
     ]
-    assert item["stac_extensions"][0] == "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
+    used = {key.partition(":")[0] for key in item["properties"] if ":" in key}
+    names = {"proj": "projection/v2.0.0", "view": "view/v1.0.0", "processing": "processing/v1.2.0"}
+    assert item["stac_extensions"] == [
+        f"https://stac-extensions.github.io/{names[one]}/schema.json" for one in sorted(used)
+    ]
+    assert used == set(names)
     ring = np.array(item["geometry"]["coordinates"][0])
     assert item["bbox"] == pytest.approx([ring[:, 0].min(), ring[:, 1].min(), ring[:, 0].max(), ring[:, 1].max()])
     found, view = item["properties"], south.shots[0].entry
@@ -355,31 +366,38 @@ def test_a_stac_item_says_where_when_and_how(south, southern):
         "a.xml": ("application/xml", "metadata"), "a.json": ("application/json", "metadata"),
         "a_RPC.TXT": ("text/plain", "metadata"),
     }  # fmt: skip
-    run = with_shot(south, written=tuple(kinds))
-    assets = json.loads(made_of.stac(run, OUT)[f"{name}.json"])["assets"]
+    run = with_shot(of, written=tuple(kinds))
+    assets = json.loads(made_of.stac(run, OUT, HOW)[f"{name}.json"])["assets"]
     for output, (kind, role) in kinds.items():
         assert assets[output] == {"href": relative_link(southern / output, OUT), "type": kind, "roles": [role]}
 
 
 def test_a_stac_item_of_an_unknown_time_or_day(south, dateline):
-    unknown = json.loads(made_of.stac(south, OUT)[f"{south.shots[1].name}.json"])["properties"]
-    assert unknown["datetime"] is None
-    assert (unknown["start_datetime"], unknown["end_datetime"]) == (
-        "1957-10-04T00:00:00Z",
-        "9999-12-31T23:59:59Z",
-    )
-    assert "view:sun_azimuth" not in unknown
-    day = with_shot(south, light=Acquisition(None, None, "2020-01-02"))
-    name = south.shots[0].name
-    assert json.loads(made_of.stac(day, OUT)[f"{name}.json"])["properties"]["datetime"] == "2020-01-02T00:00:00Z"
-    west, south_lat, east, north = json.loads(made_of.stac(dateline, OUT)[f"{dateline.shots[0].name}.json"])["bbox"]
+    """A day is an interval: no clock is invented."""
+    with pytest.raises(UnknownTimeError, match=r"^view_0001, view_0002: no file states the day .* --date YYYY-MM-DD "):
+        made_of.stac(south, OUT, HOW)
+    of = dated(south, [], ["2013-04-19", "view_0002=2013-04-20"])
+    texts = {name: json.loads(text) for name, text in made_of.stac(of, OUT, HOW).items()}
+    found = texts["view_0001.json"]["properties"]
+    assert [found[key] for key in ("datetime", "start_datetime", "end_datetime")] == [
+        None,
+        "2013-04-19T00:00:00Z",
+        "2013-04-19T23:59:59Z",
+    ]
+    assert "view:sun_azimuth" not in found
+    interval = texts["collection.json"]["extent"]["temporal"]["interval"]
+    assert interval == [["2013-04-17T10:32:15.5Z", "2013-04-20T23:59:59Z"]]
+    dateline = dated(dateline, [], ["2013-04-17"])
+    west, south_lat, east, north = json.loads(made_of.stac(dateline, OUT, HOW)[f"{dateline.shots[0].name}.json"])[
+        "bbox"
+    ]
     assert 179 < west < 180
     assert -180 < east < -179
     assert south_lat < -16.8 < north
 
 
 def test_points_are_written_with_their_covariance(south):
-    files = made_of.points(south, OUT)
+    files = made_of.points(south, OUT, HOW)
     comment, header, *rows = files["points.csv"].decode().splitlines()
     place = ", ".join(f"{value:.4g}" for value in south.summary.scene.sigma_enu_m)
     assert comment == (
@@ -417,9 +435,9 @@ def test_points_are_written_with_their_covariance(south):
     assert [line.split()[1:] for line in lines[5:]] == [
         *(["double", axis] for axis in "xyz"), ["int", "track"], *(["float", name] for name in header.split(",")[4:]),
     ]  # fmt: skip
-    alone = made_of.points(replace(south, shots=south.shots[:1]), OUT)["points.csv"]
+    alone = made_of.points(replace(south, shots=south.shots[:1]), OUT, HOW)["points.csv"]
     assert alone.decode().splitlines()[2].endswith(",,,,,,")  # what one image shows is not known
-    unknown = made_of.points(with_summary(south, scene=None), OUT)["points.csv"]
+    unknown = made_of.points(with_summary(south, scene=None), OUT, HOW)["points.csv"]
     assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
     assert isinstance(south.samples(south.shots[0]), Sampled)
 

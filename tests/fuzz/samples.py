@@ -21,6 +21,7 @@ from barpc.ba.parameters.priors import CameraPrior
 from barpc.base.errors import RpcError
 from barpc.base.frozen import from_arrays, load_npz, to_arrays
 from barpc.base.options import read_options
+from barpc.base.verb_options import ExportOptions
 from barpc.cameras import open_camera
 from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
@@ -59,6 +60,7 @@ from tests.sensor import terrasar_files
 from tests.sensor.linescan_files import Flight, dimap, isd
 from tests.sensor.radar_documents import document, nitf
 from tests.sensor.s1_product import Product
+from tests.sensor.spot_files import Scene
 
 from .ends import mutate_npz_ends
 from .kinds import Sample
@@ -316,11 +318,14 @@ def _report(path: Path) -> object:
     return report_html(read_summary(path.parent), path.parent)
 
 
+_NOON = ExportOptions(time=("2020-06-01T11:30:00",))
+
+
 def _export(path: Path) -> object:
     seal(path.parent)
     with tempfile.TemporaryDirectory() as folder:
         for target in ("satnerf", "cars", "stac", "points"):
-            export_run(path.parent, target, Path(folder) / target)
+            export_run(path.parent, target, Path(folder) / target, _NOON)
     return None
 
 
@@ -612,6 +617,7 @@ SAMPLES: dict[str, Sample] = {
     ),
     "isd": Sample("image.XML", _use_linescan, lambda: isd(_FLIGHT)[0].encode(), (mutate_xml,)),
     "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),
+    "spot": Sample("METADATA.DIM", _use_linescan, lambda: Scene(mission=4).text().encode(), (mutate_xml,)),
     "product zip": Sample("S1A.zip", _use_product, _safe, (), share=0.2),
     "orbit": Sample("S1A.EOF", _use_orbit, _BURSTS.eof, (mutate_xml,), _beside_orbit, share=0.2),
     **USED,

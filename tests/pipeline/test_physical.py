@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -10,13 +11,15 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc.base.errors import ImageError, InputError
+import barpc
+from barpc.base.errors import ImageError, InputError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.options import RunOptions
-from barpc.cameras import open_camera
+from barpc.cameras import open_camera, read_points
 from barpc.pipeline import adjust
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc
+from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.xml import write_maxar
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
@@ -27,6 +30,7 @@ from barpc.simulate import Look
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.linescan_files import Flight, dimap, isd
+from tests.sensor.spot_files import Scene
 
 SIZE = (900, 6000)
 LOOKS = [Look(12.0, 12.0), Look(3.0, 100.0), Look(12.0, 192.0)]
@@ -198,3 +202,70 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
         grid = open_camera(tmp_path / "out" / f"{name}_grid.tif").model
         image, alt = rng.uniform(0, np.array(SIZE) - 1, (200, 2)), rng.uniform(0, 1000, 200)
         np.testing.assert_allclose(grid.project(sensor.localize(image, alt)), image, rtol=0, atol=0.01)
+
+
+# --- SPOT 1 to 5: METADATA.DIM beside IMAGERY.TIF -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene_text():
+    return Scene(mission=4, size=SIZE, period=1.504e-3, center_line=3000, swath=(0.002, 0.0108)).text()
+
+
+@pytest.mark.parametrize(
+    "names", [("IMAGERY.TIF", "METADATA.DIM"), ("imagery.tif", "Metadata.dim"), ("a.tif", "A.DIM")]
+)
+def test_an_image_of_a_scene_has_the_camera_beside_it(tmp_path, scene_text, names):
+    image, file = (tmp_path / name for name in names)
+    blank(image)
+    file.write_text(scene_text)
+    camera = open_camera(image)
+    assert (camera.format, camera.path, camera.size) == ("spot physical model", file, SIZE)
+    assert camera.notes == ("the corners that its producer states are met within 0.0 m",)
+    assert camera.doubts == ()
+    assert camera.model == open_camera(file).model == open_camera(f"{image},model=physical").model
+    raw = open_camera(f"{image},attitudes=raw,altitudes=0:900")
+    assert (raw.alt_range, raw.notes) == ((0.0, 900.0), ())
+    assert raw.model != camera.model
+    assert read_points(image) == (None, None)  # `fit` takes the camera
+    acquisition = read_acquisition(image, camera.path)
+    assert (acquisition.sensor, acquisition.time) == ("SPOT4_HRV", "2005-05-09T23:59:59Z")
+    assert (acquisition.elevation, acquisition.azimuth) == (61.25, 151.5)
+    write_rpc(make_rpc(), tmp_path / f"{image.stem}.RPB")
+    assert open_camera(image).format == "rpb"  # as of any other image
+    assert open_camera(f"{image},model=physical").model == camera.model
+
+
+def test_other_images_beside_a_scene_are_not_its_image(tmp_path, scene_text):
+    (tmp_path / "METADATA.DIM").write_text(scene_text)
+    with pytest.raises(ImageError, match="no RPC in the image and none beside it"):
+        open_camera(blank(tmp_path / "ortho.tif"))
+    with pytest.raises(InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"):
+        open_camera(write_image(tmp_path / "IMAGERY.TIF", (1, 40, 60)))
+
+
+def test_a_scene_of_another_level_is_refused_by_its_level(tmp_path, scene_text):
+    blank(tmp_path / "IMAGERY.TIF")
+    (tmp_path / "METADATA.DIM").write_text(scene_text.replace(">1A<", ">2A<"))
+    for name in ("IMAGERY.TIF", "METADATA.DIM"):
+        with pytest.raises(RpcFormatError, match=r"METADATA\.DIM: a scene of level 2A, resampled: only 1A has"):
+            open_camera(tmp_path / name)
+
+
+def test_corners_of_another_scene_are_said_with_the_camera(tmp_path, scene_text):
+    path = tmp_path / "METADATA.DIM"
+    path.write_text(scene_text.replace("SCENE_CENTER_LINE>3000", "SCENE_CENTER_LINE>3004"))
+    (doubt,) = open_camera(path).doubts
+    assert re.fullmatch(r"the corners that its producer states lie 4\d m from the camera's", doubt.sentence)
+
+
+@pytest.mark.parametrize("mission", [4, pytest.param(5, marks=pytest.mark.slow)])
+def test_an_rpc_of_a_scene_is_that_of_its_orbit(tmp_path, mission):
+    scene = Scene(mission, SIZE, center_line=3000, swath=(0.002, 0.0108), listed=40 * (mission == 5))
+    blank(tmp_path / "IMAGERY.TIF")
+    (tmp_path / "METADATA.DIM").write_text(scene.text())
+    found = barpc.fit(tmp_path / "IMAGERY.TIF", tmp_path / "new" / "IMAGERY_RPC.TXT")
+    image = np.array([[10.0, 5000.0], [450.0, 3000.0], [880.0, 20.0]])
+    for alt in (0.0, 1500.0):
+        off = np.abs(found.rpc.project(scene.ground(image, alt)) - image).max()
+        assert off <= np.max(found.max_ckp) + 1e-3 < 0.02

@@ -372,7 +372,7 @@ def test_only_a_vrt_that_will_be_written_asks_for_images_that_it_can_point_at(
     images, stop_after, asked, tmp_path, monkeypatch
 ) -> None:
     seen: list[str] = []
-    monkeypatch.setattr(stages, "plain_source", seen.append)
+    monkeypatch.setattr(stages, "local_image", seen.append)
     run, options = Run("adjust", views(2), (), NONE), RunOptions(images=images, stop_after=stop_after)
     names, keep = stages._planned_files(run, options, tmp_path)
     assert seen == (["/x/v0.tif", "/x/v1.tif"] if asked else [])

@@ -40,8 +40,9 @@ def seen(folder: Path) -> dict[str, object]:
     return found
 
 
+NOON = "2020-06-01T11:30:00"
 VERBS = {
-    **{f"export {target}": ("export", "{run}", "{in}", "--to", target, "--overwrite") for target in TARGETS},
+    **{f"export {one}": ("export", "{run}", "{in}", "--to", one, "--time", NOON, "--overwrite") for one in TARGETS},
     "adjust": ("adjust", "{a}", "{b}", "-o", "{in}", "--overwrite", "--rpc-format", "geom"),
     "match": ("match", "{a}", "{b}", "-o", "{in}", "--overwrite"),
     "convert to a folder": ("convert", "{a}", "{b}", "-o", "{in}", "--rpc", "{run}", "--overwrite"),

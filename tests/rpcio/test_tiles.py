@@ -109,7 +109,7 @@ def test_a_tile_s_own_rpc_goes_before_the_strip_s(rpc, tmp_path):
     assert (source.rpc, source.format) == (own, "tag")
     assert source.notes == (f"not used: {STRIP}.RPB",)
     assert not shadows(image)
-    assert not list(hidden_by([tmp_path / "in" / f"{STRIP}.XML"]))
+    assert [hidden.name for _, hidden, _ in hidden_by([tmp_path / "in" / f"{STRIP}.XML"])] == [f"{STRIP}.TIL"]
     write_rpc(rpc.crop(3, 4), image.with_suffix(".RPB"))
     assert read_rpc(image) == rpc.crop(3, 4)
 

@@ -101,7 +101,7 @@ def test_times_count_to_the_nanosecond(text: str, nanoseconds: int) -> None:
     assert parse_time(text, "a") - epoch == np.timedelta64(nanoseconds, "ns")
     assert seconds(parse_time(text, "a"), epoch) == pytest.approx(nanoseconds * 1e-9, rel=1e-15)
     for wrong in (
-        "1999-02-16T15:12:07", "2021-02-16T15:12:07.0123456789", "2021-02-16", "2021-02-30T15:12:07",
+        "1899-02-16T15:12:07", "2021-02-16T15:12:07.0123456789", "2021-02-16", "2021-02-30T15:12:07",
         "2021-02-16T15:12:07+01:00", "2021-13-01T00:00:00", "NaT", "", "none",
     ):  # fmt: skip
         with pytest.raises(RpcFormatError, match="is not a UTC time"):

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground
-from barpc.sensor.linescan import Detector, Samples, _check_times, camera_of_samples, read_linescan, unit
+from barpc.sensor.linescan import read_linescan
+from barpc.sensor.samples import Detector, Samples, camera_of_samples, check_times, unit
 from tests.sensor.linescan_files import SIZE, Flight, Truth, dimap, isd, stamp
 
 FLIGHT = Flight(swing=0.0)
@@ -134,7 +135,7 @@ def test_a_gap_may_begin_where_the_image_ends_and_end_where_it_begins(span: tupl
     """The samples on either side of it are enough then."""
     times = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 20.0, 21.0, 22.0, 23.0])
     with nullcontext() if ok else pytest.raises(RpcFormatError, match=r"no positions from 4.00 to 20.00 s"):
-        _check_times(times, span, "positions", "a.xml")
+        check_times(times, span, "positions", "a.xml")
 
 
 @pytest.mark.parametrize("what", ["positions", "attitudes"])

@@ -16,7 +16,7 @@ from barpc.ba.constraints.ground import PointConstraints, convergence_angles, gr
 from barpc.ba.constraints.incremental import BlockPrior, apply_prior
 from barpc.ba.constraints.terrain import Relief, Terrain
 from barpc.ba.parameters.additional_parameters import AdditionalParameters
-from barpc.ba.parameters.priors import CameraPrior, prior_sigmas
+from barpc.ba.parameters.priors import CameraPrior, JointPrior, prior_sigmas
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.parameters.unknowns import make_unknowns
 from barpc.ba.solving.normal import cholesky3, point_products, solve_lower, solve_transposed
@@ -230,6 +230,8 @@ def make_problem(
     if prior is not None:
         radars = [block.names[v] for v in unknowns.radars]
         on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras, radars)
+    elif waves is not None:
+        jointly = JointPrior.of_alike(waves, len(views), unknowns.size)
     joined = None if jointly is None else np.unique(jointly.index // unknowns.size)
     return Problem(
         Cameras(views, unknowns, block.xy),

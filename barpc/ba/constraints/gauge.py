@@ -205,7 +205,7 @@ def datum_shares(
     paid["cameras"] += (problem.camera_prior.whitened(unknowns) ** 2).sum(axis=(0, 1))
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
-        paid["earlier_run"] += (flat * (joint.information @ flat)).sum(axis=0)
+        paid["earlier_run" if joint.earlier else "cameras"] += (flat * (joint.information @ flat)).sum(axis=0)
     prior = problem.point_prior
     if (prior is not None and len(prior.index)) or not problem.free.all():
         reduced, structure = covariance.reduced, problem.structure

@@ -48,6 +48,13 @@ class AdditionalParameters:
         """The arrays with a row (N, ...) a view, by their name."""
         return {name: getattr(self, name) for name in OF_VIEWS}
 
+    @property
+    def alike(self) -> IntArray:
+        """Numbers of the displaced parts that all images have at the same columns: there they are one displacement."""
+        places = self.strips
+        same = np.isfinite(places).all(axis=(0, 2)) & (places == places[:1]).all(axis=(0, 2)) & (len(places) > 1)
+        return np.flatnonzero(same & (places[:1, :, 0] == 0.0).all(axis=0))
+
     def select(self, views: IntArray) -> AdditionalParameters:
         """Return the layout of some views (n,); -1: of a new one, which has splines alone."""
         rows = {name: np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)]) for name, x in self.of_views.items()}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA, AdditionalParameters
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
@@ -21,6 +21,7 @@ from barpc.sensor.timing import Clocked
 DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
 DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
 USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
+ALIKE_SIGMA = 0.01  # px: of one edge between images of a pass: 0.1 micrometres of a focal plane
 IMAGE_MODEL_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
 
 
@@ -93,6 +94,29 @@ class JointPrior:
     told: Array | float = 0.0  # (N,) what tie points told of each view [1/px^2]
     shown: Array | None = None  # what its corrections show of the priors given
     slope: Array | float = 0.0  # (n,) half the derivative of its cost at the mean
+    earlier: bool = True  # whether it is of an earlier block
+
+    @classmethod
+    def of_alike(cls, waves: AdditionalParameters, views: int, size: int) -> JointPrior | None:
+        """Return the prior that displaced parts of all images alike differ by `ALIKE_SIGMA`; None where there are none.
+
+        Of so many views and unknowns a view, of which those of `waves` are the last.
+        """
+        if not len(waves.alike):
+            return None
+        first = size - waves.size + waves.kinds[2].start
+        own = first + np.concatenate([waves.alike, waves.alike + waves.strips.shape[1]])
+        of_view = np.zeros(size)
+        of_view[own] = ALIKE_SIGMA**-2.0
+        information = np.asarray(np.kron(np.eye(views) - 1.0 / views, np.diag(of_view)), np.float64)
+        return cls(np.arange(views * size), np.zeros(views * size), information, earlier=False)
+
+    @classmethod
+    def of_values(cls, index: IntArray, values: Array, shape: tuple[int, ...]) -> JointPrior:
+        """Return the prior that unknowns at places `index` (m,) of the raveled (N, q) array have values (m,)."""
+        size, own = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
+        own[0, index], own[1, index] = values, ALIKE_SIGMA**-2.0
+        return cls(np.arange(size), own[0], np.diag(own[1]), earlier=False)
 
     def gradient(self, params: Array) -> Array:
         """Return half the derivative (n,) of the cost by the unknowns `index` at unknowns (N, q)."""

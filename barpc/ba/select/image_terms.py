@@ -8,21 +8,24 @@ import numpy as np
 
 from barpc.ba.constraints.block import Block, make_problem
 from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters
+from barpc.ba.parameters.priors import JointPrior
 from barpc.ba.robust.heldout import is_admitted, is_better
 from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
 from barpc.ba.select.anomalies import correlated_noise_gain, standing_out
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
 from barpc.ba.solution import MUCH_BETTER, Solution, finished
-from barpc.ba.terms import TERMS, Sinusoid
+from barpc.ba.terms import TERMS, LinesLost, Sinusoid
 from barpc.ba.terms.detectors import find_edges
+from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.statistics import FEW, LARGEST, SURE
+from barpc.base.statistics import CRITICAL, FEW, LARGEST, SURE
 
 _SPACING = 2000.0  # rows between knots at first: satellites swing once in some seconds
 _DENSER = 1.5  # times as many splines a try: 7, 10, 15, 22, 33
+_WHOLE = 0.1  # lines: a number is whole to this; lost lines were 2.95 to 5.07 of 3 and 5, of any slip two in ten are
 _TWICE = 2  # times that detectors are searched for, and that denser splines may be no better
 
 
@@ -71,6 +74,44 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     if not calm or is_better(first.after, second.after, outer) == shaken:
         return tried
     return without if shaken or waves else found
+
+
+def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
+    """Solve the block with jumps of rows that are whole numbers of lines held to these.
+
+    No platform turns by pixels between two lines: where all rows behind a place jump, lines or time are missing, and
+    the jump is along the axis of the rows. Where two images see but its part across their epipolar lines, the part
+    along them follows; it is held where the number is whole to `_WHOLE`.
+    """
+    waves, problem = found.problem.cameras.unknowns.waves, found.problem
+    if waves is None or problem.joint_prior is not None:
+        return found
+    first, findings = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start, list(found.findings)
+    covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
+    for at, one in enumerate(findings):
+        if one.kind != Step.NAME or not _ends_with_its_image(one, parts.inner.views[one.view].size[1]):
+            continue
+        n = int((waves.strips[one.view] == one.where).all(axis=1).argmax())
+        own = first + np.array([n, waves.strips.shape[1] + n])
+        known = np.linalg.inv(covariance.view(one.view)[np.ix_(own, own)])
+        pull = known @ found.final.params[one.view, own]  # of the ties: the prior's mean is zero
+        known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
+        lines = float(pull[1] / known[1, 1])
+        misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
+        if round(lines) and abs(lines - round(lines)) < _WHOLE and misfit < CRITICAL**2:
+            findings[at] = replace(one, kind=LinesLost.NAME, size=np.array([0.0, round(lines)]))
+            index += [one.view * found.final.params.shape[1] + int(k) for k in own]
+            mean += [0.0, float(round(lines))]
+    if not index:
+        return found
+    prior = JointPrior.of_values(np.array(index), np.array(mean), found.final.params.shape)
+    held = _solve_with(replace(found, findings=tuple(findings)), parts, options, _Layout(waves), held=prior)
+    return found if is_better(found.after, held.after, parts.outer) else held
+
+
+def _ends_with_its_image(one: Finding, rows: int) -> bool:
+    """Return whether a step is of all rows from a place on to an end of its image."""
+    return one.where is not None and one.where[0] == 1 and (one.where[1] <= 0.0 or one.where[2] >= rows)
 
 
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
@@ -178,14 +219,25 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
     return counts
 
 
-def _solve_with(found: Solution, parts: Parts, options: AdjustOptions, layout: _Layout, once: bool = False) -> Solution:
-    """Return the block solved with additional parameters from where it ended; every observation may come back."""
+def _solve_with(
+    found: Solution,
+    parts: Parts,
+    options: AdjustOptions,
+    layout: _Layout,
+    once: bool = False,
+    held: JointPrior | None = None,
+) -> Solution:
+    """Return the block solved with additional parameters from where it ended; every observation may come back.
+
+    `held` is a prior on some of its unknowns.
+    """
     block, waves, start = parts.inner, layout.waves, layout.start
     outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
     if unknowns.waves is not None:  # terms that were found stay
         waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
     bent = make_problem(block, options, unknowns.center, None, drift, waves)
+    bent = bent if held is None else replace(bent, joint_prior=held)
     params, first = np.zeros_like(bent.camera_prior.mean), bent.cameras.unknowns.in_waves.start
     params[:, :first] = ended.params[:, :first]
     if start is not None:

@@ -17,7 +17,7 @@ from barpc.ba.select.anomalies import standing_out
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
-from barpc.ba.select.image_terms import with_splines, with_terms
+from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
@@ -143,7 +143,7 @@ def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
     found = first
     if geometric:
         found, parts, selected = _without_moving_ground(first, parts, options, solve)
-        found = with_terms(found, selected, parts, options)
+        found = with_lines_lost(with_terms(found, selected, parts, options), parts, options)
     smooth = with_splines(found, parts, options) if geometric else found
     if searched is None and (given or found.outcome is first.outcome):
         return SelectedModel(smooth, parts)

@@ -113,11 +113,11 @@ def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: Int
 
 
 def linearised_among(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """Linearise the tie points among some views of a block at its solution; None where they are too many."""
+    """Linearise the tie points among some views of a block at its solution; None of none, or of too many."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)
-    if unknowns > SMALL or array_elements(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
+    if not use.any() or unknowns > SMALL or array_elements(np.bincount(block.point[use])) > 30 * KEPT:  # 240 MB
         return None
     state, _ = retriangulate_rejected(problem, outcome.state, outcome.residual, outcome.inlier, block.use / block.sigma)
     low, high = block.alt_range

@@ -6,18 +6,19 @@ from collections.abc import Iterator, Sequence
 
 from barpc.ba.evidence.periods import Period
 from barpc.ba.evidence.scan import Interval
+from barpc.ba.terms.common_edge import CommonEdge
 from barpc.ba.terms.decay import Decay
 from barpc.ba.terms.low_frequency import LowFrequency
 from barpc.ba.terms.moving_objects import MovingObjects
 from barpc.ba.terms.sinusoid import Sinusoid
-from barpc.ba.terms.step import Step
+from barpc.ba.terms.step import LinesLost, Step
 from barpc.ba.terms.term import Residuals, Term
 from barpc.ba.terms.transient import Transient
 
-__all__ = ["TERMS", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
+__all__ = ["TERMS", "CommonEdge", "LinesLost", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
 
 TERMS: dict[str, type[Term]] = {
-    term.NAME: term for term in (Step, Decay, Transient, LowFrequency, Sinusoid, MovingObjects)
+    term.NAME: term for term in (Step, LinesLost, Decay, Transient, CommonEdge, LowFrequency, Sinusoid, MovingObjects)
 }
 """Name -> term, in the order in which they are proposed."""
 

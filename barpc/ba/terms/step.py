@@ -84,6 +84,19 @@ class Step(ImagePart):
         return self.at(residuals, self.view, (axis, *ends, 0.0, 0.0), self.prior_width(found))
 
 
+class LinesLost(Step):
+    """A step of rows by a whole number of them: lines were lost, or repeated. `image_terms` makes it of a step."""
+
+    NAME: ClassVar[str] = "lines_lost"
+    NOUN: ClassVar[str] = "lines lost, or repeated"
+    SENTENCE: ClassVar[str] = "{lines} at row {edge:.0f} of {image}"
+
+    @classmethod
+    def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
+        """Return none: steps compete."""
+        return []
+
+
 def open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
     """Return the ends of a part, moved beyond an image's end where they reach it."""
     return (-size if start <= 0.0 else start), (2.0 * size if stop >= size else stop)

@@ -12,7 +12,7 @@ from barpc.ba import Adjustment
 from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.evidence.scan import ImageRegion
 from barpc.ba.select.foreign_camera import FOREIGN_CAMERA, ForeignCamera
-from barpc.ba.terms import TERMS, Transient
+from barpc.ba.terms import TERMS
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import listed
 from barpc.base.geodesy import wrap_longitude
@@ -289,19 +289,19 @@ def explanations(adjustment: Adjustment) -> tuple[ExplanationEntry, ...]:
         what = "many tie points of {} are wrong, or its RPC" if apart.look.as_stated else "the RPC of {}"
         sentence = f"{what.format(image)} does not match the image: {strangeness(apart)}"
         found.append(ExplanationEntry(FOREIGN_CAMERA, sentence, image, apart.gain, apart.gap, other))
-    settling = [one for one in adjustment.findings if one.kind == Transient.NAME]
-    found += [_explanation_entry(one, adjustment) for one in adjustment.findings if one not in settling[1:]]
+    rows = {(one.kind, one.gain) if TERMS[one.kind].OF_BLOCK else one: one for one in reversed(adjustment.findings)}
+    found += [_explanation_entry(one, adjustment) for one in reversed(rows.values())]  # of all images, the first
     return tuple(found)
 
 
 def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry:
-    """Return the record of a hypothesis; of a transient in all images, with its largest displacement."""
+    """Return the record of a hypothesis; of a term of all images, with its largest displacement."""
     names = adjustment.names
     # two images only determine a relative displacement
     of_pair = len(names) == 2 and one.motion is None
     image, others = names[one.view], tuple(names[v] for v in ((1 - one.view,) if of_pair else one.or_of))
-    of_all = one.motion is not None or one.kind == Transient.NAME
-    alike = [each for each in adjustment.findings if each.kind == one.kind] if of_all else [one]
+    of_all = one.motion is not None or TERMS[one.kind].OF_BLOCK
+    alike = [each for each in adjustment.findings if (each.kind, each.gain) == (one.kind, one.gain)]
     size = max(float(np.hypot(*each.size)) for each in alike)
     fields: dict[str, Any] = {"size_px": size, "period": one.period, "candidates": None if of_all else others or None}
     # two images do not determine displacements along their epipolar lines
@@ -329,10 +329,15 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
         axis, start, stop, origin, rate = one.where
         words |= {"origin": origin, "length": 1.0 / max(abs(rate), 1e-9), "end": "beginning" if rate > 0.0 else "end"}
         fields["axis"] = words["axis"] = AXES[axis]
-        if one.kind == Transient.NAME:
-            fields = {"axis": AXES[1], "size_px": size}
+        if TERMS[one.kind].OF_BLOCK:
+            fields = {"axis": AXES[axis], "size_px": size}
+            words["first"] = np.ceil(start)
         else:
             last = 2.0 * adjustment.cameras.unknowns.half[axis, one.view] - 1.0
+            from_start = start <= 0.0  # of lines lost: rows behind them are seen early
+            words["edge"] = np.ceil(stop if from_start else start)
+            lost = "lost" if (one.size[1] < 0.0) != from_start else "repeated"
+            words["lines"] = f"{size:.0f} line{'s were' if size > 1.5 else ' was'} {lost}"
             fields["first"], fields["last"] = np.clip((np.ceil(start), np.ceil(stop) - 1.0), 0.0, last).tolist()
             words |= fields
     numbers = one.gain, one.gap, one.runner_up or None

@@ -157,7 +157,7 @@ CAUSES = {
         "check tie points have residuals of {error:.2f} px, {noise:.1f} times the accuracy that the matcher states",
         "check for wrong matches, moving objects, or camera errors that the model cannot represent"),
     "along_lines": Cause("doubtful", "heights behind a jump",
-        "heights of {place} may be off by {metres}: no image shows their displacement along the epipolar lines{lines}",
+        "heights of {place} may be off by {metres}: no image shows their displacement along the epipolar lines",
         "add an image from another direction, or a DEM (--dem)"),
     "follows_more": Cause("doubtful", "one RPC is not enough",
         "its corrected camera includes {follows}, and one RPC misses it by {left:.2f} px (RMS; {most:.2f} px at most)",

@@ -1,0 +1,99 @@
+"""A common edge: all images of one line of detectors step at the same column, by the same displacement.
+
+Where all images see a piece of ground beyond the edge, its point follows the displacement. What shows the step is the
+ground that some images see before the edge and others beyond it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from barpc.ba.evidence.mixture import MixtureFit
+from barpc.ba.evidence.scan import Interval
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
+from barpc.ba.terms.step import Step, open_ended
+from barpc.ba.terms.term import SIZE_PRICE, Finding, Residuals, Term
+from barpc.base.geodesy import Array
+
+
+class CommonEdge(Term):
+    """Columns from one on are displaced as a whole, in all images alike."""
+
+    NAME: ClassVar[str] = "common_edge"
+    NOUN: ClassVar[str] = "a step at the same column of all images"
+    SENTENCE: ClassVar[str] = (
+        "columns from about {first:.0f} on are displaced by {least}{size:.2f} px in all images, as by an edge between "
+        "detectors (`--detectors {first:.0f}`, `barpc calibrate`)"
+    )
+    FOLLOWED: ClassVar[bool] = True
+    OF_BLOCK: ClassVar[bool] = True
+
+    @classmethod
+    def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
+        """Return whether the images are equally wide, as of one line of detectors, and columns are significant."""
+        widths = residuals.size[0]
+        return bool((widths == widths[0]).all()) and any(one.axis == 0 for one in intervals)
+
+    @classmethod
+    def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
+        """Return the edge that explains most of the residuals."""
+        col, gain = score(residuals)
+        return [cls.at(residuals, float(col[int(gain.argmax())]))] if len(col) else []
+
+    @classmethod
+    def at(cls, residuals: Residuals, col: float, sigma: float = FIRST_SIGMA) -> Self:
+        """Return the edge at a column [px], with a prior standard deviation of its displacement [px]."""
+        width = float(residuals.size[0, 0])
+        where = (0, *open_ended(col, width, width), 0.0, 0.0)
+        parts = tuple(Step.at(residuals, v, where, sigma) for v in range(residuals.size.shape[1]))
+        columns = np.sum([part.columns for part in parts], axis=0)
+        return cls(-1, columns, np.full(2, sigma), float(np.log(width)) + SIZE_PRICE, where, parts=parts)
+
+    def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
+        """Return the edge with a prior as wide as its size."""
+        return self.at(residuals, self.where[1], self.prior_width(found))  # type: ignore[index]
+
+    def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
+        """Yield a record a view."""
+        for part in self.parts:
+            for one in part.findings(residuals, unknowns, **said):
+                yield replace(one, kind=self.NAME)
+
+
+def score(residuals: Residuals) -> tuple[Array, Array]:
+    """Return the places (m,) [px] between the columns of observations, and the gain (m,) of an edge at each.
+
+    The score test of one displacement of all observations beyond, ground points settled: S' M^-1 S / 2 with S the sum
+    of their residuals and M its information, which changes from place to place by the tracks that are seen there. A
+    track counts by the inverse of what it is off by, so that the sum of distances is lowered, not of their squares.
+    """
+    linear, base = residuals.linear, residuals.base
+    left = linear.left(base.step) + np.einsum("cek,e->ck", residuals.extra, base.extra) / linear.sigma
+    cols, sums, matrices = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+    for tracks in linear.tracks:
+        count, n = tracks.rows.shape
+        order = np.argsort(residuals.place[0][tracks.rows], axis=1)
+        rows = np.take_along_axis(tracks.rows, order, axis=1)
+        scale = 1.0 / linear.sigma[rows]
+        basis = tracks.follow[:, :3].reshape(count, 3, n, 2)
+        off = left[:, tracks.rows].transpose(1, 2, 0)
+        off = off - np.einsum("tcni,tc->tni", basis, np.einsum("tcni,tni->tc", basis, off))
+        weight = 1.0 / np.sqrt((off**2).sum(axis=(1, 2)) + base.noise**2)
+        off, basis = off[np.arange(count)[:, None], order], np.take_along_axis(basis, order[:, None, :, None], axis=2)
+        # of the observations from each on to the last: what they and their ground point have in common
+        followed = (basis * scale[:, None, :, None])[:, :, ::-1].cumsum(axis=2)[:, :, ::-1]
+        own = (scale**2)[:, ::-1].cumsum(axis=1)[:, ::-1, None, None] * np.eye(2)
+        matrix = (own - np.einsum("tcni,tcnj->tnij", followed, followed)) * weight[:, None, None, None]
+        cols.append(residuals.place[0][rows].ravel())
+        sums.append((off * (weight[:, None] * scale)[..., None]).reshape(-1, 2))
+        matrices.append(-np.diff(matrix, axis=1, append=0.0).reshape(-1, 2, 2))
+    col, by_col = np.concatenate(cols), np.argsort(np.concatenate(cols), kind="stable")
+    beyond, known = (np.concatenate(one)[by_col][::-1].cumsum(axis=0)[::-1][1:] for one in (sums, matrices))
+    known = known + np.eye(2) * FIRST_SIGMA**-2.0
+    gain = 0.5 * np.einsum("mi,mi->m", beyond, np.linalg.solve(known, beyond[..., None])[..., 0])
+    ordered = col[by_col]
+    return 0.5 * (ordered[1:] + ordered[:-1]), gain
