@@ -55,8 +55,7 @@ def adjust(
     jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
         ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
     progress : callable, optional, `progress(stage, done, total)`
-    **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``;
-        for dry_run see `barpc.plan`
+    **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``
 
     Returns
     -------
