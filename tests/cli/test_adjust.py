@@ -301,7 +301,10 @@ def test_help_imports_nothing_heavy():
     ("command", "unwanted"),
     [
         ("main()", "scipy.linalg scipy.sparse scipy.spatial scipy.special cv2 shapely jinja2 boto3 barpc.ba barpc.tie"),
-        ("_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading", "barpc.ba barpc.report boto3"),
+        (
+            "_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading",
+            "barpc.ba barpc.report.outcome boto3",
+        ),
         ("sys.argv[1:] = ['adjust', 'none.tif', 'no.tif', '-o', 'out']; main()", "scipy.spatial scipy.optimize jinja2"),
     ],
     ids=["info", "worker", "adjust"],
