@@ -21,7 +21,7 @@ _out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="F
 
 @click.command("adjust", cls=Grouped)
 @_images_argument
-@_out_dir
+@click.option("-o", "--out-dir", metavar="DIR", help="Folder for the results; needed unless with --dry-run.")
 @paper
 @click.option("--dry-run", is_flag=True, help="Say pairs, time, memory, datum and doubts; write nothing.")
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
@@ -45,6 +45,8 @@ def adjust(dry_run: bool, **flags: Any) -> int:
     """
     from barpc.verbs import runs
 
+    if flags["out_dir"] is None and not dry_run:
+        raise click.MissingParameter(param_type="option", param_hint="'-o' / '--out-dir'")
     return _run_pipeline(runs.plan, flags, _tell_plan) if dry_run else _run_pipeline(runs.adjust, flags)
 
 
