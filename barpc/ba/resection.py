@@ -66,7 +66,7 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class RpcDiagnosis:
-    """The one change with which the RPC of a view is as accurate as stated; without any field set there is none."""
+    """The change that makes the RPC of a view as accurate as stated; unknown if all fields have their defaults."""
 
     offset: Array | None = None  # (2,) col, row [px] of projected minus observed points
     height: float | None = None  # [m] by which heights are too high, if that explains the offset

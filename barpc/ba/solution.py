@@ -237,7 +237,7 @@ def _without_distorting_control(
     """Return the constrained solution, or the one `free` of control if control raises check residuals."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
-    # expected increase: tie points of a view have a common error noise_floor, for each of its q unknowns [px^2]
+    # allowed increase [px^2]: the common error noise_floor of the tie points of a view, for each of its q unknowns
     known = free.final.params.shape[1] * options.noise_floor**2
     if raised <= known or not is_better(without, found.after, outer):
         return found

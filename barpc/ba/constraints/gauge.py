@@ -44,7 +44,7 @@ class Mode:
     """One of the motions of the scene, with the correlated part of the others."""
 
     sigma: float  # its posterior standard deviation [m]
-    motion: Array  # (10,) expected value of all `MOTIONS` where this one is wrong by sigma [m]
+    motion: Array  # (10,) expected errors of all `MOTIONS` if this one is wrong by sigma [m]
     meaning: str  # its name
 
 

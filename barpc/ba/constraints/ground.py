@@ -164,8 +164,8 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
 class TerrainTest:
     """Comparison of a DEM with the tie points, and its use as a constraint."""
 
-    held: int  # tie points constrained to it
-    known: int  # tie points where it has a height
+    held: int  # tie points constrained to the DEM
+    known: int  # tie points with a DEM height
     total: int  # tie points in use
     offset: float  # median of adjusted altitudes minus the DEM [m]; NaN: no DEM height
     spread: float  # 1.4826 times the median absolute deviation of these [m]

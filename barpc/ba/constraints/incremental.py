@@ -69,7 +69,7 @@ class BlockPrior:
     scene : EarlierScene or None
         Motions of the scene by the camera unknowns; None: file of an earlier release.
     told : (n,) or None
-        Information of tie points on each view, before the limit by the error that a view shares [1/px^2].
+        Information of tie points on each view, without the limit by errors common to a view [1/px^2].
     shown : (4 + drift, 2) or None
         Sums of corrections that estimate the camera priors (`barpc.ba.robust.variances.Variances.shown`).
     rest : Rest or None

@@ -129,7 +129,7 @@ class Registration:
     """The motion that registers a surface to given heights, and their agreement with it."""
 
     motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.constraints.gauge.MOTIONS`
-    covariance: Array  # (7, 7) of it, with the prior at a hundredth of its weight
+    covariance: Array  # (7, 7) of it, with a prior wider by `TIMES` than `before` of `register`
     near: BoolArray  # (n,) heights on valid patches of the surface
     agree: BoolArray  # (n,) inliers among these
     residual: Array  # (n,) given minus moved surface [m]; NaN: no surface

@@ -178,7 +178,8 @@ class Relief:
         """Compare a DEM with ground points (P, 3) from rays alone.
 
         The `strong` (P,) ones have heights with standard deviations `sharp` (P,) [m]. Those are used whose deviation is
-        below that of single DEM heights, `stated` [m] or observed. Tilts are heights at the RMS distance of the points.
+        below that of DEM heights: the larger of `stated` [m] and the observed one. Tilts are heights at the RMS
+        distance of the points from their middle.
         """
         index = np.flatnonzero(strong)
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))

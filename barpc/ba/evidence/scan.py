@@ -5,9 +5,9 @@ of the share of wrong observations (Kulldorff 1997, "A spatial scan statistic"),
 all observations of the interval.
 
 `met_worse` tests check tie points: rows, columns and cells of each image, halved repeatedly, against the rest of the
-image. The null hypothesis is only that all parts are alike, so neither the noise nor the share of wrong matches
-matters. Two tests, each with Bonferroni's bound: the number of outliers that are displaced by the same amount, which
-wrong matches are not (exact, hypergeometric), and the mean of the inliers (Hotelling, then by permutation). Neighbours
+image. The null hypothesis is only that all parts have one distribution, so neither the noise nor the share of wrong
+matches matters. Two tests, each with Bonferroni's bound: the number of outliers with the same displacement, which wrong
+matches do not have (exact, hypergeometric), and the mean of the inliers (Hotelling, then by permutation). Neighbours
 share errors. Therefore one observation is taken in each small part of an image, and a common displacement within the
 tolerance is ignored.
 """
@@ -56,7 +56,7 @@ def price(views: int) -> float:
 
 
 def scan(
-    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
+    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, weight: Array, floor: float = 0.0
 ) -> list[Interval]:
     """Find the most significant interval of the columns and of the rows of each view, by each statistic; best first.
 
@@ -66,7 +66,7 @@ def scan(
     place : (2, K), image coordinates [px], in images of `size` (2, N)
     wrong : (K,), probability that an observation is wrong
     off : (2, K), residuals of all observations, in standard deviations of inliers
-    told : (K,), weights of these; 0: not used
+    weight : (K,), weights of these; 0: not used
     floor : float, size of displacements that are tolerated [standard deviations]
     """
     views, found = size.shape[1], []
@@ -77,7 +77,7 @@ def scan(
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
         shares = share_log_ratios(whole)
-        gains, displaced = _displacements(view, bin_, off, told, views, floor)
+        gains, displaced = _displacements(view, bin_, off, weight, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # the whole image is no interval
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
@@ -101,22 +101,22 @@ def _intervals(bins: Array) -> Array:
 
 
 def _displacements(
-    view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
+    view: IntArray, bin_: IntArray, off: Array, weight: Array, views: int, floor: float
 ) -> tuple[Array, Array]:
     """Return the gain [nats] of a common displacement of each interval, and its size (intervals, N).
 
-    The score test beside the drift of a camera: a constant, a slope and a bend along the axis are projected out. Of a
-    step this may leave the middle of the image; the term of the step explains it.
+    The score test beside the drift of a camera: a constant, a slope and a bend along the axis are projected out. Of the
+    rows of a step only the middle ones may be significant then; the term explains all of them.
     """
     at = view * BINS + bin_
-    sums = [np.bincount(at, row, views * BINS) for row in (told, *(told * off))]
+    sums = [np.bincount(at, row, views * BINS) for row in (weight, *(weight * off))]
     count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
     smooth = np.vander(np.linspace(-1.0, 1.0, BINS), DRIFTS, increasing=True)
     weighted = count[:, :, None] * smooth
     normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(DRIFTS) * (count.sum(axis=1) + 1.0)[:, None, None]
     shift = np.stack(shifts, axis=2)  # (N, bins, 2)
     followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
-    left = (off - np.ascontiguousarray(followed.reshape(-1, 2).T).take(at, axis=1)) * np.sqrt(told)
+    left = (off - np.ascontiguousarray(followed.reshape(-1, 2).T).take(at, axis=1)) * np.sqrt(weight)
     scatter = [[np.bincount(view, a * b, views) for a in left] for b in left]
     size, axes = np.linalg.eigh(np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None])
     rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
@@ -333,17 +333,17 @@ def _by_permutation(along: Array, of_near: Array) -> Array:
     return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 
-def hypergeometric_tail(found: int, count: int, alike: int, whole: int) -> float:
-    """Return the probability of `found` or more marked ones among `count` draws from `whole`, of which `alike` are.
+def hypergeometric_tail(found: int, count: int, marked: int, whole: int) -> float:
+    """Return the probability of `found` or more marked items among `count` drawn from `whole` items, `marked` of them.
 
     The tail of the hypergeometric distribution, by logarithms of factorials; 0 where so many cannot be drawn.
     """
-    k = np.arange(found, min(count, alike) + 1)
+    k = np.arange(found, min(count, marked) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
         return np.asarray(gammaln(n + 1.0) - gammaln(m + 1.0) - gammaln(n - m + 1.0))
 
-    return float(np.exp(ways(alike, k) + ways(whole - alike, count - k) - ways(whole, count)).sum())
+    return float(np.exp(ways(marked, k) + ways(whole - marked, count - k) - ways(whole, count)).sum())
 
 
 def principal_axes(standard: Array) -> tuple[Array, Array]:

@@ -137,7 +137,7 @@ class AdditionalParameters:
         return np.concatenate(found)
 
     def stretches(self, rows: float) -> float:
-        """Return the number of independent averages of the noise over an image of `rows` rows that these unknowns take.
+        """Return the number of parts of an image of `rows` rows over which these unknowns average correlated noise.
 
         One for each unknown; for a sinusoid one for each half period and coordinate.
         """

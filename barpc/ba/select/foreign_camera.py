@@ -50,7 +50,7 @@ class ForeignCamera:
     contradicted: float  # outlier rate of its tie points after resection; NaN: unknown
     look: RpcDiagnosis  # its result: swapped axes, an offset, ...
     placed: Placed | None  # its resected camera; None: it stays as delivered
-    scale: float = 1.0  # factor by which its correction exceeds the prior, where it was found by that
+    scale: float = 1.0  # factor by which its prior had to be widened, if it was found by its prior
 
     @property
     def view(self) -> int:

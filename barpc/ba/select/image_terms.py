@@ -77,7 +77,7 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
 
 
 def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with steps of rows constrained to whole numbers of lost lines, where they are that.
+    """Solve the block with steps of rows constrained to whole numbers of lost lines, if they are nearly whole.
 
     No platform turns by pixels between two lines. Where all rows behind a place are displaced, lines are missing, and
     the step is along the rows' axis. In pairs only its part across epipolar lines is observed; the part along them
