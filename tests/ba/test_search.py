@@ -204,7 +204,7 @@ def test_lines_lost_in_two_of_four_views_are_given_back_to_both(seed: int) -> No
     adjusted = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     first, second = sorted(world.plan.injected, key=lambda one: one.views)
     assert [(one.kind, one.view) for one in sorted(adjusted.findings, key=lambda one: one.view)] == [
-        ("step", *first.views), ("step", *second.views)
+        ("lines_lost", *first.views), ("lines_lost", *second.views)
     ]  # fmt: skip
     judged = judge(world, adjusted.sensors)
     assert max(*judged.p99, judged.hit) < 0.06
