@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
 from barpc.base.statistics import CRITICAL, FEW, LARGEST, SURE
-from barpc.scene import View
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _DENSER = 1.5  # factor on the number of splines of each further try: 7, 10, 15, 22, 33
@@ -85,8 +83,8 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     the step is along the rows' axis. In pairs only its part across epipolar lines is observed; the part along them
     follows. The constraint is set where the number of lines is whole to `_WHOLE`.
     """
-    findings, views = list(found.findings), parts.inner.views
-    steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, views)]
+    findings = list(found.findings)
+    steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, parts.inner)]
     if not steps or found.problem.joint_prior is not None:
         return found
     problem, waves = found.problem, found.problem.cameras.unknowns.waves
@@ -113,11 +111,11 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     return found if is_better(found.after, held.after, parts.outer) else held
 
 
-def _ends_with_its_image(one: Finding, views: Sequence[View]) -> bool:
+def _ends_with_its_image(one: Finding, block: Block) -> bool:
     """Return whether a finding is a step of all rows from a place on to an end of its image."""
     if one.kind != Step.NAME or one.where is None or one.where[0] != 1:
         return False
-    return one.where[1] <= 0.0 or one.where[2] >= views[one.view].size[1]
+    return one.where[1] <= 0.0 or one.where[2] >= block.views[one.view].size[1]
 
 
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
