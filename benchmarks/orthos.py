@@ -7,7 +7,8 @@ measured, in pixels of the image:
   error    a made image of SIDE px, whose two bands are its own columns and rows, under a real camera of Mont Ventoux on
            SRTM heights: what the map shows minus where the camera sees the map's ground; RMS, the 99.9th centile
   seam     the largest change of that error from a row or column of the map to the next, mean along it
-  CPU      of that map, over barpc's, and peak memory
+  CPU      seconds of a millionth of that map's image pixels and of the start, as shares of barpc's, told by an image of
+           SMALL px; peak memory
   views    two views of the Pleiades triplet by their corrected cameras, on the surface that s2p ships, holes filled:
            median shift between the maps, col and row, and spread, by the matching of tools/ncc_check.py beside the data
 The places that the camera should see come from PROJ, numpy and the RPC formula of that tool, not from this package.
@@ -41,8 +42,8 @@ from benchmarks.real import ROOT, measured  # noqa: E402
 from benchmarks.real_crops import load_tool  # noqa: E402
 from benchmarks.real_sets import as_rasterio  # noqa: E402
 
-SIDE, GSD, CRS, GEOID = 2048, 0.5, 32631, 51.0
-"""Of the made image [px], of a map's pixel [m], EPSG code; height of the geoid at Mont Ventoux [m]."""
+SIDE, SMALL, GSD, CRS, GEOID = 2048, 256, 0.5, 32631, 51.0
+"""Of the made images [px], of a map's pixel [m], EPSG code; height of the geoid at Mont Ventoux [m]."""
 CORNER = np.array([9000.0, 9000.0])  # of the made image in its product [px]: 1 km
 STEP, HALF, HOLE = 12, 12, 10  # px between matched places, of half a patch, across a hole
 Tool = Callable[[list[Path], Path, Path], list[str]]
@@ -102,18 +103,20 @@ def made(tool: Tool, images: list[Path], dem: Path, out: Path) -> tuple[list[Pat
     return found, cpu, peak
 
 
-def made_image(data: Path, place: Path) -> tuple[Path, Path]:
-    """An image whose bands are its columns and rows, and the heights above the ellipsoid that it lies on."""
-    image, dem = place / "made.tif", place / "ellipsoidal.tif"
+def made_images(data: Path, place: Path) -> tuple[list[Path], Path]:
+    """Images whose bands are their columns and rows, and the heights above the ellipsoid that they lie on."""
+    images, dem = [place / f"made_{side}.tif" for side in (SMALL, SIDE)], place / "ellipsoidal.tif"
     with rasterio.open(data / "dem/N44E005.hgt") as file:
         heights, layout = file.read(1).astype(np.float32) + np.float32(GEOID), file.profile
     with rasterio.open(dem, "w", **layout | {"driver": "GTiff", "dtype": "float32"}) as file:
         file.write(heights, 1)
-    pixels = np.stack(np.meshgrid(*2 * [np.arange(1, SIDE + 1, dtype=np.float32)]))  # 0 is no data
-    with rasterio.open(image, "w", "GTiff", SIDE, SIDE, 2, dtype="float32", nodata=0, tiled=True) as file:
-        file.write(pixels)
-        file.rpcs = as_rasterio(read_rpc(data / "optical/phr_ventoux/left_image.geom"), CORNER)
-    return image, dem
+    rpcs = as_rasterio(read_rpc(data / "optical/phr_ventoux/left_image.geom"), CORNER)
+    for image, side in zip(images, (SMALL, SIDE), strict=True):
+        pixels = np.stack(np.meshgrid(*2 * [np.arange(1, side + 1, dtype=np.float32)]))  # 0 is no data
+        with rasterio.open(image, "w", "GTiff", side, side, 2, dtype="float32", nodata=0, tiled=True) as file:
+            file.write(pixels)
+            file.rpcs = rpcs
+    return images, dem
 
 
 def errors(made: Path, image: Path, dem: Path, tool: ModuleType) -> np.ndarray:
@@ -202,20 +205,26 @@ def main() -> None:
         if not (place / "run/summary.json").is_file():
             measured(run, ROOT, place / "log")
         pair = [place / "run" / f"{one.stem}.vrt" for one in (images[0], images[2])]
-        image, dem = made_image(given.data, place)
-        print("| tool | error: RMS, 99.9 % [px] | seam [px] | CPU / barpc's | MB | views apart [px] |")
+        (small, image), dem = made_images(given.data, place)
+        print("| tool | error: RMS, 99.9 % [px] | seam [px] | CPU / Mpx, start | MB | views apart [px] |")
         print("|---|---|---|---|---|---|")
-        first = 0.0
+        first = np.empty(0)
         for name, tool in tools.items():
+            _, least, _ = made(tool, [small], dem, place / f"{name}_small")
             (one,), cpu, peak = made(tool, [image], dem, place / f"{name}_made")
-            first = first or cpu
+            each = (cpu - least) / (SIDE**2 - SMALL**2) * 1e6
+            cost = np.array([each, least - each * SMALL**2 / 1e6])
+            first = cost if name == "barpc" else first
             off = errors(one, image, dem, check)
             length = np.linalg.norm(off, axis=-1)
             size = f"{np.sqrt(np.nanmean(length**2)):.3f}, {np.nanpercentile(length, 99.9):.3f}"
             two, _, _ = made(tool, pair, surface, place / f"{name}_pair")
-            cost = f"{cpu / first:.2f} | {peak:.0f}"
-            print(f"| {name} | {size} | {seam(off):.3f} | {cost} | {apart(two, surface, check)} |", flush=True)
-            print(f"{name}: {cpu / SIDE**2 * 1e6:.2f} CPU s a Mpx", file=sys.stderr)
+            share = ", ".join(f"{one:.0%}" for one in cost / first)
+            print(
+                f"| {name} | {size} | {seam(off):.3f} | {share} | {peak:.0f} | {apart(two, surface, check)} |",
+                flush=True,
+            )
+            print(f"{name}: {cost[0]:.2f} CPU s a Mpx, {cost[1]:.2f} s to start", file=sys.stderr)
 
 
 if __name__ == "__main__":
