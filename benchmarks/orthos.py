@@ -166,7 +166,7 @@ def apart(paths: list[Path], surface: Path, tool: ModuleType) -> str:
     both = (shown[0] > 0) & (shown[1] > 0)
     shift = np.array(list(_shifts(shown[0], shown[1], both, tool)))
     middle, spread = np.median(shift, axis=0), [nmad(one) for one in shift.T]
-    words = ", ".join(f"{m:+.3f} ± {s:.3f}" for m, s in zip(middle, spread, strict=True))
+    words = ", ".join(f"{m:+.3f}±{s:.3f}" for m, s in zip(middle, spread, strict=True))
     return f"{words} ({len(shift)})"
 
 

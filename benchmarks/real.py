@@ -1,6 +1,7 @@
 """Real images, each set by barpc and by the peers that are installed: one table, a row a set.
 
-    python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--orthority PYTHON] [--only SET]...
+    python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--orthority PYTHON]
+                              [--only SET]...
 
 A cell has the epipolar offset of independent points (median, spread 1.4826 MAD [px] and their number, the worst pair
 of a set), CPU seconds, peak memory, the exit code and the first sentence of the result. The points are those of the
@@ -12,7 +13,8 @@ through GDAL. Tools:
   barpc      `barpc adjust` with its defaults, and what a set gives (GCPs, DEM, reference)
   cars       cars-bundleadjustment of the interpreter given, its .geom as written and half a pixel back
   orthority  orthority's refinement by GCPs, `shift` and `shift-drift`, of the interpreter given
-A set or a tool that is absent is named with the reason. The sets are in benchmarks/real_sets.py.
+A set or a tool that is absent is named with the reason. The sets are in benchmarks/real_sets.py; surfaces and
+orthoimages beside those of others in benchmarks/surfaces.py and orthos.py.
 """
 
 from __future__ import annotations
