@@ -1,7 +1,7 @@
 """Real images, each set by barpc and by the peers that are installed: one table, a row a set.
 
     python benchmarks/real.py [--data ../shared/data] [--folder FOLDER] [--cars PYTHON] [--orthority PYTHON]
-                              [--sba CHECKOUT] [--only SET]...
+                              [--only SET]...
 
 A cell has the epipolar offset of independent points (median, spread 1.4826 MAD [px] and their number, the worst pair
 of a set), CPU seconds, peak memory, the exit code and the first sentence of the result. The points are those of the
@@ -12,9 +12,9 @@ through GDAL. Tools:
   delivered  the cameras as they are
   barpc      `barpc adjust` with its defaults, and what a set gives (GCPs, DEM, reference)
   cars       cars-bundleadjustment of the interpreter given, its .geom as written and half a pixel back
-  sba        sat-bundleadjust of a checkout, by the Python of its folder `venv` or, without one, this one
   orthority  orthority's refinement by GCPs, `shift` and `shift-drift`, of the interpreter given
-A set or a tool that is absent is named with the reason. The sets are in benchmarks/real_sets.py.
+A set or a tool that is absent is named with the reason. The sets are in benchmarks/real_sets.py; surfaces and
+orthoimages beside those of others in benchmarks/surfaces.py and orthos.py.
 """
 
 from __future__ import annotations
@@ -58,13 +58,9 @@ from benchmarks.real_sets import (  # noqa: E402
 Cameras = dict[str, Path]
 """Files by the stems of the images."""
 TOOLS = (
-    "delivered", "barpc", "cars, as written", "cars, half a pixel back", "sba", "orthority, shift",
-    "orthority, shift-drift",
+    "delivered", "barpc", "cars, as written", "cars, half a pixel back", "orthority, shift", "orthority, shift-drift",
 )  # fmt: skip
-ABSENT = {
-    "cars": "no interpreter given (--cars)", "orthority": "no interpreter given (--orthority)",
-    "sba": "no checkout given (--sba); the package index has none",
-}  # fmt: skip
+ABSENT = {"cars": "no interpreter given (--cars)", "orthority": "no interpreter given (--orthority)"}
 BESIDE = """
 import json, resource, subprocess, sys
 code = subprocess.call(sys.argv[2:])
@@ -246,24 +242,6 @@ def _shifted(geom: Path, image: str, pixels: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def by_sba(checkout: Path, arguments: list[str], place: Path) -> tuple[Row, Cameras]:
-    """sat-bundleadjust: a folder of images, a folder of RPCs in rpcm's text, and the adjusted ones in `rpcs_adj`."""
-    given, out = place / "sba_in", place / "sba"
-    for name in ("images", "rpcs"):
-        (given / name).mkdir(parents=True)
-    for path in map(Path, arguments):
-        (given / "images" / f"{path.stem}.tif").symlink_to(path)
-        shutil.copy(place / "delivered" / f"{path.stem}_RPC.TXT", given / "rpcs" / f"{path.stem}.rpc")
-    (place / "sba.json").write_text(json.dumps({"input_dir": str(given), "output_dir": str(out)}))
-    own = checkout / "venv/bin/python"
-    program = [str(own if own.is_file() else sys.executable), str(checkout / "main.py"), str(place / "sba.json")]
-    cpu, peak, code = measured(program, checkout, place / "sba.log")
-    said = "" if code == 0 else (place / "sba.log").read_text().strip().splitlines()[-1][:100]
-    found = {Path(path): next(iter(sorted((out / "rpcs_adj").glob(f"{Path(path).stem}*"))), None) for path in arguments}
-    cameras = converted({path: one for path, one in found.items() if one is not None}, place / "sba_vrt")
-    return Row("sba", "", cpu, peak, code, said), cameras
-
-
 def converted(files: dict[Path, Path], out: Path) -> Cameras:
     """VRTs of images with cameras of other files."""
     arguments = [f"{image},camera={camera}" for image, camera in files.items()]
@@ -338,8 +316,6 @@ def _runs(scene: Scene, tools: argparse.Namespace, arguments: list[str], place: 
     yield by_barpc(arguments, scene.options, place)
     if tools.cars and len(arguments) > 1:
         yield from by_cars(tools.cars, arguments, place)
-    if tools.sba and len(arguments) > 1:
-        yield by_sba(tools.sba.resolve(), arguments, place)
 
 
 def _rows_of_gcps(
@@ -412,7 +388,6 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, action="append", default=[], help="images of one place")
     parser.add_argument("--cars", metavar="PYTHON", help="interpreter that has cars-bundleadjustment")
     parser.add_argument("--orthority", metavar="PYTHON", help="interpreter that has orthority")
-    parser.add_argument("--sba", metavar="CHECKOUT", type=Path, help="folder of sat-bundleadjust")
     parser.add_argument("--only", nargs="+", default=[], help="parts of the names of sets")
     given = parser.parse_args()
     tool = given.data.parent / "tools/epi_check.py"

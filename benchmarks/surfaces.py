@@ -1,6 +1,7 @@
 """Surfaces of the same corrected cameras by `barpc dsm`, s2p and CARS: a row a pair of images and tool.
 
     python benchmarks/surfaces.py [--data ../shared/data] [--s2p PYTHON] [--cars PYTHON] [--only PAIR] [--keep FOLDER]
+    python benchmarks/surfaces.py --shipped [--data ../shared/data] [--keep FOLDER]
 
 Each set is adjusted, and every pair of it made into a surface of 1 m cells: by barpc and CARS with their defaults (of
 CARS one resolution, as the images are small), by s2p with its pointing correction off, which wants none.
@@ -10,6 +11,8 @@ CARS one resolution, as the images are small), by s2p with its pointing correcti
   CPU      seconds a million pixels of the smaller image (s2p, CARS: their processes, too)
 Below a set of several pairs, of each tool: the median difference of two pairs' heights, and the standard deviation of
 the medians of nine parts of the scene over three, which is the noise that matching leaves in the first.
+--shipped: of the whole triplet, all pairs, beside the surface that s2p ships for it: UTM 31 N, cells of 0.5 m, above
+the ellipsoid, of 700 x 700 px in the middle of the second image, seen with each of the others.
 --keep leaves runs and surfaces in a folder, where a second call finds them.
 """
 
@@ -162,12 +165,37 @@ def between(a: Path, b: Path) -> str:
     return f"{np.median(values):+.3f} +- {noise:.3f} m ({len(values)} cells, {len(medians)} parts)"
 
 
+def shipped(data: Path, place: Path) -> None:
+    """Print the rows of barpc's surfaces of the whole triplet beside the one that s2p ships."""
+    theirs = data / "optical/phr_triplet_whole/s2p_dsm.tif"
+    images = sorted(theirs.parent.glob("img_*.tif"))
+    run = adjusted(images, place)
+    known, (low, high) = heights(theirs, theirs), read_scene(run).alt_range
+    one, _, three = names = [shot.name for shot in read_scene(run).shots]
+    print("| cameras, pairs | of s2p's cells | to s2p's heights: median, NMAD [m]; > 5 m |\n|---|---|---|")
+    for kind, views in {"corrected, all": names, "corrected, the widest": [one, three], "delivered, all": []}.items():
+        given = [run / f"{view}.vrt" for view in views] or images
+        call = [sys.executable, "-m", "barpc", "-q", "dsm", *map(str, given), "--alt", str(low), str(high)]
+        call += ["--gsd", "0.5", "-o", str(place / "dsm.tif"), "--overwrite"]
+        measured(call, ROOT, place / "log")
+        ours = heights(place / "dsm.tif", theirs)
+        apart = (ours - known)[np.isfinite(ours + known)]
+        median, far = float(np.median(apart)), float(np.mean(np.abs(apart) > FAR))
+        share = len(apart) / np.isfinite(known).sum()
+        print(f"| {kind} | {share:.1%} | {median:+.2f}, {nmad(apart):.2f}; {far:.2%} |", flush=True)
+
+
+def adjusted(images: list[Path], place: Path) -> Path:
+    """The run of a set, made where it is not there."""
+    if not (place / "run/summary.json").is_file():
+        given = [*map(str, images), "--rpc-format", "txt,geom", "-o", str(place / "run")]
+        measured([sys.executable, "-m", "barpc", "-q", "adjust", *given], ROOT, place / "log")
+    return place / "run"
+
+
 def of_set(name: str, images: list[Path], tools: dict[str, Tool], only: list[str], place: Path) -> None:
     """Print the rows of a set."""
-    run = place / "run"
-    if not (run / "summary.json").is_file():
-        given = [*map(str, images), "--rpc-format", "txt,geom", "-o", str(run)]
-        measured([sys.executable, "-m", "barpc", "-q", "adjust", *given], ROOT, place / "log")
+    run = adjusted(images, place)
     every: dict[str, dict[Pair, Path]] = {tool: {} for tool in tools}
     for pair in itertools.combinations([path.stem for path in images], 2):
         label = " - ".join(pair)
@@ -195,7 +223,14 @@ def main() -> None:
     parser.add_argument("--cars", metavar="PYTHON", help="interpreter that has CARS")
     parser.add_argument("--only", nargs="+", default=[], help="parts of the names of pairs")
     parser.add_argument("--keep", type=Path, help="folder for runs and surfaces")
+    parser.add_argument("--shipped", action="store_true", help="beside the surface that s2p ships")
     given = parser.parse_args()
+    if given.shipped:
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(given.keep or folder).absolute()
+            place.mkdir(parents=True, exist_ok=True)
+            shipped(given.data, place)
+        return
     tools: dict[str, Tool] = {"barpc": by_barpc}
     tools |= {"s2p": by_s2p(given.s2p)} if given.s2p else {}
     tools |= {"cars": by_cars(given.cars)} if given.cars else {}

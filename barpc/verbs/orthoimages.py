@@ -273,10 +273,13 @@ def _write_terrain(path: Path, camera: Camera, terrain: Dem, levels: tuple[float
     place, size = to_map @ Affine.translation(left, top), (int(right - left), int(bottom - top))
     whole = pyproj.CRS(grid.crs.to_wkt())
     flat = (whole.sub_crs_list[0] if whole.is_compound else whole).to_2d().to_wkt()
-    if grid.crs.is_geographic:  # GDAL has no posts beyond a longitude of 180: the same in a map about the image
-        middle = place.c + place.a * size[0] / 2
-        place = Affine.scale(np.radians(_SPHERE)) @ Affine.translation(-middle, 0.0) @ place
-        flat = f"+proj=eqc +lon_0={wrap_longitude(middle)} +R={_SPHERE}"
+    if grid.crs.is_geographic:
+        half = place.a * size[0] / 2
+        east = wrap_longitude(place.c + half)
+        place, flat = Affine(place.a, 0.0, east - half, 0.0, place.e, place.f), "EPSG:4326"
+        if abs(east) + half > 180.0:  # where GDAL has no posts: the same in a map, at half as much CPU again
+            place = Affine.scale(np.radians(_SPHERE)) @ Affine.translation(-east, 0.0) @ place
+            flat = f"+proj=eqc +lon_0={east} +R={_SPHERE}"
     what = {"dtype": "float32", "nodata": -32768.0, "crs": flat, "transform": place, "tiled": True}
     with rasterio.open(path, "w", "GTiff", *size, 1, **what) as file:
         for rows in chunks(size[1], BLOCK_SIZE):
