@@ -35,7 +35,7 @@ def report(run_dir: str, other: str | None) -> int:
     if other is None:
         if wants_json():
             raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
-        from barpc.pipeline.outputs import remake_report
+        from barpc.pipeline.remake import remake_report
 
         tell(None, remake_report(run_dir))
         return 0
@@ -101,7 +101,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
       barpc verify adjusted --figures
       barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
-    from barpc.pipeline.outputs import SAME
+    from barpc.pipeline.proof import SAME
     from barpc.verbs import runs
 
     with at_work() as progress:

@@ -18,13 +18,12 @@ from barpc.base.errors import InputError, UsageError
 from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
 from barpc.base.verb_options import ExportOptions
-from barpc.export.files import Files, as_json
+from barpc.export.files import Files, as_json, ply
 from barpc.export.light import lit
 from barpc.export.pinholes import Picture, Pinhole, mapped, pictures_of, pinhole_of
 from barpc.export.shots import Scene, Shot, Window, relative_link
 from barpc.rasters.raster import open_raster
 from barpc.report.compare import flat_options
-from barpc.report.runfiles import ply
 from barpc.scene import BoolArray, IntArray
 
 ByteImage = npt.NDArray[np.uint8]

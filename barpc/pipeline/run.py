@@ -48,8 +48,9 @@ from barpc.pipeline.inputs import (
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures
+from barpc.pipeline.remake import remake_report
 from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names

@@ -16,11 +16,10 @@ from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
 from barpc.report.finished import FinishedRun
-from barpc.report.quality_checks import enu
 from barpc.report.records import json_form
 from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
-from barpc.report.summary.words import median, metres
+from barpc.report.summary.words import enu, median, metres
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC

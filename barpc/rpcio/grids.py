@@ -34,8 +34,8 @@ from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
 
-GRID_SUFFIX, CORRECTION = "_grid.tif", "_correction.tif"
-"""Ends of the names of localisation and correction grids."""
+GRID_SUFFIX, CORRECTION, RESAMPLED = "_grid.tif", "_correction.tif", "_resampled.tif"
+"""Ends of the names of localisation and correction grids, and of images resampled by these."""
 
 SIGN = "image point = that of the RPC in this file + (dcol, drow)"
 _GRID_PROFILE: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}

@@ -21,7 +21,7 @@ from barpc.verbs.workers import executor_for
 if TYPE_CHECKING:
     from barpc.dsm import Surface
     from barpc.pipeline import AdjustResult
-    from barpc.pipeline.outputs import Proved
+    from barpc.pipeline.proof import Proved
     from barpc.tie.tasks import Progress
 
 PathLike = str | Path
@@ -273,7 +273,7 @@ def verify(
     >>> all(one.passed for one in barpc.verify("tied"))
     True
     """
-    from barpc.pipeline.outputs import prove
+    from barpc.pipeline.proof import prove
 
     chosen = with_values(VerifyOptions(), keywords, "verify")
     folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect

@@ -14,9 +14,9 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.manifest import Layer, render
-from barpc.pipeline import outputs as proof
+from barpc.pipeline import proof
 from barpc.pipeline.grid_outputs import REOPENED
-from barpc.pipeline.outputs import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
+from barpc.pipeline.proof import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 
