@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, UsageError
 from barpc.base.geodesy import Array
@@ -121,6 +120,8 @@ def _model(
     scene: Scene, out: Path, entries: Sequence[_Entry], colours: ByteImage, masks: bool = False, **about: Any
 ) -> Files:
     """Return the text model, its points and ``transforms.json``, and ``world.json`` with more keys, `about` it."""
+    from scipy.spatial.transform import Rotation  # of no other tool
+
     world = scene.world(scene.points)
     cameras, images = [], []
     seen: dict[int, list[tuple[int, int, float]]] = {}

@@ -5,19 +5,17 @@ The names below are imported when first used: a worker process, which does the t
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from barpc.base import used_later
+from barpc.base.options import RunOptions
 
 if TYPE_CHECKING:
-    from barpc.base.options import RunOptions
     from barpc.pipeline.loading import LoadedViews, load_views
     from barpc.pipeline.run import AdjustResult, adjust, check
 
 __all__ = ["AdjustResult", "LoadedViews", "RunOptions", "adjust", "check", "load_views"]
-_MODULES = {"RunOptions": "barpc.base.options", **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading")}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES.get(name, f"{__name__}.run")), name)
+__getattr__ = used_later(
+    __name__,
+    dict.fromkeys(("AdjustResult", "adjust", "check"), "run") | dict.fromkeys(("LoadedViews", "load_views"), "loading"),
+)

@@ -5,8 +5,9 @@ The names below are imported when first used: what a finished run says is read w
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from barpc.base import used_later
 
 if TYPE_CHECKING:
     from barpc.report.outcome import Run
@@ -14,10 +15,4 @@ if TYPE_CHECKING:
     from barpc.report.verdict import summarize
 
 __all__ = ["Run", "Summary", "summarize"]
-_MODULES = {"Run": "outcome", "Summary": "summary", "summarize": "verdict"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = used_later(__name__, {"Run": "outcome", "Summary": "summary", "summarize": "verdict"})

@@ -13,12 +13,11 @@ from barpc import pipeline
 from barpc.base.declarations import with_values
 from barpc.base.errors import UsageError
 from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
-from barpc.cameras import ImageLike
-from barpc.verbs.images import every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 
 if TYPE_CHECKING:
+    from barpc.cameras import ImageLike
     from barpc.dsm import Surface
     from barpc.pipeline import AdjustResult
     from barpc.pipeline.proof import Proved
@@ -69,6 +68,8 @@ def adjust(
     >>> result.views[0].sensor.project([5.4, 43.3, 120.0]).shape
     (2,)
     """
+    from barpc.verbs.images import every
+
     chosen, where = run_options(options, **keywords), os.fspath(out_dir)
     with executor_for(jobs, executor) as workers:
         return pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
@@ -140,6 +141,8 @@ def check(
     >>> found.passed, found.summary["pairs"][0]["num_matches"] > 100
     (False, True)
     """
+    from barpc.verbs.images import every
+
     chosen = run_options(options, **keywords)
     with executor_for(jobs, executor) as workers:
         return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
@@ -184,6 +187,7 @@ def dsm(
     (2.0, True)
     """
     from barpc.dsm import make_dsm
+    from barpc.verbs.images import every, one_or_many
 
     chosen = with_values(options or DsmOptions(), keywords, "dsm")
     given, _ = one_or_many(source)
