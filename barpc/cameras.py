@@ -21,16 +21,14 @@ from barpc.base.geodesy import EVERYWHERE as EVERYWHERE
 from barpc.base.manifest import LAST
 from barpc.base.remote import PathOrUrl, is_url, located, location
 from barpc.base.safe_io import IMAGE, read_head
-from barpc.rasters.raster import driver_at, driver_of, earth_crs, open_raster
+from barpc.rasters.raster import GRID_TAG, driver_at, driver_of, earth_crs, open_raster
 from barpc.rpcio import read_rpc_source
-from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.formats import SIGN
 from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical, scene_beside
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
-from barpc.sensor.direct_grid import GRID_TAG, DirectGrid
 from barpc.sensor.geometry import altitude_range
-from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
 
 if TYPE_CHECKING:
@@ -316,6 +314,7 @@ def _is_grid(path: PathOrUrl, head: bytes, choices: Mapping[str, Any]) -> bool:
 
 def _open_grid(path: PathOrUrl, altitudes: list[float] | None = None) -> Camera:
     from barpc.pointio.correspondences import read_grid
+    from barpc.sensor.direct_grid import DirectGrid
 
     nodes = read_grid(path, altitudes)
     grid = DirectGrid.from_points(nodes.ground, nodes.image)
@@ -324,6 +323,9 @@ def _open_grid(path: PathOrUrl, altitudes: list[float] | None = None) -> Camera:
 
 
 def _open_correction(path: PathOrUrl) -> Camera:
+    from barpc.rpcio.grids import read_correction
+    from barpc.sensor.image_corrections import Displaced
+
     rpc, lacking = read_correction(path)
     size = int(lacking.cols[-1]) + 1, int(lacking.rows[-1]) + 1  # its nodes go from corner to corner of the image
     return Camera(Displaced(rpc, lacking), path, "correction", size, altitude_range(rpc))

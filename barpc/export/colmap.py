@@ -22,7 +22,7 @@ from barpc.export.light import lit
 from barpc.export.pinholes import Picture, Pinhole, mapped, pictures_of, pinhole_of
 from barpc.export.shots import Scene, Shot, Window, relative_link
 from barpc.rasters.raster import open_raster
-from barpc.report.compare import flat_options
+from barpc.report.records import flat_options
 from barpc.scene import BoolArray, IntArray
 
 ByteImage = npt.NDArray[np.uint8]

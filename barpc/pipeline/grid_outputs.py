@@ -22,15 +22,8 @@ from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.proof import REOPENED
 from barpc.pipeline.verify_outputs import verify_grid
-from barpc.rpcio.grids import (
-    CORRECTION,
-    GRID_SUFFIX,
-    RESAMPLED,
-    read_correction,
-    write_correction,
-    write_grid,
-    write_resampled,
-)
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
+from barpc.rpcio.grids import read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.csm import STATE_END as STATE

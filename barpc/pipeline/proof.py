@@ -22,7 +22,7 @@ from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import format_for, hidden_by
-from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, RESAMPLED
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
 
 if TYPE_CHECKING:
     from barpc.tie.tasks import Progress

@@ -31,10 +31,9 @@ from barpc.pointio.tables import (
     vertical_of_column,
 )
 from barpc.rasters.dem import HeightGrid, datum_of
-from barpc.rasters.raster import driver_of, open_raster, transformed
+from barpc.rasters.raster import GRID_TAG, driver_of, open_raster, transformed
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of
 from barpc.scene import Altimetry
-from barpc.sensor.direct_grid import GRID_TAG
 
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
 

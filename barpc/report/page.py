@@ -16,7 +16,6 @@ import numpy as np
 
 from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
-from barpc.report.compare import flat_options
 from barpc.report.maps import doubted, ground_map, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.ranking import (
@@ -31,7 +30,7 @@ from barpc.report.ranking import (
     worst_first,
     worst_pairs,
 )
-from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
+from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, flat_options, table, value_of
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
 from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry, SceneEntry

@@ -133,6 +133,23 @@ def _serialized_fields(kind: Any) -> list[tuple[str, bool]]:
     return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
 
 
+def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return the nested options as one level, names joined by dots.
+
+    Examples
+    --------
+    >>> flat_options({"tie": {"band": 1}, "overwrite": False})
+    {'tie.band': 1, 'overwrite': False}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in options.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flat_options(value, f"{before}{key}.")
+        else:
+            flat[before + key] = value
+    return flat
+
+
 # --- tables -----------------------------------------------------------------------------------------------
 
 MAX_SHOWN = 400  # Rows of a table of the page, sentences, images and ground points on its map; files have all

@@ -22,7 +22,6 @@ from barpc.sensor.rational import DERIVATIVE, monomials
 if TYPE_CHECKING:
     from scipy.interpolate import NdBSpline
 
-GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 LINEAR = 0.005  # px: what linear interpolation in a grid made here may miss by
 
 _REDERIVE_SHRINK = 1e-4  # of a step to the next: more asks for new derivatives

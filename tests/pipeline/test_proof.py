@@ -325,8 +325,7 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
 
 
 def test_a_grid_holds_the_camera_of_its_image_and_a_resampled_one_does_not() -> None:
-    from barpc.pipeline.grid_outputs import RESAMPLED
-    from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
+    from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
 
     for end, holds in (
         (GRID_SUFFIX, True),
