@@ -10,6 +10,7 @@ import click
 import numpy as np
 import pytest
 import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 
 import barpc
 from barpc import cameras
@@ -150,7 +151,7 @@ def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
     case = MODELS["localisation grid"]()
     monkeypatch.setattr("barpc.pointio.correspondences.read_grid", lambda path, altitudes: _nodes(case.model))
     path = write_image(tmp_path / "grid.tif")
-    with rasterio.open(path, "r+") as dataset:
+    with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "r+") as dataset:
         dataset.update_tags(ALTITUDE_B0="0")
     camera = open_camera(path)
     assert camera.format == "grid"
