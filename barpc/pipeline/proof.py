@@ -1,4 +1,4 @@
-"""Comparison of a finished run, or an export, with what it was: its files, its inputs and its cameras."""
+"""Comparison of a finished run, or an export, with its checksums: its files, inputs and cameras."""
 
 from __future__ import annotations
 
