@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 
 def used_later(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package whose names (name -> module in it) are imported when first used."""
+    """Return the `__getattr__` of a package whose names (name -> its module) are imported when first used."""
 
     def of_package(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{modules[name]}"), name)
+        return getattr(import_module(modules[name]), name)
 
     return of_package

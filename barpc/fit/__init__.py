@@ -1,23 +1,20 @@
 """Sensor model to RPC: the fit and its certificate. The names below are imported when first used."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from barpc.base import used_later
-from barpc.base.options import FitOptions
+
+TYPE_CHECKING = False  # as of `typing`, whose import is most of what `import barpc` would cost
 
 if TYPE_CHECKING:
+    from barpc.base.options import FitOptions
     from barpc.fit.certificate import Localisation, RpcFit
     from barpc.fit.refit import fit_rpc, fit_rpc_points
     from barpc.fit.system import Normalization
 
+_MODULES = {
+    "FitOptions": "barpc.base.options",
+    **dict.fromkeys(("Localisation", "RpcFit"), "barpc.fit.certificate"),
+    **dict.fromkeys(("fit_rpc", "fit_rpc_points"), "barpc.fit.refit"),
+    "Normalization": "barpc.fit.system",
+}
 __all__ = ["FitOptions", "Localisation", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]
-__getattr__ = used_later(
-    __name__,
-    {
-        **dict.fromkeys(("Localisation", "RpcFit"), "certificate"),
-        **dict.fromkeys(("fit_rpc", "fit_rpc_points"), "refit"),
-        "Normalization": "system",
-    },
-)
+__getattr__ = used_later(__name__, _MODULES)

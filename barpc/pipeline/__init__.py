@@ -8,14 +8,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from barpc.base import used_later
-from barpc.base.options import RunOptions
 
 if TYPE_CHECKING:
+    from barpc.base.options import RunOptions
     from barpc.pipeline.loading import LoadedViews, load_views
-    from barpc.pipeline.run import AdjustResult, adjust, check
+    from barpc.pipeline.planning import Plan
+    from barpc.pipeline.results import OpenedRun
+    from barpc.pipeline.run import AdjustResult, adjust, check, plan
 
-__all__ = ["AdjustResult", "LoadedViews", "RunOptions", "adjust", "check", "load_views"]
-__getattr__ = used_later(
-    __name__,
-    dict.fromkeys(("AdjustResult", "adjust", "check"), "run") | dict.fromkeys(("LoadedViews", "load_views"), "loading"),
-)
+__all__ = ["AdjustResult", "LoadedViews", "OpenedRun", "Plan", "RunOptions", "adjust", "check", "load_views", "plan"]
+_MODULES = {
+    "RunOptions": "barpc.base.options",
+    "OpenedRun": f"{__name__}.results",
+    "Plan": f"{__name__}.planning",
+    **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading"),
+    **dict.fromkeys(("AdjustResult", "adjust", "check", "plan"), f"{__name__}.run"),
+}
+__getattr__ = used_later(__name__, _MODULES)

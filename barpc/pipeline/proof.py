@@ -12,7 +12,7 @@ import numpy as np
 
 from barpc.base import manifest
 from barpc.base.atomic import STATE
-from barpc.base.errors import BarpcError, InputError
+from barpc.base.errors import BarpcError, InputError, listed
 from barpc.base.identity import fingerprint
 from barpc.base.manifest import LAST, SUMS, Layer
 from barpc.base.remote import is_url
@@ -46,6 +46,17 @@ class Proved:
     def passed(self) -> bool:
         """Whether the file counts as unchanged."""
         return self.now in PASSED_STATES
+
+
+class Verification(tuple[Proved, ...]):
+    """The state of every file of a folder, a `Proved` each; it is false where one of them has changed."""
+
+    def __bool__(self) -> bool:
+        return all(one.passed for one in self)
+
+    def __repr__(self) -> str:
+        wrong = [f"{one.file} {one.now}" for one in self if not one.passed]
+        return f"Verification({len(self)} files, {listed(wrong, 3) or 'none has changed'})"
 
 
 def prove(

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from barpc.base.errors import BarpcError
+from barpc.base.keywords import PathLike
 from barpc.base.manifest import REPORT_FILE
 from barpc.report.finished import FinishedRun
 from barpc.report.page import can_render, page_of
 from barpc.workspace import Workspace
 
 
-def remake_report(folder: Path | str) -> Path:
+def remake_report(folder: PathLike) -> Path:
     """Make report.html of a finished run again, from its files.
 
     Raises

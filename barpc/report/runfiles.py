@@ -30,6 +30,8 @@ FOLDER = "tables"
 """Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
 PRIOR_FILE, IMAGES = "block.npz", "images.json"  # the files in it that a later run starts from
 
+MATCHES = "matches.npz"  # all tie points, in use or not, to the bit
+
 _PLACE = "lon", "lat", "height_above_datum"
 RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
 """Columns of residuals.csv, one row a track. Heights: above the ellipsoid."""

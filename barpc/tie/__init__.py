@@ -41,14 +41,14 @@ __all__ = [
 __getattr__ = used_later(
     __name__,
     {
-        "Keypoints": "matchers.features",
-        "Matches": "matchers.matcher",
-        "match_pairs": "matchers.matching",
-        "PairReport": "matchers.report",
-        **dict.fromkeys(("Area", "read_area"), "pairing.area"),
-        **dict.fromkeys(("Pair", "Scope"), "pairing.overlaps"),
-        "refine": "patches.register",
-        "ReferenceControl": "reference",
-        **dict.fromkeys(("TieResult", "find_tracks", "link", "thin"), "tracks"),
+        "Keypoints": "barpc.tie.matchers.features",
+        "Matches": "barpc.tie.matchers.matcher",
+        "match_pairs": "barpc.tie.matchers.matching",
+        "PairReport": "barpc.tie.matchers.report",
+        **dict.fromkeys(("Area", "read_area"), "barpc.tie.pairing.area"),
+        **dict.fromkeys(("Pair", "Scope"), "barpc.tie.pairing.overlaps"),
+        "refine": "barpc.tie.patches.register",
+        "ReferenceControl": "barpc.tie.reference",
+        **dict.fromkeys(("TieResult", "find_tracks", "link", "thin"), "barpc.tie.tracks"),
     },
 )
