@@ -14,32 +14,25 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from barpc.base.errors import ImageError, InputError, MissingRpcError, RpcError
 from barpc.base.geodesy import EVERYWHERE as EVERYWHERE
 from barpc.base.manifest import LAST
 from barpc.base.remote import PathOrUrl, is_url, located, location
 from barpc.base.safe_io import IMAGE, read_head
-from barpc.pointio.correspondences import (
-    GRID_TAG,
-    Correspondences,
-    correspondence_kind,
-    read_correspondences,
-    read_gcp_grid,
-    read_grid,
-)
-from barpc.rasters.raster import driver_at, driver_of, earth_crs, open_raster
+from barpc.rasters.raster import GRID_TAG, driver_at, driver_of, earth_crs, open_raster
 from barpc.rpcio import read_rpc_source
-from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.formats import SIGN
 from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical, scene_beside
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
-from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import altitude_range
-from barpc.sensor.image_corrections import Displaced
 from barpc.sensor.rpc import RPC
+
+if TYPE_CHECKING:
+    from barpc.pointio.correspondences import Correspondences
 
 ChoiceReader = Callable[[str], Any]
 ImageLike = Any
@@ -190,6 +183,8 @@ def read_points(spec: str | Path) -> tuple[Correspondences | None, tuple[int, in
 
     And the size of the image, given behind the file or its own.
     """
+    from barpc.pointio.correspondences import correspondence_kind, read_correspondences
+
     path, texts = split_spec(spec)
     if path.is_dir() or path.suffix.lower() == ".zip" or b"<adsHeader>" in read_head(path, IMAGE):
         return None, None
@@ -209,6 +204,8 @@ def _tagged(path: PathOrUrl) -> tuple[Correspondences | None, tuple[int, int] | 
     try:
         read_rpc_source(path)
     except MissingRpcError:
+        from barpc.pointio.correspondences import read_gcp_grid
+
         return read_gcp_grid(path)
     except (ImageError, RpcError):
         pass  # it is said where the camera is opened
@@ -307,11 +304,18 @@ def _open_csm(path: PathOrUrl, altitudes: tuple[float, float] = EVERYWHERE) -> C
 def _is_grid(path: PathOrUrl, head: bytes, choices: Mapping[str, Any]) -> bool:
     if driver_of(head) != "GTiff":
         return False
-    tags = choices.get("tags")
-    return "altitudes" in choices or (correspondence_kind(path) == "grid" if tags is None else GRID_TAG in tags)
+    if "altitudes" in choices:
+        return True
+    if (tags := choices.get("tags")) is None:
+        with open_raster(path) as dataset:
+            tags = dataset.tags()
+    return GRID_TAG in tags
 
 
 def _open_grid(path: PathOrUrl, altitudes: list[float] | None = None) -> Camera:
+    from barpc.pointio.correspondences import read_grid
+    from barpc.sensor.direct_grid import DirectGrid
+
     nodes = read_grid(path, altitudes)
     grid = DirectGrid.from_points(nodes.ground, nodes.image)
     size = (max(1, int(grid.cols[-1]) + 1), max(1, int(grid.rows[-1]) + 1))  # an image that begins at (0, 0)
@@ -319,6 +323,9 @@ def _open_grid(path: PathOrUrl, altitudes: list[float] | None = None) -> Camera:
 
 
 def _open_correction(path: PathOrUrl) -> Camera:
+    from barpc.rpcio.grids import read_correction
+    from barpc.sensor.image_corrections import Displaced
+
     rpc, lacking = read_correction(path)
     size = int(lacking.cols[-1]) + 1, int(lacking.rows[-1]) + 1  # its nodes go from corner to corner of the image
     return Camera(Displaced(rpc, lacking), path, "correction", size, altitude_range(rpc))

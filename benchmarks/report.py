@@ -18,7 +18,7 @@ from barpc.ba import adjust_tracks
 from barpc.fit import fit_rpc
 from barpc.report import Run, Summary, summarize
 from barpc.report.page import report_html
-from barpc.report.runfiles import TABLES
+from barpc.report.tables import TABLES
 from barpc.simulate import simulate_block
 
 

@@ -6,7 +6,8 @@ Each turn is a process of its own with an output folder of its own, so that noth
 and system time, one thread, the median of the turns after a first one; sources are compiled before, as installing does.
 "start" is what no stage counts: the interpreter, imports, the end. Other tools that read RPCs, which a development
 environment has, are hidden: to import them takes longer than to verify with them. "floor" is a process that imports
-numpy, scipy, OpenCV and rasterio, as far as they are used, and ends.
+numpy, scipy, OpenCV and rasterio, as far as they are used, and ends. After "whole": verbs that read the run, and the
+shortest command of all.
 """
 
 from __future__ import annotations
@@ -24,6 +25,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PEERS = ("boto3", "rpcm", "shareloc", "orthority")
 FLOOR = "import cv2, numpy, rasterio, scipy.linalg, scipy.optimize, scipy.sparse.csgraph, scipy.spatial"
+READING = {
+    "--version": ["--version"],
+    "verify": ["verify", "out"],
+    "report": ["report", "out"],
+    "two reports": ["report", "out", "out"],
+    "export": ["export", "out", "s2p", "--to", "s2p"],
+}
 RUN = "from barpc.cli import main; main()"
 THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -52,8 +60,11 @@ def turn(environment: dict[str, str], arguments: list[str]) -> dict[str, float]:
         floor = cpu([sys.executable, "-c", FLOOR], environment, folder)
         whole = cpu(command, environment, folder)
         state = json.loads(Path(folder, "out", ".barpc", "state.json").read_text())
+        reading = {
+            name: cpu([sys.executable, "-c", RUN, "-q", *words], environment, folder) for name, words in READING.items()
+        }
     stages = {entry["stage"]: entry["cpu_seconds"] for entry in state["stages"]}
-    return {"floor": floor, "start": whole - sum(stages.values()), **stages, "whole": whole}
+    return {"floor": floor, "start": whole - sum(stages.values()), **stages, "whole": whole, **reading}
 
 
 def cpu(command: list[str], environment: dict[str, str], folder: str) -> float:
@@ -85,7 +96,8 @@ def main() -> int:
                     found[checkout].append(one)
     stages = dict.fromkeys(stage for turns in found.values() for one in turns for stage in one)
     print(f"CPU s, median of {given.turns} turns" + ", the last column this checkout" * (len(checkouts) > 1))
-    for stage in sorted(stages, key=lambda stage: stage == "whole"):
+    last = ["whole", *READING]
+    for stage in sorted(stages, key=lambda stage: last.index(stage) + 1 if stage in last else 0):
         medians = [statistics.median(one.get(stage, 0.0) for one in found[c]) for c in checkouts]
         ratio = f"   x {medians[-1] / medians[0]:.2f}" if len(medians) > 1 and medians[0] > 0 else ""
         print(f"  {stage:14s}" + "".join(f"{seconds:8.3f}" for seconds in medians) + ratio)

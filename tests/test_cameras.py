@@ -9,6 +9,8 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
 
 import barpc
 from barpc import cameras
@@ -147,9 +149,10 @@ def test_a_camera_that_is_no_rpc_says_so_where_an_rpc_is_needed(frame, tmp_path,
 
 def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
     case = MODELS["localisation grid"]()
-    monkeypatch.setattr(cameras, "read_grid", lambda path, altitudes: _nodes(case.model))
-    monkeypatch.setattr(cameras, "correspondence_kind", lambda path: "grid")
+    monkeypatch.setattr("barpc.pointio.correspondences.read_grid", lambda path, altitudes: _nodes(case.model))
     path = write_image(tmp_path / "grid.tif")
+    with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "r+") as dataset:
+        dataset.update_tags(ALTITUDE_B0="0")
     camera = open_camera(path)
     assert camera.format == "grid"
     assert camera.model == case.model

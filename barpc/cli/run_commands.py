@@ -33,13 +33,14 @@ def report(run_dirs: tuple[str, ...], csv: bool) -> int:
       barpc report adjusted adjusted_with_drift
       barpc report --csv scenes/*/adjusted > scenes.csv
     """
-    from barpc.report.overview import NO_RUN, as_csv
     from barpc.verbs import runs
 
     if wants_json() and len(run_dirs) == 1 and not csv:
         raise click.UsageError("--json goes with two runs or --csv; the summary.json of one is there already")
     found = runs.report(*run_dirs, csv=csv)
     if csv:
+        from barpc.report.overview import NO_RUN, as_csv
+
         echo(json.dumps(found, indent=1) if wants_json() else as_csv(found))
         lacking = [row["run"] for row in found if row["status"] == NO_RUN]
         return tell_gate(f"{len(lacking)} of {len(found)} folders hold no finished run:", lacking) if lacking else 0
@@ -104,7 +105,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
       barpc verify adjusted --figures
       barpc verify adjusted --expect 4a1e...c09f /archive/images
     """
-    from barpc.pipeline.outputs import SAME
+    from barpc.pipeline.proof import SAME
     from barpc.verbs import runs
 
     with at_work() as progress:

@@ -109,8 +109,7 @@ def print_summary(summary: Summary, root: str = "") -> None:
 
     `root`: that of the files that were written.
     """
-    from barpc.report.ranking import TABLE_ROWS_SHOWN
-    from barpc.report.verdict import VERDICT_SENTENCES, sentences
+    from barpc.report.ranking import TABLE_ROWS_SHOWN, VERDICT_SENTENCES, sentences
 
     width, lines = output_width(), sentences(summary)
     folder = shlex.quote(summary.out_dir or ".")

@@ -34,7 +34,7 @@ from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.report.finished import FinishedRun
 from barpc.report.runfiles import PRIOR_FILE
-from barpc.rpcio.grids import CORRECTION
+from barpc.rpcio.formats import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
 from barpc.sensor.rational import monomials

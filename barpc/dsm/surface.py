@@ -48,8 +48,8 @@ from barpc.dsm.stereo import (
     surface_tile,
 )
 from barpc.pipeline.executor import CachingExecutor, worker_count
-from barpc.pipeline.outputs import remake_report
 from barpc.pipeline.pictures import encoded
+from barpc.pipeline.remake import remake_report
 from barpc.rasters.raster import BLOCK_SIZE, hashed, map_crs, open_raster
 from barpc.report.finished import FinishedRun
 from barpc.report.page import can_render

@@ -12,19 +12,17 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, UsageError
 from barpc.base.geodesy import Array
 from barpc.base.remote import is_url
 from barpc.base.verb_options import ExportOptions
-from barpc.export.files import Files, as_json
+from barpc.export.files import Files, as_json, ply
 from barpc.export.light import lit
 from barpc.export.pinholes import Picture, Pinhole, mapped, pictures_of, pinhole_of
 from barpc.export.shots import Scene, Shot, Window, relative_link
 from barpc.rasters.raster import open_raster
-from barpc.report.compare import flat_options
-from barpc.report.runfiles import ply
+from barpc.report.records import flat_options
 from barpc.scene import BoolArray, IntArray
 
 ByteImage = npt.NDArray[np.uint8]
@@ -122,6 +120,8 @@ def _model(
     scene: Scene, out: Path, entries: Sequence[_Entry], colours: ByteImage, masks: bool = False, **about: Any
 ) -> Files:
     """Return the text model, its points and ``transforms.json``, and ``world.json`` with more keys, `about` it."""
+    from scipy.spatial.transform import Rotation  # of no other tool
+
     world = scene.world(scene.points)
     cameras, images = [], []
     seen: dict[int, list[tuple[int, int, float]]] = {}

@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import numpy.typing as npt
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, polygon, wrap_longitude
@@ -17,7 +18,6 @@ from barpc.base.verb_options import ExportOptions
 from barpc.export.light import lit, moment, require
 from barpc.export.shots import Scene, Shot, pairs_of, relative_link
 from barpc.report.records import json_form
-from barpc.report.runfiles import ply
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
 
@@ -251,3 +251,17 @@ def _covariances(scene: Scene) -> Array:
     out = np.full_like(normal, np.nan)
     out[known] = scene.noise**2 * (axes[known] / values[known, None]) @ axes[known].swapaxes(1, 2)
     return out
+
+
+_PLY = {"float64": "double", "float32": "float", "int32": "int", "uint8": "uchar"}
+
+
+def ply(columns: Mapping[str, npt.NDArray[Any]], *comments: str) -> bytes:
+    """Return points as a binary PLY: columns (n,) by their names, of the types of `_PLY`, and comments."""
+    kinds = [(name, column.dtype) for name, column in columns.items()]
+    records: Any = np.rec.fromarrays(list(columns.values()), dtype=kinds)
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    header.append(f"element vertex {len(records)}")
+    header += [f"property {_PLY[column.dtype.name]} {name}" for name, column in columns.items()]
+    rows: bytes = records.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + rows

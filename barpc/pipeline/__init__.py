@@ -5,8 +5,9 @@ The names below are imported when first used: a worker process, which does the t
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from barpc.base import used_later
 
 if TYPE_CHECKING:
     from barpc.base.options import RunOptions
@@ -21,10 +22,6 @@ _MODULES = {
     "OpenedRun": f"{__name__}.results",
     "Plan": f"{__name__}.planning",
     **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading"),
+    **dict.fromkeys(("AdjustResult", "adjust", "check", "plan"), f"{__name__}.run"),
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES.get(name, f"{__name__}.run")), name)
+__getattr__ = used_later(__name__, _MODULES)

@@ -20,8 +20,10 @@ from barpc.fit import RpcFit
 from barpc.fit.points import Sample, widened
 from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
+from barpc.pipeline.proof import REOPENED
 from barpc.pipeline.verify_outputs import verify_grid
-from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, read_correction, write_correction, write_grid, write_resampled
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
+from barpc.rpcio.grids import read_correction, write_correction, write_grid, write_resampled
 from barpc.scene import View
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.csm import STATE_END as STATE
@@ -36,8 +38,6 @@ logger = logging.getLogger(__name__)
 
 MISFIT = 0.02
 """A camera that its RPC misses by more [px] gets grids, too."""
-RESAMPLED = "_resampled.tif"
-REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
 
 Written = dict[str, dict[str, float | str]]
 """File -> consumer -> difference to P_BA [px], or why it does not read it."""

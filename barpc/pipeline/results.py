@@ -14,7 +14,7 @@ from barpc.base.errors import BarpcWarning, InputError, plain
 from barpc.base.frozen import html_table, load_npz
 from barpc.base.safe_io import GEOJSON, read_json
 from barpc.cameras import open_camera
-from barpc.pipeline.outputs import remake_report
+from barpc.pipeline.remake import remake_report
 from barpc.report import Summary
 from barpc.report.compare import written_rpc
 from barpc.report.finished import FinishedRun

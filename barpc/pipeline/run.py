@@ -57,8 +57,9 @@ from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
-from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE, outline_features
+from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE
 from barpc.report.summary import InputEntry, StageEntry
+from barpc.report.tables import outline_features
 from barpc.rpcio import local_image
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel

@@ -35,7 +35,7 @@ from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Vrt, read_vrt
 from barpc.rpcio import Carrier, format_for, read_rpc, sidecars
-from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid

@@ -31,12 +31,11 @@ from barpc.pointio.tables import (
     vertical_of_column,
 )
 from barpc.rasters.dem import HeightGrid, datum_of
-from barpc.rasters.raster import driver_of, open_raster, transformed
+from barpc.rasters.raster import GRID_TAG, driver_of, open_raster, transformed
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of
 from barpc.scene import Altimetry
 
 HEIGHT_SIGMA = 0.5  # m, of a height whose file states none: ICESat-2 and GEDI over gentle ground
-GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 
 _CORRESPONDENCE_COLUMNS: Names = {**COLUMNS, "sigma": ("sigma", "sigma_px")}
 _HEIGHT_COLUMNS: Names = {

@@ -335,6 +335,7 @@ def driver_at(path: PathOrUrl | str, head: bytes | None = None) -> str | None:
 
 PixelArray = npt.NDArray[Any]
 
+GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 BLOCK_SIZE = 512  # px a side, read and written at a time
 _MOST_OPEN = 64
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as float64, others as float32

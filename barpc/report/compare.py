@@ -17,11 +17,10 @@ from barpc.base.keywords import PathLike
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
 from barpc.report.finished import FinishedRun
-from barpc.report.quality_checks import enu
-from barpc.report.records import json_form
+from barpc.report.records import flat_options, json_form
 from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
-from barpc.report.summary.words import median, metres
+from barpc.report.summary.words import enu, median, metres
 from barpc.rpcio import read_rpc
 from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC
@@ -173,23 +172,6 @@ def _compared_pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
             matches = [one.num_matches for one in both if one]
             rows.append({"a": both[0].a, "b": both[0].b, "num_matches": matches, "epipolar_rms": rms})
     return rows
-
-
-def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Return the nested options as one level, names joined by dots.
-
-    Examples
-    --------
-    >>> flat_options({"tie": {"band": 1}, "overwrite": False})
-    {'tie.band': 1, 'overwrite': False}
-    """
-    flat: dict[str, Any] = {}
-    for key, value in options.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flat_options(value, f"{before}{key}.")
-        else:
-            flat[before + key] = value
-    return flat
 
 
 def _comparison_lines(comparison: Mapping[str, Any]) -> list[str]:

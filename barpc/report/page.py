@@ -16,20 +16,21 @@ import numpy as np
 
 from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
-from barpc.report.compare import flat_options
 from barpc.report.maps import doubted, ground_map, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
-from barpc.report.quality_checks import GOOD_RMSE
 from barpc.report.ranking import (
+    GOOD_RMSE,
     MIN_PAIR_MATCHES,
     TABLE_ROWS_SHOWN,
+    VERDICT_SENTENCES,
     flagged,
     offset_of,
+    sentences,
     sure_pairs,
     worst_first,
     worst_pairs,
 )
-from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, table, value_of
+from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, flat_options, table, value_of
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
 from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry, SceneEntry
@@ -37,7 +38,6 @@ from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, Gcp
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import NAMED, largest
-from barpc.report.verdict import VERDICT_SENTENCES, sentences
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open

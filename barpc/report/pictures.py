@@ -11,8 +11,7 @@ from barpc.report.maps import WIDTH, evenly, panel_box, round_ticks, template
 from barpc.report.ranking import TABLE_ROWS_SHOWN, worst_first
 from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
-from barpc.report.summary.pairs import medians
-from barpc.report.summary.words import STATUS_WORDS, counted
+from barpc.report.summary.words import STATUS_WORDS, counted, medians
 
 _DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 

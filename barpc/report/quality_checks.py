@@ -11,19 +11,19 @@ from barpc.ba.control.snooping import ControlTest
 from barpc.ba.parameters.priors import is_stated
 from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import listed
-from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
+from barpc.report.measures.block import left_entries, matters, strangeness
 from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
-from barpc.report.summary.block import AXES, LeftEntry, left_entries, matters, strangeness
+from barpc.report.ranking import GOOD_RMSE
+from barpc.report.summary.block import AXES, LeftEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
+from barpc.report.summary.words import CAUSES, NAMED, counted, enu, known, metres
 from barpc.report.unseen import unseen_parts
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
 from barpc.tie.reference import FAR_RADIUS, PEAK
 
 MIN_TIE_POINTS = 30  # Of a view, used or rejected: they tell a standard deviation to an eighth, 1 / sqrt(2 n)
-GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
 ENOUGH_GCPS = 3  # Control points that constrain a view without any tie point
 WORST_LEFT = 0.15  # px: a larger misfit of one RPC anywhere needs review
 NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher states: more needs review
@@ -410,8 +410,3 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
 def lengths(values: Iterable[float]) -> str:
     """Return lengths in readable units."""
     return ", ".join(map(metres, values))
-
-
-def enu(shift: Sequence[float] | Array) -> str:
-    """Return a shift (3,) east, north, up [m] in words."""
-    return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))

@@ -1,14 +1,17 @@
-"""Images and pairs in the order in which they are shown: the worst first."""
+"""Images and pairs in the order in which they are shown, the worst first, and one sentence for those of one cause."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from barpc.report.quality_checks import GOOD_RMSE
+from barpc.base.errors import listed
+from barpc.report.summary import Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, STATUS_WORDS
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS
 
+GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
+VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 MIN_PAIR_MATCHES = 30  # Of a pair that is called good for heights: they tell its offset to a fifth of its scatter
 
@@ -52,3 +55,33 @@ def sure_pairs(views: Sequence[ViewEntry], pairs: Sequence[PairEntry]) -> list[P
 def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
     """Return pairs whose epipolar offset exceeds the limit of stereo, the worst first."""
     return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
+
+
+def sentences(summary: Summary) -> list[str]:
+    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
+    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and sentences
+    for view in flagged(summary.views):
+        alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
+    for file in summary.left_out:  # a reason often begins with the file
+        why = file.reason.replace(file.path, "").lstrip(": ")
+        alike.setdefault(("", why), []).append((file.path, file.reason_text))
+    own = {text for found in alike.values() for _, text in found}
+    rest = [line for line in summary.verdict if line not in own]
+    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
+    return [
+        *rest[:place],
+        *(line for why, found in alike.items() for line in _status_sentences(*why, found)),
+        *rest[place:],
+    ]
+
+
+def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
+    """Return sentences of images of a status, or of files, and why."""
+    names = listed([name for name, _ in alike], NAMED)
+    if len(alike) <= NAMED or (status and why not in CAUSES):
+        return [text for _, text in alike]
+    if not status:
+        return [f"{len(alike)} files were left out, {names}: {why}"]
+    start = f"{len(alike)} images: {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
+    remedy = CAUSES[why].remedy.format(image="IMAGE")
+    return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]

@@ -70,7 +70,24 @@ class Record:
                 kind, meta = (one.metadata[key] for key in ("kind", "meta"))
                 kinds[name] = Annotated[kind or kinds[name], meta]
         cls.__annotations__ = kinds
-        dataclass(frozen=True)(cls)
+        dataclass(frozen=True, eq=False, repr=False)(
+            cls
+        )  # written once, below: for each class they cost 30 % of the import
+
+    def _values(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, name) for name in self.__dataclass_fields__)
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
+    def __repr__(self) -> str:
+        pairs = zip(self.__dataclass_fields__, self._values(), strict=True)
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in pairs)})"
 
     @classmethod
     def read(cls, found: Any) -> Self:
@@ -114,6 +131,23 @@ def _serialized_fields(kind: Any) -> list[tuple[str, bool]]:
     """Return the fields of a dataclass, and whether they are left out while None."""
     of_record = issubclass(kind, Record)
     return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
+
+
+def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return the nested options as one level, names joined by dots.
+
+    Examples
+    --------
+    >>> flat_options({"tie": {"band": 1}, "overwrite": False})
+    {'tie.band': 1, 'overwrite': False}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in options.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flat_options(value, f"{before}{key}.")
+        else:
+            flat[before + key] = value
+    return flat
 
 
 # --- tables -----------------------------------------------------------------------------------------------

@@ -18,6 +18,9 @@ from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
 from barpc.report.datum import datum_reasons
+from barpc.report.measures import measure_run
+from barpc.report.measures.block import explanations, held_out_places, left_entries, matters
+from barpc.report.measures.views import measure_views
 from barpc.report.next_steps import next_steps
 from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, Added, Run
 from barpc.report.quality_checks import (
@@ -27,7 +30,6 @@ from barpc.report.quality_checks import (
     deformation_reasons,
     dem_lines,
     dem_reasons,
-    enu,
     held_lines,
     inconsistency,
     is_smooth,
@@ -36,22 +38,12 @@ from barpc.report.quality_checks import (
     reference_reasons,
     view_status,
 )
-from barpc.report.ranking import flagged
 from barpc.report.records import json_form, value_of
-from barpc.report.summary import LeftOutEntry, Summary, measure_run
-from barpc.report.summary.block import (
-    AXES,
-    HeldOutEntry,
-    LeftEntry,
-    explanations,
-    held_out_places,
-    left_entries,
-    matters,
-)
-from barpc.report.summary.views import ViewEntry, measure_views
-from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, counted, median, metres
+from barpc.report.summary import LeftOutEntry, Summary
+from barpc.report.summary.block import AXES, HeldOutEntry, LeftEntry
+from barpc.report.summary.views import ViewEntry
+from barpc.report.summary.words import NAMED, counted, enu, median, metres
 
-VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
 _SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
@@ -425,36 +417,3 @@ def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     counts = counted(len(views), "image"), counted(len(run.tracks), "observation")
     yield f"{counted(run.tracks.num_points, 'tie point')} of {counts[0]}, {counts[1]}."
-
-
-# --- one screen: the worst first, one sentence for the images of one cause ----------------------------------
-
-
-def sentences(summary: Summary) -> list[str]:
-    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
-    alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and sentences
-    for view in flagged(summary.views):
-        alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
-    for file in summary.left_out:  # a reason often begins with the file
-        why = file.reason.replace(file.path, "").lstrip(": ")
-        alike.setdefault(("", why), []).append((file.path, file.reason_text))
-    own = {text for found in alike.values() for _, text in found}
-    rest = [line for line in summary.verdict if line not in own]
-    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
-    return [
-        *rest[:place],
-        *(line for why, found in alike.items() for line in _status_sentences(*why, found)),
-        *rest[place:],
-    ]
-
-
-def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
-    """Return sentences of images of a status, or of files, and why."""
-    names = listed([name for name, _ in alike], NAMED)
-    if len(alike) <= NAMED or (status and why not in CAUSES):
-        return [text for _, text in alike]
-    if not status:
-        return [f"{len(alike)} files were left out, {names}: {why}"]
-    start = f"{len(alike)} images: {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
-    remedy = CAUSES[why].remedy.format(image="IMAGE")
-    return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]

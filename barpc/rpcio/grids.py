@@ -28,16 +28,13 @@ from barpc.base.geodesy import MAX_COORDINATE, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, Kind
 from barpc.rasters.raster import BLOCK_SIZE, PixelArray, has_mask, open_raster
+from barpc.rpcio.formats import SIGN
 from barpc.rpcio.images import TIFF_PROFILE, copying, created, printable, put_tag, read_tag, require_pixels
 from barpc.scene import BoolArray
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
 
-GRID_SUFFIX, CORRECTION = "_grid.tif", "_correction.tif"
-"""Ends of the names of localisation and correction grids."""
-
-SIGN = "image point = that of the RPC in this file + (dcol, drow)"
 _GRID_PROFILE: dict[str, Any] = {"driver": "GTiff", "COMPRESS": "DEFLATE", "PREDICTOR": 3}
 _SPACING_TOLERANCE = 1e-6  # of a step: how far nodes may be off
 _GRID_KIND = Kind("a correction grid", 1 << 30, RpcFormatError)

@@ -30,9 +30,8 @@ from barpc.base.geodesy import (
     pointwise,
     wrap_longitude,
 )
-from barpc.sensor import Behind, SensorModel
+from barpc.sensor import Behind, SensorModel, fixed_point
 from barpc.sensor.curve import Turn, cross, rotation_left_jacobian, rotation_matrix
-from barpc.sensor.image_corrections import fixed_point
 
 _DERIVATIVE_ACCURACY = 1e-8  # of derivatives: the solver's steps ask for no more
 

@@ -18,18 +18,11 @@ import numpy as np
 from barpc.base.errors import RpcError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, as_image
-from barpc.sensor import Behind, SensorModel
+from barpc.sensor import Behind, SensorModel, fixed_point
 from barpc.sensor.direct_grid import LINEAR, MAX_NODE_SPACING, linear_axes
 
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
-
-
-ITERATION_TOLERANCE = 1e-7
-"""Last step of iterated image points [px]: the remaining error is a hundredth of it."""
-
-
-_MAX_ITERATIONS = 100  # a step leaves a hundredth of the error: four suffice where it converges at all
 
 
 class Displacement(Protocol):
@@ -68,19 +61,6 @@ class Displaced(Behind):
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
         return self.sensor.localize(self.correction.undo(as_image(image)), alt)
-
-
-def fixed_point(follow: Callable[[Array], Array], image: Array) -> Array:
-    """Return the fixed point (..., 2) [px] of the iteration `follow`, from a first guess."""
-    change = np.zeros(())
-    for _ in range(_MAX_ITERATIONS):
-        before, image = image, follow(image)
-        last, change = change, np.abs(image - before)
-        with np.errstate(all="ignore"):  # a step leaves a hundredth of itself, or what it was of the step before
-            left = np.fmin(change, 100.0 * change * change / last)
-        if not (left.max(initial=0.0, where=np.isfinite(left)) > ITERATION_TOLERANCE):
-            break
-    return image
 
 
 @dataclass(frozen=True, eq=False, repr=False)

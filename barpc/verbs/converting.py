@@ -38,7 +38,8 @@ from barpc.rpcio import (
     write_crop,
     write_rpc,
 )
-from barpc.rpcio.grids import GRID_SUFFIX, write_grid
+from barpc.rpcio.formats import GRID_SUFFIX
+from barpc.rpcio.grids import write_grid
 from barpc.scene import Camera
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border

@@ -14,7 +14,7 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError, out_of_memory
 from barpc.base.geodesy import Array
 from barpc.export.shots import Shot, read_scene
-from barpc.pipeline.outputs import CHANGED, NOT_ASKED, SAME, Proved
+from barpc.pipeline.proof import CHANGED, NOT_ASKED, SAME, Proved
 from barpc.pipeline.verify_outputs import CONSUMERS, projection_by
 from barpc.rpcio import format_for
 

@@ -13,8 +13,6 @@ from barpc import pipeline
 from barpc.base.declarations import with_values
 from barpc.base.errors import ReservationError, UsageError
 from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
-from barpc.cameras import ImageLike
-from barpc.verbs.images import every, one_or_many
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 
@@ -22,9 +20,10 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
+    from barpc.cameras import ImageLike
     from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult, Plan
-    from barpc.pipeline.outputs import Verification
+    from barpc.pipeline.proof import Verification
     from barpc.pipeline.results import OpenedRun
     from barpc.tie.tasks import Progress
 
@@ -74,6 +73,8 @@ def adjust(
     >>> result.views[0].sensor.project([5.4, 43.3, 120.0]).shape
     (2,)
     """
+    from barpc.verbs.images import every
+
     chosen, where = run_options(options, **keywords), os.fspath(out_dir)
     with executor_for(jobs, executor) as workers:
         done = pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
@@ -115,6 +116,8 @@ def plan(
     >>> found.views, found.doubts
     (('view_00', 'view_01', 'view_02'), ())
     """
+    from barpc.verbs.images import every
+
     chosen, processes = run_options(options, **keywords), jobs + (jobs > 1) if isinstance(jobs, int) else 1
     where = None if out_dir is None else os.fspath(out_dir)
     with executor_for(jobs, executor) as workers:
@@ -190,6 +193,8 @@ def check(
     >>> found.passed, found.summary["pairs"][0]["num_matches"] > 100
     (False, True)
     """
+    from barpc.verbs.images import every
+
     chosen = run_options(options, **keywords)
     with executor_for(jobs, executor) as workers:
         return pipeline.check(every(images), options=chosen, executor=workers, progress=progress)
@@ -234,6 +239,7 @@ def dsm(
     (2.0, True)
     """
     from barpc.dsm.surface import make_dsm
+    from barpc.verbs.images import every, one_or_many
 
     chosen = with_values(options or DsmOptions(), keywords, "dsm")
     given, _ = one_or_many(source)
@@ -353,7 +359,7 @@ def report(run_dir: PathLike, *others: PathLike, csv: bool = False) -> Any:
         from barpc.report.compare import compare_runs
 
         return compare_runs(run_dir, *others)
-    from barpc.pipeline.outputs import remake_report
+    from barpc.pipeline.remake import remake_report
 
     return remake_report(run_dir)
 
@@ -390,7 +396,7 @@ def verify(
     >>> barpc.verify("tied")
     Verification(... files, none has changed)
     """
-    from barpc.pipeline.outputs import Verification, prove
+    from barpc.pipeline.proof import Verification, prove
 
     chosen = with_values(VerifyOptions(), keywords, "verify")
     folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect

@@ -14,8 +14,8 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import ALIKE_SIGMA, JointPrior
 from barpc.ba.terms import CommonEdge
 from barpc.ba.terms.common_edge import score
+from barpc.report.measures.block import explanations
 from barpc.report.outcome import triangulate_tracks
-from barpc.report.summary.block import explanations
 from barpc.simulate import simulate_block
 from tests.ba.residuals import Displacement, residuals_of, step
 

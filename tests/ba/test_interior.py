@@ -10,7 +10,7 @@ import pytest
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, pair_heights
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.report.summary.views import _shared_errors, moved_in_space
+from barpc.report.measures.views import _shared_errors, moved_in_space
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import intersect_pair
 from barpc.sensor.image_corrections import ColumnSpline

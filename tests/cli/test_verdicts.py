@@ -182,7 +182,7 @@ def test_two_runs_are_compared_and_one_is_reported_again(
 ) -> None:
     found = {"a": "x", "b": "y", "views": [], "pairs": [], "lines": ["All alike."]}
     monkeypatch.setattr(compare, "compare_runs", lambda one, two: {**found, "a": one, "b": two})
-    monkeypatch.setattr("barpc.pipeline.outputs.remake_report", lambda one: f"{one}/report.html")
+    monkeypatch.setattr("barpc.pipeline.remake.remake_report", lambda one: f"{one}/report.html")
     assert run("report", "one") == 0
     assert capsys.readouterr().out == "one/report.html\n"
     assert run("report", "one", "two") == 0

@@ -16,8 +16,8 @@ from barpc import adjust
 from barpc.base import manifest
 from barpc.base.options import RunOptions
 from barpc.export.shots import read_scene
-from barpc.pipeline import outputs
-from barpc.pipeline.outputs import PASSED_STATES, prove
+from barpc.pipeline import proof, remake
+from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.workspace import Workspace
 from tests.reliability.conftest import barpc
@@ -100,7 +100,7 @@ def edits(data: bytes) -> dict[str, bytes]:
 
 
 def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatch) -> None:
-    monkeypatch.setattr(outputs, "_verify_cameras", lambda summary, folder: ())  # the hashes alone find it
+    monkeypatch.setattr(proof, "_verify_cameras", lambda summary, folder: ())  # the hashes alone find it
     root, names = root_of(run), files(run)
     assert len(names) > 20
     for name in names:
@@ -121,7 +121,7 @@ def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatc
 
 
 def test_every_consistent_edit_is_found_by_the_root_alone(run, monkeypatch) -> None:
-    monkeypatch.setattr(outputs, "_verify_cameras", lambda summary, folder: ())
+    monkeypatch.setattr(proof, "_verify_cameras", lambda summary, folder: ())
     root = root_of(run)
     for name in set(files(run)) - {SUMS, "summary.json"}:
         data, sums = (run / name).read_bytes(), (run / SUMS).read_bytes()
@@ -249,9 +249,9 @@ def test_a_report_that_is_made_again_is_the_same_file(run) -> None:
 
 
 def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> None:
-    roots, page = [root_of(run)], outputs.page_of
+    roots, page = [root_of(run)], remake.page_of
     for text in ("<!-- another release -->", "<!-- one more -->"):
-        monkeypatch.setattr(outputs, "page_of", lambda files, text=text: page(files) + text)
+        monkeypatch.setattr(remake, "page_of", lambda files, text=text: page(files) + text)
         assert barpc("report", run).code == 0
         roots.append(root_of(run))
     assert barpc("convert", SAMPLES[2], "-o", run, "--rpc-format", "rpb").code == 0
@@ -274,13 +274,13 @@ def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> 
 def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
     root = root_of(run)
     (run / "view_00_RPC.TXT").write_bytes((run / "view_01_RPC.TXT").read_bytes())
-    monkeypatch.setattr(outputs, "page_of", lambda files: "of another release")
+    monkeypatch.setattr(remake, "page_of", lambda files: "of another release")
     assert barpc("report", run).code == 0
     assert root_of(run) != root
     assert wrong(run) == wrong(run, root) == {("view_00_RPC.TXT", "changed")}
     sums = (run / SUMS).read_text().replace("# barpc 0", "# barpc 9", 1)
     (run / SUMS).write_text(sums)
-    monkeypatch.setattr(outputs, "page_of", lambda files: "of one more")
+    monkeypatch.setattr(remake, "page_of", lambda files: "of one more")
     assert barpc("report", run).code == 1
     assert (run / SUMS).read_text() == sums  # changed by somebody: nothing is built on it
     assert (SUMS, "changed") in wrong(run)
@@ -289,7 +289,7 @@ def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
 def test_a_command_that_is_killed_before_its_layer_is_said_and_heals(run, monkeypatch) -> None:
     root = root_of(run)
     with monkeypatch.context() as patch:
-        patch.setattr(outputs, "page_of", lambda files: "of another release")
+        patch.setattr(remake, "page_of", lambda files: "of another release")
         with monkeypatch.context() as killed:
             killed.setattr(Workspace, "_add_layer", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
             assert barpc("report", run).code == 130

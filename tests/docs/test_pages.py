@@ -15,7 +15,7 @@ import pytest
 
 import barpc
 from barpc.pointio.gcp_formats import GCP_FORMATS
-from barpc.report.runfiles import TABLES
+from barpc.report.tables import TABLES
 from barpc.rpcio import FORMATS
 from tests.docs.pages import DOCS, PAGES, ROOT, anchors, links
 

@@ -37,7 +37,8 @@ from barpc.report.page import report_html
 from barpc.report.runfiles import read_summary, table_path
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.rpcio.grids import SIGN, read_correction
+from barpc.rpcio.formats import SIGN
+from barpc.rpcio.grids import read_correction
 from barpc.rpcio.images import put_tag
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.scene import View

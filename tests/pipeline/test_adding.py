@@ -18,7 +18,7 @@ import rasterio
 from barpc.ba import BlockPrior
 from barpc.base.errors import BarpcError, InputError
 from barpc.pipeline import AdjustResult, RunOptions, adjust
-from barpc.pipeline.outputs import PASSED_STATES, prove
+from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag

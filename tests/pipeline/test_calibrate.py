@@ -33,7 +33,7 @@ from barpc.pipeline.calibrate import (
     common_errors,
     read_calibration,
 )
-from barpc.pipeline.outputs import PASSED_STATES, prove
+from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio.acquisition import read_acquisition

@@ -22,9 +22,10 @@ from barpc.cli import cli
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import adjust, check
 from barpc.pipeline import grid_outputs as grids
-from barpc.pipeline.grid_outputs import CORRECTION, GRID_SUFFIX, RESAMPLED, grid_names, write_grids
+from barpc.pipeline.grid_outputs import grid_names, write_grids
 from barpc.pipeline.verify_outputs import difference
 from barpc.rpcio import read_rpc
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
 from barpc.rpcio.grids import read_correction, write_correction
 from barpc.scene import View
 from barpc.sensor.csm import STATE_END

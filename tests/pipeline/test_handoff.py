@@ -37,7 +37,8 @@ from barpc.rpcio import (
     write_rpc,
     write_rpc_copy,
 )
-from barpc.rpcio.grids import CORRECTION, write_correction
+from barpc.rpcio.formats import CORRECTION
+from barpc.rpcio.grids import write_correction
 from barpc.scene import BoolArray
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC

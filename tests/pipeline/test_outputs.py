@@ -24,8 +24,8 @@ from barpc.pipeline.inputs import PRIOR_FILE
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, verify_files, write_views
 from barpc.pipeline.verify_outputs import CONSUMERS, Consumer, Reading, control_grid, difference, verify
 from barpc.report.page import can_render
-from barpc.report.runfiles import TABLES
 from barpc.report.summary import OutputEntry
+from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC

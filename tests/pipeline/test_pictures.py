@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.pipeline import outputs, pictures
+from barpc.base.errors import InputError
+from barpc.pipeline import pictures
+from barpc.pipeline.remake import remake_report
 from barpc.simulate import simulate_block
 from tests.sealing import seal
 from tests.tie.conftest import write_image
@@ -92,10 +94,10 @@ def test_the_page_is_made_again_without_the_images_and_of_a_run_without_pictures
     out = tmp_path / "run"
     shutil.copytree(adjusted[1], out)
     before = (out / "report.html").read_bytes()
-    assert outputs.remake_report(out).read_bytes() == before
+    assert remake_report(out).read_bytes() == before
     (out / "tables/pictures.json").unlink()  # of an earlier release
     seal(out)
-    assert b"data:image/jpeg" not in outputs.remake_report(out).read_bytes()
+    assert b"data:image/jpeg" not in remake_report(out).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -105,8 +107,8 @@ def test_damaged_pictures_are_named_in_one_line(adjusted, tmp_path, text):
     out = tmp_path / "run"
     shutil.copytree(adjusted[1], out)
     (out / "tables/pictures.json").write_text(text)
-    with pytest.raises(outputs.InputError, match=r"pictures\.json"):
-        outputs.remake_report(out)
+    with pytest.raises(InputError, match=r"pictures\.json"):
+        remake_report(out)
 
 
 def test_an_image_that_is_gone_or_elsewhere_is_left_out(matched, tmp_path):

@@ -14,9 +14,9 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.manifest import Layer, render
-from barpc.pipeline import outputs as proof
+from barpc.pipeline import proof
 from barpc.pipeline.grid_outputs import REOPENED
-from barpc.pipeline.outputs import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
+from barpc.pipeline.proof import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
 from barpc.rpcio import write_rpc
 from tests.rpcio.conftest import make_rpc
 
@@ -325,8 +325,7 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
 
 
 def test_a_grid_holds_the_camera_of_its_image_and_a_resampled_one_does_not() -> None:
-    from barpc.pipeline.grid_outputs import RESAMPLED
-    from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX
+    from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
 
     for end, holds in (
         (GRID_SUFFIX, True),

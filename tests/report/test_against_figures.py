@@ -18,11 +18,10 @@ pytest.importorskip("jinja2")
 from barpc.base.errors import listed
 from barpc.report import Run, Summary
 from barpc.report.page import SECTIONS
-from barpc.report.quality_checks import enu
 from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary.block import DatumEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import metres
+from barpc.report.summary.words import enu, metres
 from barpc.report.verdict import summarize
 from tests.lanes import rest_slow
 from tests.report.worlds import WORLDS

@@ -15,7 +15,7 @@ from barpc.ba.select.foreign_camera import FOREIGN_CAMERA, ForeignCamera
 from barpc.ba.terms.moving_ground import Motion
 from barpc.ba.terms.term import Finding
 from barpc.report import verdict
-from barpc.report.summary.block import explanations, left_entries, strangeness
+from barpc.report.measures.block import explanations, left_entries, strangeness
 
 NAMES = "west", "east"
 

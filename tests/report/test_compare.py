@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cli import cli
-from barpc.report.compare import compare_runs, flat_options
-from barpc.report.records import json_form
+from barpc.report.compare import compare_runs
+from barpc.report.records import flat_options, json_form
 from barpc.rpcio import read_rpc, write_rpc
 from tests.rpcio.conftest import make_rpc
 from tests.sealing import seal

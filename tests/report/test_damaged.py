@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from barpc.base.errors import BarpcWarning, InputError
 from barpc.cli import cli
-from barpc.pipeline.outputs import remake_report
+from barpc.pipeline.remake import remake_report
 from barpc.report import Run
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from barpc.ba.robust.consensus import TwoGroups
+from barpc.report.measures.views import measure_views
 from barpc.report.quality_checks import PASSED_STATUS
-from barpc.report.summary.views import measure_views
 from barpc.report.summary.words import STATUS_WORDS
 from barpc.report.verdict import block_verdict
 from tests.lanes import diagonal

@@ -16,11 +16,12 @@ from click.testing import CliRunner
 
 from barpc.base.errors import BarpcError, InputError
 from barpc.cli import cli
-from barpc.pipeline import outputs
+from barpc.pipeline.remake import remake_report
 from barpc.report import Run, page, summarize
 from barpc.report.ranking import worst_first
-from barpc.report.runfiles import MAX_PICTURES, TABLES, Draped, ObservationTable, RunFiles
+from barpc.report.runfiles import MAX_PICTURES, Draped, ObservationTable, RunFiles
 from barpc.report.summary.words import metres
+from barpc.report.tables import TABLES
 from barpc.scene import Tracks
 from tests.lanes import rest_slow
 from tests.report.conftest import run_of_block, written
@@ -39,7 +40,7 @@ def test_the_report_made_again_from_the_files_is_the_same_to_the_byte(fixture, r
     finished = request.getfixturevalue(fixture)
     shutil.copytree(finished.folder, tmp_path / "copy")
     (tmp_path / "copy/report.html").unlink()
-    outputs.remake_report(tmp_path / "copy")
+    remake_report(tmp_path / "copy")
     assert (tmp_path / "copy/report.html").read_bytes() == (finished.folder / "report.html").read_bytes()
 
 
@@ -193,13 +194,13 @@ def test_barpc_report_makes_the_page_and_says_where(block_run, tmp_path):
 
 def test_a_folder_without_a_finished_run_is_refused_with_a_reason(block_run, tmp_path):
     with pytest.raises(InputError, match="no finished run"):
-        outputs.remake_report(tmp_path)
+        remake_report(tmp_path)
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(InputError, match="not JSON that can be read"):
-        outputs.remake_report(tmp_path)
+        remake_report(tmp_path)
     (tmp_path / "summary.json").write_text(json.dumps({"schema": 1}))
     with pytest.raises(InputError, match="schema 1"):
-        outputs.remake_report(tmp_path)
+        remake_report(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["residuals.csv", "observations.csv", "footprints.geojson"])
@@ -210,7 +211,7 @@ def test_a_table_that_is_missing_or_damaged_is_named(block_run, tmp_path, name, 
     if damage is not None:
         (tmp_path / "run/tables" / name).write_text(damage)
     with pytest.raises(InputError, match=re.escape(name)):
-        outputs.remake_report(tmp_path / "run")
+        remake_report(tmp_path / "run")
 
 
 def test_without_jinja2_the_run_is_whole_and_the_verb_says_what_to_install(block_run, tmp_path, monkeypatch):
@@ -219,4 +220,4 @@ def test_without_jinja2_the_run_is_whole_and_the_verb_says_what_to_install(block
     assert (tmp_path / "run/summary.json").is_file()
     assert not (tmp_path / "run/report.html").exists()
     with pytest.raises(BarpcError, match=r"pip install 'barpc\[report\]'"):
-        outputs.remake_report(tmp_path / "run")
+        remake_report(tmp_path / "run")

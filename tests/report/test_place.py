@@ -11,8 +11,8 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
+from barpc.report.measures.views import ce90, measure_views, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.report.runfiles import read_tables
-from barpc.report.summary.views import ce90, measure_views, moved_by_clocks, moved_in_space, stated_ce90
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Timed, Timing

@@ -10,6 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from barpc.ba.constraints.gauge import MOTIONS
+from barpc.ba.select.foreign_camera import FOREIGN_CAMERA
+from barpc.ba.terms import TERMS
 from barpc.base.errors import listed
 from barpc.report.records import (
     Cell,
@@ -24,9 +27,10 @@ from barpc.report.records import (
     value_of,
 )
 from barpc.report.summary import SCHEMA, published_schema
-from barpc.report.summary.pairs import OffsetEntry, PairEntry, medians
+from barpc.report.summary.block import EXPLANATIONS, MODES
+from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import Count, Share, Side, largest, median, metres
+from barpc.report.summary.words import Count, Share, Side, largest, median, medians, metres
 
 from .made import a_correction, a_pair, a_view
 
@@ -116,6 +120,12 @@ def test_what_is_said_of_a_value_ends_with_its_unit():
 def test_the_version_of_the_file_is_three():
     assert SCHEMA == 3
     assert published_schema()["$defs"]["Summary"]["properties"]["schema"]["enum"] == [3]
+
+
+def test_kinds_of_the_file_are_those_of_the_adjustment():
+    """Records name them of their own: reading a run loads no adjustment."""
+    assert list(MODES) == list(MOTIONS)
+    assert list(EXPLANATIONS) == [*TERMS, FOREIGN_CAMERA]
 
 
 def test_columns_are_fields_parts_and_own_ones():

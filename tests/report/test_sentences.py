@@ -16,9 +16,9 @@ from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
 from barpc.report.outcome import Added, Run
-from barpc.report.quality_checks import control_reasons, enu, held_lines
+from barpc.report.quality_checks import control_reasons, held_lines
 from barpc.report.summary.views import FitEntry
-from barpc.report.summary.words import metres
+from barpc.report.summary.words import enu, metres
 from barpc.report.verdict import block_verdict, view_status
 from barpc.scene import Tracks
 from barpc.tie.detail import Gap

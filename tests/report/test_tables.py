@@ -13,19 +13,12 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError
+from barpc.export.files import ply
 from barpc.report import summarize
 from barpc.report.geopackage import geopackage
 from barpc.report.records import json_form
-from barpc.report.runfiles import (
-    OBSERVATION_COLUMNS,
-    RESIDUALS,
-    TABLES,
-    gcps_geojson,
-    map_layers,
-    ply,
-    read_tables,
-    run_key,
-)
+from barpc.report.runfiles import OBSERVATION_COLUMNS, RESIDUALS, read_tables, run_key
+from barpc.report.tables import TABLES, gcps_geojson, map_layers
 
 from .made import a_pair, a_summary, a_view, without_points
 

@@ -11,7 +11,7 @@ import pytest
 from barpc.ba import adjust_tracks
 from barpc.base.geodesy import ground_from_ecef
 from barpc.report import Run, summarize
-from barpc.report.summary.block import explanations
+from barpc.report.measures.block import explanations
 from barpc.report.unseen import unseen_parts
 from barpc.simulate import simulate_block
 

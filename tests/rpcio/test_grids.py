@@ -16,7 +16,8 @@ from barpc.cameras import open_camera
 from barpc.fit.points import Sample
 from barpc.pipeline.verify_outputs import unverified, verify_grid
 from barpc.rpcio import read_rpc
-from barpc.rpcio.grids import CORRECTION, GRID_SUFFIX, read_correction, write_correction, write_grid
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
+from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from tests.jitter import scene

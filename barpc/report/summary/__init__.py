@@ -1,26 +1,20 @@
-"""The summary of a run, which summary.json stores: the one declaration of each value, its column and its measurement.
+"""The summary of a run, which summary.json stores: the one declaration of each value, and its column.
 
-A new value is a field declared by `column` and a line in the function that measures its record; a table shows it if it
-is named among the columns there. A module each: views, pairs, the block, ground points.
+A new value is a field declared by `column` and a line in the function of `barpc.report.measures` that measures its
+record; a table shows it if it is named among the columns here. A module each: views, pairs, the block, ground points.
 """
 
 from __future__ import annotations
 
-import platform
-import sys
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
 
-from barpc import __version__
-from barpc.report.outcome import Run
-from barpc.report.records import Number, Record, column, json_form
-from barpc.report.summary import ground_points
-from barpc.report.summary.block import SceneEntry, measure_scene
+from barpc.report.records import Number, Record, column
+from barpc.report.summary.block import SceneEntry
 from barpc.report.summary.ground_points import CheckPointEntry, ControlTestEntry, GcpEntry, ReferenceEntry
-from barpc.report.summary.pairs import PairEntry, measure_pairs
+from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import ABOVE, Count, Vector
 
@@ -158,44 +152,3 @@ def published_schema() -> dict[str, Any]:
         "Paths are relative to the run folder.",
         **msgspec.json.schema(Summary),
     }
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions of the libraries in use."""
-    names = {"numpy": "numpy", "scipy": "scipy", "cv2": "opencv", "rasterio": "rasterio", "shapely": "shapely"}
-    return {name: str(sys.modules[module].__version__) for module, name in names.items() if module in sys.modules}
-
-
-def measure_run(run: Run, views: tuple[ViewEntry, ...], verdict: Mapping[str, Any]) -> Summary:
-    """Return the summary of a run, with its views and the verdict on it; numbers may be NaN."""
-    usable, written = int(np.isfinite(run.ground).all(axis=1).sum()), len(run.written_tracks)
-    lengths = np.bincount(np.bincount(run.tracks.point))
-    return Summary(
-        schema=SCHEMA,
-        barpc=__version__,
-        kind=run.kind,
-        **verdict,
-        out_dir=run.out_dir,
-        altitude_m=run.altitude,
-        views=views,
-        pairs=measure_pairs(run),
-        left_out=tuple(LeftOutEntry(path, reason) for path, reason in run.left_out),
-        tracks=TracksEntry(
-            num_tracks=run.tracks.num_points,
-            num_observations=len(run.tracks),
-            by_length={str(n): int(count) for n, count in enumerate(lengths) if n and count},
-        ),
-        tables=TablesEntry(usable, written, complete=written == usable),
-        scene=measure_scene(run),
-        gcps=ground_points.measure_gcps(run),
-        control_test=ground_points.measure_control(run),
-        check_points=ground_points.measure_check_points(run),
-        reference=ground_points.measure_reference(run),
-        carried=tuple(
-            CarriedEntry(one.view.name, one.view.path, one.lead, json_form(one.written)) for one in run.carried
-        )
-        or None,
-        stages=tuple(StageEntry.read(stage) for stage in run.stages),
-        options=json_form(run.options),
-        versions={"python": platform.python_version(), **_versions()},
-    )

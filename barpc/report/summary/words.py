@@ -9,7 +9,9 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
+from barpc.base.geodesy import Array
 from barpc.report.records import Number
+from barpc.scene import IntArray
 
 STATUS_WORDS = {
     "adjusted": "adjusted",
@@ -174,3 +176,18 @@ CAUSES = {
         "check that the others lie on stationary ground"),
 }  # fmt: skip
 """Cause -> its reservation, the worst first. A test checks that flags in a remedy are those of `barpc adjust`."""
+
+
+def enu(shift: Sequence[float] | Array) -> str:
+    """Return a shift (3,) east, north, up [m] in words."""
+    return ", ".join(f"{s:+.2f} m {word}" for s, word in zip(shift, ("east", "north", "up"), strict=True))
+
+
+def medians(values: Array, group: IntArray, num: int) -> Array:
+    """Return the median (num,) of each group of values (n,); NaN without any."""
+    count, ordered = np.bincount(group, minlength=num), values[np.lexsort((values, group))]
+    first, some = np.cumsum(count) - count, np.flatnonzero(count)
+    middle = first[some, None] + (count[some, None] - np.array([1, 0])) // 2  # the two of an even number
+    out = np.full(num, np.nan)
+    out[some] = ordered[middle].mean(axis=1)
+    return out
