@@ -249,7 +249,7 @@ class _SubsetSearch:
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
         """Return the evidence (B,) of sets (B, G), and the factors (B, 2) on accuracies and motions that it has it
-        with; minus infinity where that is less than what could contradict the best.
+        with; minus infinity for sets too unlikely to contradict the best.
         """
         best = self.score.max(initial=-np.inf)
         score, factors = np.full(len(masks), -np.inf), np.ones((len(masks), 2))
@@ -270,7 +270,7 @@ class _SubsetSearch:
 
 
 class SetEvidence:
-    """What sets of points (B, G) tell of every point, and the evidence (B,) that those of a set agree.
+    """Evidence (B,) that the points of sets (B, G) agree, and the predictions of every point by a set.
 
     Points agree to `times` their standard deviations, and the cameras' motions are `motions` times as large as told.
     """
@@ -293,8 +293,8 @@ class SetEvidence:
         self._inside = -0.5 * (self.squares + volume) - of_points - ODDS * np.log(times * motions)
 
     def deviations(self, points: IntArray) -> tuple[Array, Array]:
-        """Return the squared deviations (B, n) of points from what each set tells of them, in variances of that, and
-        the logarithms of the determinants of these.
+        """Return the squared deviations (B, n) of points from their prediction by each set, in its variances, and the
+        logarithms of the determinants of these.
         """
         left, turned = self._seen(points)
         return _deviation(left, self._spread(turned))
@@ -308,14 +308,14 @@ class SetEvidence:
         return np.asarray(self._inside[part] - (wrong * out[:, some]).sum(axis=1))
 
     def at_most(self) -> Array:
-        """Return limits (B,) that the log evidence of the sets cannot exceed, whatever the points outside show."""
+        """Return upper limits (B,) of the log evidence of the sets, by their own points."""
         least = _anywhere(np.zeros(1), 3.0 * np.log(self.variance))
         return np.asarray(self._inside - least * (~self.masks).sum(axis=1))
 
     def gains(self, points: IntArray) -> Array:
-        """Return what single points (n,) add to the evidence of the only set when they are moved into it, or out of it.
+        """Return the gains (n,) in the evidence of the only set by single points moved into it, or out of it.
 
-        What the set tells is updated by a point, an update of rank three.
+        A point is an update of rank three of the predictions.
         """
         inside, out = self.masks[0, points], np.flatnonzero(~self.masks[0])
         left, turned = self._seen(points)
@@ -344,7 +344,7 @@ class SetEvidence:
         return np.asarray(gain)
 
     def _seen(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
-        """Return what is left (B, n, 3) of points' offsets once sets are known, and their motions (B, n, 3, r)."""
+        """Return the offsets (B, n, 3) of points minus their predictions by sets, and their motions (B, n, 3, r)."""
         motions, root = self.offsets.motions[points], self._root[part]
         turned = (motions.reshape(-1, motions.shape[2]) @ root).reshape(len(root), *motions.shape)
         return self.offsets.own[points] - (turned @ self._mean[part, None, :, None])[..., 0], turned

@@ -274,7 +274,7 @@ def _robust(
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
     The noise is a median that counts observations by their weights and so leaves the wrong ones behind, but not below
     what the best fifth of all shows, nor below half of the stated noise, or a few that fit by chance would be left.
-    Control points take no part where there are others: while nothing holds their places they fit too well.
+    Control points do not count where there are others: while nothing holds their places they fit too well.
     """
     state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
