@@ -17,7 +17,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, solution
 from barpc.ba.control import agreement as sets
-from barpc.ba.control.agreement import Agreement, Offsets, agreement, offsets_of
+from barpc.ba.control.agreement import Agreement, Offsets, SetEvidence, agreement, offsets_of
 from barpc.ba.control.snooping import ControlTest
 from barpc.ba.solution import Solution
 from barpc.base.geodesy import enu_basis
@@ -178,7 +178,8 @@ def test_points_that_nothing_tells_of_take_no_part() -> None:
 def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
     offsets = drawn(5, 2, {0: (9.0, 0.0, 0.0)}, free=50.0)
     chosen = np.array([0, 1, 1, 0, 1], dtype=bool)
-    (score,), (squared,), (together,) = sets.log_evidence(offsets, chosen[None], scale)
+    told = SetEvidence(offsets, chosen[None], scale)
+    (score,), (squared,), (together,) = told.evidence(np.arange(1)), told.deviations(np.arange(5))[0], told.squares
     motions = offsets.motions.reshape(15, -1)
     whole = motions @ motions.T + scale**2 * np.eye(15)
     rows = np.repeat(chosen, 3)
@@ -195,7 +196,39 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
         # alike at all sizes from one sigma to 10,000: 1 / (4 pi r^3) over ln 10,000 and the ball within
         density = -np.log(4 * np.pi * (1 / 3 + np.log(1e4))) - 3 * np.log(max(far, 1.0))
         expected += density - 0.5 * np.linalg.slogdet(spread)[1] - sets.ODDS
-    assert score == pytest.approx(expected, abs=0.05)
+    assert score == pytest.approx(expected - sets.ODDS * np.log(scale), abs=0.05)
+    assert told.at_most()[0] > score
+
+
+@pytest.mark.parametrize(("scale", "motions"), [(1.0, 1.0), (3.0, 2.0)])
+@pytest.mark.parametrize("inside", [2, 7, 15])
+def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(
+    scale, motions, inside, monkeypatch
+) -> None:
+    """In one piece, and where the points are many a few at a time; the set of all, too."""
+    offsets = drawn(15, 3, any_way(3, 4, 6.0))
+    chosen = np.arange(15) >= 15 - inside
+    masks = np.vstack([chosen, chosen ^ np.eye(15, dtype=bool)])
+    score = SetEvidence(offsets, masks, scale, motions).evidence(np.arange(16))
+    there = SetEvidence(offsets, chosen[None], scale, motions)
+    np.testing.assert_allclose(there.gains(np.arange(15)), score[1:] - score[0], rtol=1e-6, atol=1e-5)
+    monkeypatch.setattr(sets, "_MAX_SET_POINTS", 20)
+    np.testing.assert_allclose(there.gains(np.arange(3, 15)), score[4:] - score[0], rtol=1e-6, atol=1e-5)
+
+
+def test_thousands_of_points_some_wrong_are_told_apart_and_none_is_asked_of_every_other() -> None:
+    offsets = drawn(4000, 3, any_way(3, 80, 12.0))
+    one = agreement(offsets, np.ones(4000, dtype=bool))
+    assert not one.used[:80].any()
+    assert one.used[80:].sum() > 3910  # five of the right ones in a thousand are beyond what the others tell
+
+
+def test_right_control_points_do_not_make_tie_points_look_better_than_they_are() -> None:
+    """Nothing holds their places while outliers are looked for, and their residuals are small."""
+    block = simulate_block(3, 300, seed=1, num_gcps=900, num_checks=0)
+    one = adjust_tracks(block.views, block.tracks, None, block.gcps)
+    alone = adjust_tracks(block.views, block.tracks)
+    assert one.noise == pytest.approx(alone.noise, rel=0.03)
 
 
 # --- a block ----------------------------------------------------------------------------------------------

@@ -250,7 +250,7 @@ def forward(
 
     def posterior(prior: CameraPrior, around: Any = None) -> Any:
         odd = chosen(prior.sigma[:, 0] / v.given.sigma[:, 0])
-        return SimpleNamespace(evidence=gains.get(odd, 0.0), under=posterior)
+        return SimpleNamespace(evidence=gains.get(odd, 0.0), together=lambda _, prior: posterior(prior))
 
     v = variances(n)
     monkeypatch.setattr(Variances, "_alone", alone)
@@ -414,6 +414,14 @@ def test_other_priors_of_single_views_are_an_update_of_what_is_known(n: int) -> 
         if view == 1:
             assert evidence[view] == pytest.approx(known.evidence, abs=1e-6)
     assert (evidence > known.evidence + 20.0).any()
+    now, scale = known, np.ones((n, 1))
+    for views in ([0, n // 2], [1], [n - 1, 3]):  # one after the other, several at once
+        scale[views] = np.random.default_rng(n).uniform(2.0, 50.0, (len(views), 1))
+        now = now.together(np.array(views), replace(prior, sigma=prior.sigma * scale))
+    exact = around.posterior(now.prior)
+    assert now.evidence - known.evidence == pytest.approx(exact.evidence - known.evidence, abs=1e-6)
+    np.testing.assert_allclose(now.offset, exact.offset, atol=1e-6)
+    np.testing.assert_allclose(now.blocks, exact.blocks, rtol=1e-6, atol=1e-9 * np.abs(exact.blocks).max())
 
 
 def adjusted(block: SimulatedBlock, **options: Any) -> Adjustment:

@@ -10,8 +10,8 @@ the cameras' motions l times larger than their covariance: the data choose among
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -20,16 +20,18 @@ from scipy.special import chdtri
 from barpc.ba.constraints.block import Block
 from barpc.ba.robust.heldout import enu_offsets
 from barpc.ba.solving.covariance import Covariance
-from barpc.ba.solving.normal import solve_transposed
-from barpc.base.geodesy import Array, enu_basis
+from barpc.ba.solving.normal import TRIANGLE, cholesky3, solve_lower, solve_transposed
+from barpc.base.geodesy import Array, enu_basis, parts
 from barpc.base.statistics import CRITICAL, GROSS, LEVEL, SURE, TRIALS
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 UNCONSTRAINED_SIGMA = (
     1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
 )
 _MAX_SET_POINTS = 50_000  # points of sets at a time: some 25 MB
 _SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
+# chance that no sample of three is free of outliers, at which no more are drawn: of all of them where half are wrong
+_ENOUGH = (1.0 - 0.5**3) ** (TRIALS // 2)
 ODDS = float(-np.log(LEVEL))
 """Nats that it costs to call a point wrong, and each factor of e in accuracies or motions; and by which a set must
 beat any other that contradicts it: one in twenty."""
@@ -79,11 +81,16 @@ class Offsets:
         """Return the offsets of some of the points."""
         return Offsets(self.own[keep], self.motions[keep])
 
-    def moving(self, times: float) -> Offsets:
-        """Return the offsets with the free motions of the cameras scaled by a factor."""
-        factor = np.full(self.motions.shape[2], times)
-        factor[-3:] = 1.0
-        return Offsets(self.own, self.motions * factor)
+    @cached_property
+    def products(self) -> Array:
+        """Products (G, r + 1, r + 1) of every point's motions and, the last, its offset with each other."""
+        both = np.concatenate([self.motions, self.own[..., None]], axis=2)
+        return np.asarray(np.swapaxes(both, 1, 2) @ both)
+
+    def sums(self, masks: BoolArray) -> Array:
+        """Return the sums (B, r + 1, r + 1) of the products of the points in sets (B, G)."""
+        flat = self.products.reshape(len(self.own), -1)
+        return np.asarray((masks.astype(np.float64) @ flat).reshape(-1, *self.products.shape[1:]))
 
 
 def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
@@ -151,10 +158,10 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
 def _fits_as_stated(offsets: Offsets) -> bool:
     """Return whether all points are as near as nineteen times of twenty, and no better without one."""
     count = len(offsets.own)
-    one_less = np.concatenate([np.ones((1, count), dtype=bool), ~np.eye(count, dtype=bool)])
-    score, _, squares = log_evidence(offsets, one_less, 1.0)
+    every = SetEvidence(offsets, np.ones((1, count), dtype=bool))
     freedom = 3.0 * (count - 1)  # a shift is free
-    return bool(squares[0] < chdtri(freedom, LEVEL) and score[0] >= score.max())
+    fits = every.squares[0] < chdtri(freedom, LEVEL)
+    return bool(fits and every.gains(np.arange(count)).max() <= 0.0)
 
 
 class _SubsetSearch:
@@ -162,23 +169,23 @@ class _SubsetSearch:
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
+        self.masks, self.score = np.zeros((0, self.count), dtype=bool), np.zeros(0)
+        self.factors = np.zeros((0, 2))  # by which accuracies and motions are too good where a set is likeliest
         every = self.count * 2**self.count <= _MAX_SET_POINTS
         if every:
             numbers = np.arange(1, 2**self.count)
-            self.masks = ((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool)
+            self._add(((numbers[:, None] >> np.arange(self.count)) & 1).astype(bool))
         else:
-            self.masks = np.unique(np.array(list(self._drawn(np.ones(self.count, dtype=bool)))), axis=0)
-        self.score, self.scale = self._scored(self.masks)
-        if not every:
+            self._add(self._drawn(np.ones(self.count, dtype=bool)))
             self._refine(int(self.score.argmax()))
             rest = ~self.masks[self.score.argmax()]
             if rest.sum() >= 3:
-                self._add(np.unique(np.array(list(self._drawn(rest))) & rest, axis=0))
+                self._add(self._drawn(rest))
 
     def best(self) -> tuple[BoolArray, float, float]:
         """Return the set with the largest evidence, that, and the scale of its accuracies."""
         n = int(self.score.argmax())
-        return self.masks[n], float(self.score[n]), float(self.scale[n])
+        return self.masks[n], float(self.score[n]), float(self.factors[n, 0])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
         """Return the set that contradicts the best and weighs as much, the rest without a majority, or None."""
@@ -192,73 +199,174 @@ class _SubsetSearch:
                 return np.asarray(self.masks[other[rival.argmax()]])
         return None if 2 * best.sum() >= self.count else ~best
 
-    def _drawn(self, among: BoolArray) -> Iterator[BoolArray]:
-        """Yield the sets that agree with three points drawn from some; the same whenever they are drawn."""
-        rng, places = np.random.default_rng(0), np.flatnonzero(among)
-        yield among.copy()
-        for trial in range(TRIALS):
-            mask = np.zeros(self.count, dtype=bool)
-            mask[rng.choice(places, 3, replace=False)] = True
-            scale = (1.0, 3.0)[trial % 2]
-            for _ in range(2):
-                squared = log_evidence(self.offsets, mask[None], scale)[1][0]
-                mask = among & (squared < CRITICAL**2)
-            if mask.any():
-                yield mask
+    def _drawn(self, among: BoolArray) -> BoolArray:
+        """Return the sets (B, G) that agree with three points drawn from some; the same whenever they are drawn."""
+        some = self.offsets.select(among)
+        rng, count = np.random.default_rng(0), len(some.own)
+        every = np.arange(count)
+        found = [np.ones(count, dtype=bool)]
+        for scale in (1.0, 3.0):
+            most = 0.0
+            for trial in range(1, TRIALS // 2 + 1):
+                mask = np.zeros(count, dtype=bool)
+                mask[rng.choice(count, 3, replace=False)] = True
+                for _ in range(2):
+                    if mask.any():  # no set tells nothing, and contradicts no point
+                        mask = SetEvidence(some, mask[None], scale).deviations(every)[0][0] < CRITICAL**2
+                found += [mask] if mask.any() else []
+                most = max(most, float(mask.mean()))
+                if (1.0 - most**3) ** trial <= _ENOUGH:
+                    break
+        sets = np.unique(np.array(found), axis=0)
+        out = np.zeros((len(sets), self.count), dtype=bool)
+        out[:, among] = sets
+        return out
 
     def _refine(self, n: int) -> None:
-        """Move single points into or out of a set as long as that raises its evidence."""
+        """Move points into or out of a set as long as that raises its evidence: all that do by themselves, or the one
+        that does most.
+        """
         for _ in range(self.count):
-            squared = log_evidence(self.offsets, self.masks[n][None], self.scale[n])[1][0]
-            doubtful = np.flatnonzero((squared > 0.5 * CRITICAL**2) & (squared < 2.0 * CRITICAL**2))
-            before = self.score[n]
-            self._add(self.masks[n] ^ np.eye(self.count, dtype=bool)[doubtful])
+            mask, before = self.masks[n], self.score[n]
+            there = SetEvidence(self.offsets, mask[None], *self.factors[n])
+            squared = there.deviations(np.arange(self.count))[0][0]
+            doubtful = np.flatnonzero((squared < 2.0 * CRITICAL**2) & (~mask | (squared > 0.5 * CRITICAL**2)))
+            gains = there.gains(doubtful)
+            if not (gains > 0.0).any():
+                break
+            moved = np.zeros((2, self.count), dtype=bool)
+            moved[0, doubtful[gains > 0.0]] = moved[1, doubtful[gains.argmax()]] = True
+            self._add(mask ^ moved)
             n = int(self.score.argmax())
             if self.score[n] <= before:
                 break
 
     def _add(self, masks: BoolArray) -> None:
         """Add sets to those whose evidence is compared."""
-        score, scale = self._scored(masks)
+        score, factors = self._scored(masks)
         self.masks = np.concatenate([self.masks, masks])
-        self.score, self.scale = np.append(self.score, score), np.append(self.scale, scale)
+        self.score, self.factors = np.append(self.score, score), np.concatenate([self.factors, factors])
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
-        """Return the evidence (B,) of sets (B, G), and the scale of the accuracies that it has it with."""
-        score, scale = np.full(len(masks), -np.inf), np.ones(len(masks))
+        """Return the evidence (B,) of sets (B, G), and the factors (B, 2) on accuracies and motions that it has it
+        with; minus infinity for sets too unlikely to contradict the best.
+        """
+        best = self.score.max(initial=-np.inf)
+        score, factors = np.full(len(masks), -np.inf), np.ones((len(masks), 2))
+        room, sums = max(_MAX_SET_POINTS // self.count, 1), self.offsets.sums(masks)
         for motions, times in product(_SIGMA_FACTORS, _SIGMA_FACTORS):
-            found = log_evidence(self.offsets.moving(motions), masks, times)[0] - ODDS * np.log(times * motions)
-            better = found > score
-            score[better], scale[better] = found[better], times
-        return score, scale
+            told = SetEvidence(self.offsets, masks, times, motions, sums)
+            at_most = told.at_most()
+            order = np.argsort(-at_most, kind="stable")
+            for start in range(0, len(masks), room):
+                part = order[start : start + room]
+                part = part[at_most[part] > max(best, score.max()) - 2.0 * SURE]
+                if not len(part):
+                    break
+                found = told.evidence(part)
+                better = found > score[part]
+                score[part[better]], factors[part[better]] = found[better], (times, motions)
+        return score, factors
 
 
-def log_evidence(offsets: Offsets, masks: BoolArray, scale: float) -> tuple[Array, Array, Array]:
-    """Return the log evidence (B,) of sets of points (B, G), and their squared deviations (B, G) and (B,).
+class SetEvidence:
+    """Evidence (B,) that the points of sets (B, G) agree, and the predictions of every point by a set.
 
-    The deviations of every point from what each set tells of it, in variances of that, and the sum of squares of the
-    points in a set. Points agree to `scale` times their standard deviations; wrong ones lie anywhere.
+    Points agree to `times` their standard deviations, and the cameras' motions are `motions` times as large as told.
     """
-    own, motions, variance = offsets.own, offsets.motions, scale**2
-    if len(masks) > (room := max(_MAX_SET_POINTS // len(own), 1)):
-        parts = [log_evidence(offsets, masks[n : n + room], scale) for n in range(0, len(masks), room)]
-        score, squared, squares = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return score, squared, squares
-    chosen = masks.astype(np.float64)
-    count, r = motions.shape[0], motions.shape[2]
-    gram = np.einsum("gir,gis->grs", motions, motions).reshape(count, -1) / variance
-    matrix = np.eye(r) + (chosen @ gram).reshape(-1, r, r)
-    vector = chosen @ (np.einsum("gir,gi->gr", motions, own) / variance)
-    inverse = np.linalg.inv(matrix)
-    mean = np.einsum("brs,bs->br", inverse, vector)
-    volume = np.linalg.slogdet(matrix)[1]
-    squares = chosen @ ((own**2).sum(axis=1) / variance) - (vector * mean).sum(axis=1)
-    inside = -0.5 * (squares + volume) - 1.5 * np.log(2.0 * np.pi * variance) * chosen.sum(axis=1)
-    left = own[None] - np.einsum("gir,br->bgi", motions, mean)
-    spread = np.einsum("gir,brs,gjs->bgij", motions, inverse, motions, optimize=True)
-    spread = spread + variance * np.eye(3)
-    squared = np.einsum("bgi,bgi->bg", left, np.linalg.solve(spread, left[..., None])[..., 0])
-    # an error of a wrong point is alike in its logarithm from one standard deviation on, to 10,000
-    volume = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
-    anywhere = 1.5 * np.log(np.maximum(squared, 1.0)) + volume + 0.5 * np.linalg.slogdet(spread)[1]
-    return inside - ((1.0 - chosen) * (anywhere + ODDS)).sum(axis=1), squared, squares
+
+    def __init__(
+        self, offsets: Offsets, masks: BoolArray, times: float = 1.0, motions: float = 1.0, sums: Array | None = None
+    ) -> None:
+        r = offsets.motions.shape[2]
+        sums = offsets.sums(masks) if sums is None else sums
+        self.offsets, self.masks, self.variance = offsets, masks, times**2
+        factor = np.append(np.full(r - 3, motions), np.ones(3))  # shifts are of any size
+        information = np.eye(r) + sums[:, :r, :r] * np.outer(factor, factor) / self.variance
+        lower = np.linalg.cholesky(information)
+        inverse = np.linalg.inv(lower)
+        self._root = factor[:, None] * np.swapaxes(inverse, 1, 2)  # (B, r, r) motions once the set is known
+        self._mean = (inverse @ (sums[:, :r, r] * factor / self.variance)[..., None])[..., 0]
+        self.squares = sums[:, r, r] / self.variance - (self._mean**2).sum(axis=1)
+        volume = 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        of_points = 1.5 * np.log(2.0 * np.pi * self.variance) * masks.sum(axis=1)
+        self._inside = -0.5 * (self.squares + volume) - of_points - ODDS * np.log(times * motions)
+
+    def deviations(self, points: IntArray) -> tuple[Array, Array]:
+        """Return the squared deviations (B, n) of points from their prediction by each set, in its variances, and the
+        logarithms of the determinants of these.
+        """
+        left, turned = self._seen(points)
+        return _deviation(left, self._spread(turned))
+
+    def evidence(self, part: IntArray) -> Array:
+        """Return the log evidence (n,) of some of the sets."""
+        out = ~self.masks[part]
+        some = np.flatnonzero(out.any(axis=0))
+        left, turned = self._seen(some, part)
+        wrong = _anywhere(*_deviation(left, self._spread(turned)))
+        return np.asarray(self._inside[part] - (wrong * out[:, some]).sum(axis=1))
+
+    def at_most(self) -> Array:
+        """Return upper limits (B,) of the log evidence of the sets, by their own points."""
+        least = _anywhere(np.zeros(1), 3.0 * np.log(self.variance))
+        return np.asarray(self._inside - least * (~self.masks).sum(axis=1))
+
+    def gains(self, points: IntArray) -> Array:
+        """Return the gains (n,) in the evidence of the only set by single points moved into it, or out of it.
+
+        A point is an update of rank three of the predictions.
+        """
+        inside, out = self.masks[0, points], np.flatnonzero(~self.masks[0])
+        left, turned = self._seen(points)
+        sign = np.where(inside, -1.0, 1.0)
+        own = self._spread(turned, sign)
+        squared, volume = (part[0] for part in _deviation(left, own))
+        unit = 3.0 * np.log(self.variance)
+        beside = np.where(inside, 2.0 * unit - volume, volume)  # of what the others tell of a point
+        gain = sign * (_anywhere(squared, beside) - 0.5 * squared - 1.5 * np.log(2.0 * np.pi))
+        gain += inside * unit - 0.5 * volume
+        if not len(out):
+            return np.asarray(gain)
+        their_left, theirs = self._seen(out)
+        spread = self._spread(theirs)
+        before = _anywhere(*_deviation(their_left, spread))[0]
+        lower = cholesky3(own)
+        pull = solve_lower(lower, np.moveaxis(left, 2, 0))
+        for part in parts(len(points), max(_MAX_SET_POINTS // len(out), 1)):
+            shared = np.einsum("hir,gjr->ijhg", theirs[0], turned[0, part], optimize=True)
+            moves = np.stack([solve_lower(lower[..., part], row) for row in shared])  # (3, 3, m, n)
+            less = np.stack([(moves[i] * moves[j]).sum(axis=0) for i, j in TRIANGLE])
+            rest = their_left[0].T[..., None] - sign[part] * (moves * pull[:, :, part]).sum(axis=1)
+            after = _anywhere(*_deviation(np.moveaxis(rest, 0, 2), spread[:, 0, :, None] - sign[part] * less))
+            change = np.where(out[:, None] == points[part], 0.0, after - before[:, None])
+            gain[part] -= change.sum(axis=0)
+        return np.asarray(gain)
+
+    def _seen(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
+        """Return the offsets (B, n, 3) of points minus their predictions by sets, and their motions (B, n, 3, r)."""
+        motions, root = self.offsets.motions[points], self._root[part]
+        turned = (motions.reshape(-1, motions.shape[2]) @ root).reshape(len(root), *motions.shape)
+        return self.offsets.own[points] - (turned @ self._mean[part, None, :, None])[..., 0], turned
+
+    def _spread(self, turned: Array, sign: Array | float = 1.0) -> Array:
+        """Return the covariances (6, B, n) of points, lower triangles, by their motions, which are added or taken
+        off.
+        """
+        rows = [sign * np.einsum("bnr,bnr->bn", turned[:, :, i], turned[:, :, j]) for i, j in TRIANGLE]
+        return np.stack([row + self.variance * (i == j) for row, (i, j) in zip(rows, TRIANGLE, strict=True)])
+
+
+def _deviation(left: Array, spread: Array) -> tuple[Array, Array]:
+    """Return the squares of vectors (..., 3) in variances (6, ...), and the logarithms of these' determinants."""
+    lower = cholesky3(spread)
+    squared = (solve_lower(lower, np.moveaxis(left, -1, 0)) ** 2).sum(axis=0)
+    return squared, 2.0 * np.log(lower[[0, 3, 5]]).sum(axis=0)
+
+
+def _anywhere(squared: Array, volume: Array | float) -> Array:
+    """Return minus the log density of wrong points, by their squared deviations and the determinants of these'
+    variances: alike in the logarithm of their size from one standard deviation on, to 10,000.
+    """
+    ball = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
+    return np.asarray(1.5 * np.log(np.maximum(squared, 1.0)) + ball + 0.5 * volume + ODDS)

@@ -272,16 +272,18 @@ def _robust(
     """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
 
     The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
-    The noise is a median that counts observations by
-    their weights and so leaves the wrong ones behind, but not below what the best fifth of all shows, nor below half of
-    the stated noise, or a few that fit by chance would be left.
+    The noise is a median that counts observations by their weights and so leaves the wrong ones behind, but not below
+    what the best fifth of all shows, nor below half of the stated noise, or a few that fit by chance would be left.
+    Control points do not count where there are others: while nothing holds their places they fit too well.
     """
     state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
     s = observations.squared(residual, counted)
+    tells = use & ~observations.is_control
+    tells = tells if tells.any() else use
     for _ in range(ITERATIONS):
-        least = float(np.sqrt(np.quantile(s[use], BEST) / BEST)) if use.any() else 1.0
-        noise = max(float(np.sqrt(weighted_median(s, counted) / MEDIAN)), least, _MIN_NOISE_RATIO)
+        least = float(np.sqrt(np.quantile(s[tells], BEST) / BEST)) if use.any() else 1.0
+        noise = max(float(np.sqrt(weighted_median(s[tells], counted[tells]) / MEDIAN)), least, _MIN_NOISE_RATIO)
         if scale <= 3.6 * noise:
             break
         clean = noise < MUCH_NOISE and float((s[use] > (OUTLIER * noise) ** 2).mean()) < SLIGHT

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg as la
 from scipy.special import chdtrc, gammaincinv
 
 from barpc.ba.parameters.priors import NOISE_FLOOR, CameraPrior, states_accuracy
@@ -25,6 +26,7 @@ from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
+from barpc.ba.solving.structure import unknowns_of
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, LEVEL, SMALL, STANDS, STATED_FREEDOM, SURE, TIMES
@@ -94,7 +96,7 @@ class QuadraticProblem:
     def posterior(self, prior: CameraPrior) -> _Posterior:
         """Return the information on every view under other priors."""
         evidence, params, covariance = self.under(prior)
-        return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior)
+        return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior, covariance)
 
 
 def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
@@ -114,6 +116,34 @@ class _Posterior:
     offset: Array  # (N, q) unknowns minus their priors' means
     blocks: Array  # (N, q, q) covariance of every view's unknowns
     prior: CameraPrior
+    covariance: Covariance  # without the updates (N q, m), (m, m) that were made since
+    updates: tuple[tuple[Array, Array], ...] = ()
+
+    def together(self, views: IntArray, prior: CameraPrior) -> _Posterior:
+        """Return the same under other priors of some views (n,), all of them: by the update of `alone`."""
+        n, q = self.offset.shape
+        place = unknowns_of(views, q)
+        columns = self.covariance.columns(place)
+        for earlier, told in self.updates:
+            columns -= earlier @ (told @ earlier[place].T)
+        change = la.block_diag(*self.around.change(self.prior, prior)[views])
+        system = np.eye(len(place)) + change @ columns[place]
+        gain = np.asarray(np.linalg.solve(system, change), np.float64)
+        mine = self.offset.ravel()[place]
+        pulled = gain @ mine
+        sign, volume = np.linalg.slogdet(system)
+        if sign <= 0:
+            raise np.linalg.LinAlgError("priors together too wide for what the observations determine")
+        free = self.around.problem.free
+        volume += float((_log_variance(prior, free) - _log_variance(self.prior, free)).sum())
+        return replace(
+            self,
+            evidence=self.evidence - 0.5 * float(mine @ pulled + volume),
+            offset=self.offset - (columns @ pulled).reshape(n, q),
+            blocks=self.blocks - (columns @ gain).reshape(n, q, -1) @ np.swapaxes(columns.reshape(n, q, -1), 1, 2),
+            prior=prior,
+            updates=(*self.updates, (columns, gain)),
+        )
 
     def alone(self, prior: CameraPrior) -> tuple[Array, Array, Array]:
         """Return evidence (N,), offset (N, q) and covariance (N, q, q) of every view if its prior alone were another.
@@ -441,7 +471,8 @@ class Variances:
             as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
             odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
             chosen[tops] = size[tops]
-            known, count = around.posterior(self._prior(chosen, wide)), count + int(tops.sum())
+            known = known.together(np.flatnonzero(tops), self._prior(chosen, wide))
+            count += int(tops.sum())
         return scale, odd, known.evidence - count * price
 
     def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:

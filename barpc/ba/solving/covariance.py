@@ -95,7 +95,7 @@ class Covariance:
         of_full = not self.is_large or "full" in self.__dict__
         if of_full or self.factor.inverse is None:
             place = unknowns_of(views, self.num_unknowns)
-            return self._columns(place, of_full)[place]
+            return self.columns(place, of_full)[place]
         return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
 
     def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
@@ -107,7 +107,7 @@ class Covariance:
             if (at := self._near.pair(min(i, j), max(i, j))) is not None:
                 return np.asarray((self._near.pairs[at] if i < j else self._near.pairs[at].T) + more)
         own, other = (unknowns_of(np.array([view]), self.num_unknowns) for view in (i, j))
-        return self._columns(other, of_full)[own]
+        return self.columns(other, of_full)[own]
 
     def _of_shared(self, view: int | None = None) -> Array:
         """Return the rows (q, k) of a view in common errors; without a view the covariances (N, q, q) by these."""
@@ -121,7 +121,7 @@ class Covariance:
         assert self.factor.inverse is not None
         return self.factor.inverse()
 
-    def _columns(self, place: IntArray, of_full: bool) -> Array:
+    def columns(self, place: IntArray, of_full: bool = False) -> Array:
         """Return the covariance (N q, m) of all unknowns with those at `place` (m,)."""
         if of_full:
             return self.full[:, place]
@@ -138,7 +138,7 @@ class Covariance:
             return out if self.shared is None else out + self.shared.by_unknown @ self.shared.by_unknown.T
         every = np.arange(len(self.free))
         for part in parts(len(every), max(KEPT // len(every), 1)):
-            out[:, part] = self._columns(every[part], False)
+            out[:, part] = self.columns(every[part])
         return 0.5 * (out + out.T)
 
     def shared_moves(self, index: IntArray) -> Array:
