@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def page_of(files: RunFiles) -> str:
             summary=summary,
             sections=shown,
             keys={section.key: section.question for section in shown},
-            verdict=sentences(summary),
+            verdict=[*chain.from_iterable(sentences(summary))],
             large=len(summary.views) > TABLE_ROWS_SHOWN,
             shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,

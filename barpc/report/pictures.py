@@ -29,7 +29,8 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             evenly((seen.xy[rows] + 0.5) * (box / view.size), _DOTS) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
-        counts = f"{counted(view.num_observations, 'tie point')} (blue), {view.num_rejected} rejected (red)"
+        used, *rest = (f"{count} {name}" for name, count in view.counts.items())
+        counts = f"tie points: {used} (blue){'; ' * bool(rest)}{', '.join(rest)}{' (red)' * bool(rest)}"
         text = template("drawings.svg.j2").module.thumbnail(
             number=k,
             view=view,

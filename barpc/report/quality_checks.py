@@ -346,16 +346,20 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
     if not terrain.total:
         yield from ["The DEM constrains nothing: there are no tie points."] * (not by_reference)
         return
-    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'tie point')}"
-    if terrain.held:
-        single = f"{metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)} per point"
-        if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
-            single += f" ({terrain.alike:.1f} correlated heights count as one)"
-        yield f"{held}. Assumed error: {single}, and {metres(terrain.bias)} common to all."
-    else:
-        yield f"{held}: the DEM has no height where one is needed."
-    lie = f"; they lie {terrain.offset:+.1f} m above it (median; NMAD {terrain.spread:.1f} m)" if terrain.known else ""
-    yield f"The DEM covers {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
+    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'used tie point')}"
+    covers = f"; the DEM covers {100 * terrain.known / terrain.total:.0f} %" if terrain.known < terrain.total else ""
+    if not terrain.held:
+        yield f"{held}: the DEM has no height where one is needed{covers}."
+        return
+    yield f"{held}{covers}."
+    single = metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)
+    measured = ""
+    if terrain.known:
+        lie = f"they lie {metres(abs(terrain.offset))} {'above' if terrain.offset > 0 else 'below'} it"
+        measured = f"; measured: {lie} (median; scatter {metres(terrain.spread)})"
+    yield f"DEM accuracy assumed: {metres(terrain.bias)} shared by all points, {single} each{measured}."
+    if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
+        yield f"DEM errors are correlated: {terrain.alike:.1f} points count as one."
 
 
 CONTROL_WORDS = {"dem": "the DEM", "gcps": "the GCPs", "reference": "the reference"}

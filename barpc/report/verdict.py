@@ -305,6 +305,9 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         yield f"Tie points of {tied} agree to {after:.3f} px{was}."
     else:
         yield "There are no tie points: control alone constrains the cameras."
+    if len(run.tracks) or gcps is not None:
+        yield f"The scene as a whole moved by {enu(gauge.shift)}."
+    yield from _known_lines(run, run.adjustment, views)
     if radars := [_clocks(view) for view in views if view.correction and view.correction.timing_sigma]:
         yield f"Radar timing corrections: {listed(radars, NAMED)}."
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
@@ -322,15 +325,12 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from _unmet_places(run, run.adjustment, views, matter=False)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
-    if len(run.tracks) or gcps is not None:
-        yield f"The scene as a whole moved by {enu(gauge.shift)}."
     yield from reference_lines(run)
     if (heights := run.adjustment.altimetry) is not None and not heights.why_not:
         yield (
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they shifted it by {enu(heights.motion)}."
         )
-    yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
@@ -430,8 +430,8 @@ def _matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 # --- one screen: the worst first, one sentence for the images of one cause ----------------------------------
 
 
-def sentences(summary: Summary) -> list[str]:
-    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
+def sentences(summary: Summary) -> tuple[list[str], list[str]]:
+    """Return the results and the reservations: a sentence for all images of a cause, or files of a reason."""
     alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and sentences
     for view in flagged(summary.views):
         alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
@@ -439,13 +439,9 @@ def sentences(summary: Summary) -> list[str]:
         why = file.reason.replace(file.path, "").lstrip(": ")
         alike.setdefault(("", why), []).append((file.path, file.reason_text))
     own = {text for found in alike.values() for _, text in found}
-    rest = [line for line in summary.verdict if line not in own]
-    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
-    return [
-        *rest[:place],
-        *(line for why, found in alike.items() for line in _status_sentences(*why, found)),
-        *rest[place:],
-    ]
+    wrong = [line for why, found in alike.items() for line in _status_sentences(*why, found)]
+    results = [line for line in summary.verdict if line not in {*own, *summary.reasons}]
+    return results, wrong + [line for line in summary.reasons if line not in own]
 
 
 def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:

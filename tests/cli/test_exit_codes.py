@@ -25,7 +25,7 @@ def assert_told(said, *words):
     """Exit code 3, and the last line says why."""
     assert said.code == 3, said
     last = said.err.strip().splitlines()[-1]
-    assert last.startswith("barpc: exit code 3: "), said
+    assert last.startswith("barpc: needs review (exit code 3): "), said
     for word in words:
         assert word in last, said
 

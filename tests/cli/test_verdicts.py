@@ -214,7 +214,7 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     result.passed = False
     assert _tell_result(result) == 3
     headline = "" if quiet else "All well. "
-    assert capsys.readouterr() == (out, f"barpc: exit code 3: {headline}One.\n")
+    assert capsys.readouterr() == (out, f"barpc: needs review (exit code 3): {headline}One.\n")
 
 
 def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: pytest.MonkeyPatch) -> None:

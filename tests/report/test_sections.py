@@ -141,7 +141,7 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
     assert section.answer == (
         "The epipolar offset, the part of a mismatch that no height explains, is 0.100 px (RMS) in the worst pair "
         "(A - B); stereo matching along epipolar lines needs it well below 0.5 px. The best pair for heights is A - C: "
-        "its convergence angle is 0.9 degrees, so one pixel of parallax is 71.2 cm of height."
+        "its convergence angle is 0.9 degrees, so one pixel of parallax is 71 cm of height."
     )
     assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
     assert texts(section.tables[0])[0] == [
@@ -399,7 +399,7 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     shown = section(replace(files, reliefs=(before, after)), "surface")
     said = "41 % of its cells have a height with the delivered cameras, 93 % with the corrected ones."
     assert said in shown.answer
-    assert ("differ by 25.0 cm and by 50.0 cm" in shown.answer) == told
+    assert ("differ by 25 cm and by 50 cm" in shown.answer) == told
     assert [words.partition(",")[0] for _, words in shown.charts] == [
         "Surface from the delivered cameras", "Surface from the corrected cameras",
     ]  # fmt: skip

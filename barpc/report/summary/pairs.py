@@ -60,7 +60,7 @@ class PairEntry(Record):
 
     a: str = column("First view")
     b: str = column("Second view")
-    num_matches: Count = column("Common tie points", head="matches")
+    num_matches: Count = column("Common tie points in use", head="used")
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")

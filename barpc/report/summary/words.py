@@ -73,17 +73,16 @@ def figure(value: float) -> str:
 
 
 def metres(value: float) -> str:
-    """Return a length with a unit that keeps it readable.
+    """Return a length of two digits with a unit that keeps it readable.
 
     Examples
     --------
-    >>> metres(3.14159), metres(0.0421), metres(0.00012)
-    ('3.1 m', '4.2 cm', '0.1 mm')
+    >>> metres(3.14159), metres(53.9), metres(684.0), metres(0.0421), metres(0.00012)
+    ('3.1 m', '54 m', '680 m', '4.2 cm', '0.1 mm')
     """
-    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
-        if abs(value) * factor >= 1.0:
-            return f"{value * factor:.1f} {unit}"
-    return f"{value * 1e3:.1f} mm"
+    scaled = ((float(f"{value * factor:.2g}"), unit) for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")))
+    length, unit = next((one for one in scaled if abs(one[0]) >= 1.0), (value * 1e3, "mm"))
+    return f"{length:.{1 if abs(length) < 10.0 else 0}f} {unit}"
 
 
 @dataclass(frozen=True)
