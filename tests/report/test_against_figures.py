@@ -159,24 +159,32 @@ def _(s, far, side):
 
 
 @says(
-    r"DEM heights constrain (\d+) of (\d+) tie points?(: the DEM has no height .*|\. "
-    rf"Assumed error: {LENGTH} per point.*)"
+    r"DEM heights constrain (\d+) of (\d+) used tie points?(: the DEM has no height where one is needed)?"
+    r"(?:; the DEM covers (\d+) %)?\."
 )
-def _(s, held, num, rest, sigma):
+def _(s, held, num, nowhere, percent):
     dem = s.scene.dem
     assert (int(held), int(num)) == (dem.num_held, dem.num_tracks)
-    assert ("no height" in rest) == (dem.num_held == 0)
-    assert sigma is None or sigma == metres(dem.sigma_m)
+    assert bool(nowhere) == (dem.num_held == 0)
+    near(percent or "100", 100.0 * dem.num_known / dem.num_tracks)
 
 
-@says(rf"The DEM covers (\d+) % of the tie points(?:; they lie {NUM} m above it \(median; NMAD {NUM} m\))?\.")
-def _(s, percent, offset, spread):
+@says(
+    rf"DEM accuracy assumed: {LENGTH} shared by all points, {LENGTH} each(?:; measured: they lie {LENGTH} "
+    rf"(above|below) it \(median; scatter {LENGTH}\))?\."
+)
+def _(s, _shared, sigma, offset, side, spread):
     dem = s.scene.dem
-    near(percent, 100.0 * dem.num_known / dem.num_tracks)
+    assert dem.sigma_m is None or sigma == metres(dem.sigma_m)
     assert (offset is None) == (dem.num_known == 0)
     if offset:
-        near(offset, dem.offset_m)
-        near(spread, dem.spread_m)
+        assert (offset, spread) == (metres(abs(dem.offset_m)), metres(dem.spread_m))
+        assert (side == "above") == (dem.offset_m > 0)
+
+
+@says(rf"DEM errors are correlated: {NUM} points count as one\.")
+def _(s, alike):
+    near(alike, s.scene.dem.correlated_per_independent)
 
 
 @says(rf"The DEM does not show the terrain of the tie points: its relief is {NUM} times theirs\. .* It was not used\.")
@@ -335,15 +343,24 @@ def _(s, model):
     assert model == s.scene.model
 
 
-@says(r"The standard camera model explains all residuals; no extra model was needed\.")
+@says(r"No extra model was needed: in no image are systematic residuals significant \(F test: p above 1e-4\)\.")
 def _(s):
     assert not s.scene.explanations
-    assert not s.scene.left
-    assert any(view.num_observations for view in s.views)
-    for view in s.views:
-        assert (view.systematic_px or 0.0) <= SMOOTH or (view.systematic_p or 1.0) > SURE_P
-        assert (view.rmse_after or 0.0) < 0.5
-        assert (view.held_out_px or 0.0) < 1.0
+    assert min(view.systematic_p for view in s.views) >= 1e-4
+
+
+@says(
+    rf"No extra model was selected(?:: systematic residuals of at most {NUM} px remain \((\S+); F test: p below "
+    r"1e-4 in (\d+) images?\))?\."
+)
+def _(s, size, name, num):
+    assert not s.scene.explanations
+    sure = [view for view in s.views if view.systematic_p is not None and view.systematic_p < 1e-4]
+    assert len(sure) == int(num or 0)
+    if num:
+        largest = max(sure, key=lambda view: (view.systematic_px, view.name))
+        assert largest.name == name
+        assert float(size) == pytest.approx(largest.systematic_px, rel=0.06)
 
 
 @says(r"No extra model that was tested explains the inconsistent residuals\.")
@@ -393,26 +410,25 @@ def _(s, ratio, rest):
         near(found[2], max(view.prior_scale for view in wide))
 
 
-@says(rf"(\d+) of (\d+) observations of tie points \({NUM} %\) were rejected as outliers, the most in (\S+): {NUM} %\.")
-def _(s, cut, num, percent, name, most):
-    gone = sum(view.num_rejected for view in s.views)
-    assert (int(cut), int(num)) == (gone, gone + sum(view.num_observations for view in s.views))
-    assert float(percent) == pytest.approx(100 * gone / int(num), abs=0.051)
-    assert float(percent) > 0 < float(most)
-    assert max(s.views, key=lambda view: view.lost).lost == next(view.lost for view in s.views if view.name == name)
+@says(
+    r"Observations of tie points: (\d+) used, (\d+) check \(independent of the adjustment\), (\d+) rejected as outliers"
+    rf"(?:, (\d+) excluded, as they move together)?\.(?: Most were rejected in (\S+): {NUM} % of those used or "
+    r"rejected\.)?"
+)
+def _(s, *found):
+    *counts, name, most = found
+    names = "num_observations", "num_check", "num_rejected", "num_moving"
+    assert [int(count or 0) for count in counts] == [sum(getattr(view, name) for view in s.views) for name in names]
+    assert sum(int(count or 0) for count in counts) == s.tracks.num_observations
+    assert int(counts[1]) == s.scene.num_held_out
+    assert (name is None) == (int(counts[2]) == 0)
+    if name:
+        (view,) = (view for view in s.views if view.name == name)
+        assert view.lost == max(view.lost for view in s.views)
+        near(most, 100 * view.lost)
 
 
-@says(r"No observation of a tie point was rejected\.")
-def _(s):
-    assert sum(view.num_rejected for view in s.views) == 0 < sum(view.num_observations for view in s.views)
-
-
-@says(r"(\d+) more were held out as independent checks\.")
-def _(s, num):
-    assert int(num) == s.scene.num_held_out
-
-
-@says(r"Independent check tie points fit equally well in all rows, columns and cells of every image\.")
+@says(r"Check tie points fit equally well in all rows, columns and cells of every image\.")
 def _(s):
     assert s.scene.held_out_places == ()
     errors = [view.held_out_px for view in s.views if view.num_observations]

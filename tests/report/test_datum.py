@@ -121,7 +121,7 @@ def test_a_dem_is_held_against_the_tie_points_without_what_it_may_be_wrong_by():
 
 
 @pytest.mark.parametrize(
-    ("lean", "share", "aside"), [(0.27, 1.0, "13.0"), (0.27, 0.5, "6.5"), (1 / 12, 1.0, ""), (0.0, 1, "")]
+    ("lean", "share", "aside"), [(0.27, 1.0, "13"), (0.27, 0.5, "6.5"), (1 / 12, 1.0, ""), (0.0, 1, "")]
 )
 @pytest.mark.parametrize("source", ["gcps", "heights"])
 def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_its_own(source, lean, share, aside):

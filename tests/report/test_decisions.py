@@ -75,12 +75,12 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
     assert (
-        "as a polynomial of degree 1 (standard deviation at the first and last row: 12.0 cm): no higher degree was "
+        "as a polynomial of degree 1 (standard deviation at the first and last row: 12 cm): no higher degree was "
         "needed" in plain
     )
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
     assert (
-        "as a polynomial of degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
+        "as a polynomial of degree 2 (standard deviation at the first and last row: 12 cm, 30 cm): degree 1 left "
         in more
     )
     assert "a systematic residual of 0.31 px in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
@@ -101,18 +101,21 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
 def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed(record):
     plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
     assert "no higher degree was needed" in plain
-    assert "explains all residuals" in plain
+    assert "No extra model was needed: in no image are systematic residuals significant" in plain
     assert "fit equally well" in plain
     text = said(with_views(record, *[{"systematic_p": 0.3}] * 8, {"systematic_p": 9e-69}), held_out_places=())
     assert "no higher degree was needed" not in text
     last = record.views[8].name
+    assert f"px remain ({last}; F test: p below 1e-4 in 1 image)" in text
+    assert "No extra model was needed" not in text
     assert f"no higher degree removes the systematic residuals of {last} (F test: p below 1e-4)" in text
     for cause in ("systematic", "held_out", "wrong_matches", "left"):
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
-        assert "explains all residuals" not in text
+        assert "No extra model was" not in text
         assert "No extra model that was tested explains the inconsistent residuals." in text
         assert "fit equally well" not in text
-    assert "explains all residuals" in said(with_views(record, {"cause": "odd", "advice": "look"}), held_out_places=())
+    odd = with_views(record, *[{"systematic_p": 0.3}] * 8, {"cause": "odd", "advice": "look", "systematic_p": 0.3})
+    assert "No extra model was needed" in said(odd, held_out_places=())
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
     assert "fit equally well" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
@@ -148,13 +151,11 @@ def test_the_model_in_the_image_is_said_to_be_better(record):
 
 def test_what_was_cut_and_kept_out_is_counted(record):
     none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
-    assert "No observation of a tie point was rejected." in said(none)
-    text = said(with_views(none, {}, {"num_rejected": 100}), num_held_out=70)
-    most = f"the most in {record.views[1].name}: 50.0 %"
-    assert f"100 of 1000 observations of tie points (10.0 %) were rejected as outliers, {most}." in text
-    assert "70 more were held out as independent checks" in text
-    assert "No observation" not in text
-    assert "took no part, so" not in said(none, num_held_out=0)
+    assert "900 used, 0 check (independent of the adjustment), 0 rejected as outliers." in said(none, num_held_out=0)
+    text = said(with_views(none, {"num_moving": 4}, {"num_rejected": 100}), num_held_out=70)
+    most = f"Most were rejected in {record.views[1].name}: 50.0 % of those used or rejected."
+    counts = "900 used, 70 check (independent of the adjustment), 100 rejected as outliers, 4 excluded, as they move"
+    assert f"Observations of tie points: {counts} together. {most}" in text
 
 
 def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record):
@@ -210,7 +211,7 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     )
     older = with_views(record, *[{"neighbour_correlated_px": None, "systematic_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
-    assert [line.split()[0] for line in found] == ["The", "No"]
+    assert [line.split()[0] for line in found] == ["The", "Observations"]
 
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
@@ -227,7 +228,8 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
 
 
 def test_where_nothing_won_it_is_said_why(record):
-    assert "The standard camera model explains all residuals" in said(record)
+    assert "No extra model was needed" in said(with_views(record, *[{"systematic_p": 0.3}] * 9))
+    assert "No extra model was selected." in said(with_views(record, {"systematic_p": None}))
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
     assert "No extra model that was tested explains the inconsistent residuals." in text
@@ -254,7 +256,7 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
 
 
 def test_what_took_no_part_is_said_to_agree(record):
-    agrees = "Independent check tie points fit equally well in all rows, columns and cells of every image."
+    agrees = "Check tie points fit equally well in all rows, columns and cells of every image."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)

@@ -40,7 +40,7 @@ def test_images_without_reservation_are_counted():
     agreement = " Residuals measure how well the images agree with each other, not their accuracy on the ground."
     assert section.answer == f"3 of 3 images passed.{agreement}"
     (table,) = section.tables
-    assert table.columns[:3] == ["image", "verdict", "tie points"]
+    assert table.columns[:3] == ["image", "verdict", "used"]
     assert [row[0].text for row in table.rows] == ["A", "B", "C"]
     assert table.marks == ["0", "1", "2"]
     doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
@@ -62,7 +62,8 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "A",
             "needs review",
             "60",
-            "25.0%",
+            "0",
+            "25.0",
             "25%",
             "1.234",
             "0.100",
@@ -73,10 +74,10 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "-",
         ]
     ]
-    assert [cell.key for cell in table.rows[0]][1:5] == [4, 60, 0.25, 0.254]
+    assert [cell.key for cell in table.rows[0]][1:6] == [4, 60, 0, 25.0, 0.254]
     assert table.rows[0][1].kind == "status doubtful"
     (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
-    assert nothing.rows[0][3].text == "-"
+    assert nothing.rows[0][4].text == "-"
 
 
 def test_a_map_needs_an_outline_and_says_where_some_are_left_out(sized):

@@ -507,15 +507,20 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
         terrain = TerrainTest(held, known, total, offset, spread, bias)
         return said(run_of(adjusted(terrain=terrain, **fields)))[-2:]
 
+    assumed = "DEM accuracy assumed: 50 cm shared by all points, 2.0 m each"
     assert lines() == [
-        "DEM heights constrain 30 of 40 tie points. Assumed error: 2.0 m per point, and 50 cm common to all.",
-        "The DEM covers 50 % of the tie points; they lie +2.0 m above it (median; NMAD 3.0 m).",
+        "DEM heights constrain 30 of 40 used tie points; the DEM covers 50 %.",
+        f"{assumed}; measured: they lie 2.0 m above it (median; scatter 3.0 m).",
     ]
-    assert lines(known=0)[1] == "The DEM covers 0 % of the tie points."
+    assert lines(known=40, offset=-2.0) == [
+        "DEM heights constrain 30 of 40 used tie points.",
+        f"{assumed}; measured: they lie 2.0 m below it (median; scatter 3.0 m).",
+    ]
+    assert lines(known=0)[1] == f"{assumed}."
     assert lines(known=0, total=0, held=0)[1] == "The DEM constrains nothing: there are no tie points."
-    held = "DEM heights constrain 0 of 40 tie points: "
-    nowhere = f"{held}the DEM has no height where one is needed."
-    assert lines(held=0)[0] == nowhere
+    held = "DEM heights constrain 0 of 40 used tie points: "
+    nowhere = f"{held}the DEM has no height where one is needed; the DEM covers 50 %."
+    assert lines(held=0)[1] == nowhere
     held = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0)
     for terrain, start in (
         (held, "With the DEM, the scene's position"),
@@ -523,15 +528,16 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     ):
         assert any(line.startswith(start) for line in said(run_of(adjusted(terrain=terrain))))
     terrain = TerrainTest(0, 20, 40, 2.0, 3.0, 0.5)
-    assert said(run_of(adjusted(terrain=terrain, held=np.array([False, True]))))[-2] == nowhere
+    assert said(run_of(adjusted(terrain=terrain, held=np.array([False, True]))))[-1] == nowhere
 
 
 def test_how_much_of_a_dem_is_believed_is_said():
     told = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0, alike=3.5, relief=0.98)
-    assert said(run_of(adjusted(terrain=told)))[-2] == (
-        "DEM heights constrain 30 of 40 tie points. Assumed error: 4.0 m per point (3.5 correlated heights count as "
-        "one), and 50 cm common to all."
-    )
+    assert said(run_of(adjusted(terrain=told)))[-2:] == [
+        "DEM accuracy assumed: 50 cm shared by all points, 4.0 m each; measured: they lie 2.0 m above it (median; "
+        "scatter 3.0 m).",
+        "DEM errors are correlated: 3.5 points count as one.",
+    ]
     assert wrong(told) == []
     assert wrong(replace(told, is_known=False)) == []
 
@@ -550,7 +556,7 @@ def test_what_is_wrong_with_a_dem_is_said_and_needs_a_look():
     below = replace(right, delivered=(51.0, 9.0, -9.0), beyond=(3.4, 1.0, 1.0))
     (why,) = wrong(below)
     assert why.startswith(
-        "The DEM is 51 m below the tie points of the delivered cameras, 3.4 times the standard deviation"
+        "The DEM is 51.0 m below the tie points of the delivered cameras, 3.4 times the standard deviation"
     )
     assert why.endswith("check its heights, their datum, and the cameras.")
     (why,) = wrong(replace(right, beyond=(1.0, 2.0, 3.1)))
@@ -638,7 +644,7 @@ def test_a_reference_on_heights_of_another_place_is_told(along, told):
     found = reasons(reference=ReferenceControl(SimpleNamespace(), (seen, other), 10.0, 2.5))
     assert len(found) == told
     if told:
-        assert "points scatter along the lines of sight by 20 m in A, as with height errors of 100 m (2.0 m" in found[0]
+        assert "points scatter along the lines of sight by 20 m in A, as with height errors of 99 m (2.0 m" in found[0]
         assert "B" not in found[0].split("in A")[1]
 
 

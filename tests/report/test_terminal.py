@@ -94,7 +94,7 @@ def test_a_check_shows_no_columns_of_new_cameras(check_run, monkeypatch):
 def test_few_pairs_keep_every_column_at_every_width(width, monkeypatch):
     finished = SimpleNamespace(record=a_summary([a_view("A"), a_view("B")], [a_pair("A", "B")]))
     squeezed = " ".join(shown(finished, width, monkeypatch).split())
-    for word in ("matches", "angle", "[deg]", "B/H", "before", "after", "+0.300 ± 0.200"):
+    for word in ("used", "angle", "[deg]", "B/H", "before", "after", "+0.300 ± 0.200"):
         assert word in squeezed
 
 
