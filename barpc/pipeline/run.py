@@ -10,6 +10,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
@@ -115,7 +116,10 @@ class AdjustResult:
         record, adjusted = self.record, self.record.adjusted
         shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
         heads, *rows = shown.texts
-        return html_table(shown.caption, rows, heads)
+        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in record.reasons)
+        page = Path(self.run.out_dir) / "report.html" if self.run.out_dir else None
+        link = f'<a href="{escape(str(page))}">report.html</a>' if page is not None and page.is_file() else ""
+        return html_table(shown.caption, rows, heads) + f"<ul>{reasons}</ul>" * bool(reasons) + link
 
     @property
     def passed(self) -> bool:

@@ -48,22 +48,24 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert "nothing was matched" in said(record)
     count = len(record.pairs)
     plain = said(matched(record))
-    assert f"{count} pairs tied: {count} by guided" in plain
+    assert "Not all pairs were matched" not in plain
+    assert "Pairs by selection" not in plain
     assert "nothing was matched" not in plain
-    assert "matched again" not in plain
     fewer = ("guided 12 of 100", "guided, loosened 20 of 100")
     other = matched(record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date")
     text = said(other)
-    assert f"{count} pairs tied: {count - 1} by guided, 1 by structure" in text
-    assert "1 pair matched again" in text
+    assert f"Not all pairs were matched by guided: {count - 1} by guided, 1 by structure." in text
     first = record.pairs[0]
-    assert f"at most 3 % of the matches of a pair are false ({first.a} - {first.b})" in text
+    assert (
+        f"At most 3 % of a pair's matches are false, estimated by searching where none can be ({first.a} - {first.b})"
+        in text
+    )
     assert "Pairs by selection criterion: 1 same date." in text
 
 
 def test_the_matcher_is_said_to_be_asked_for(record):
     tie = {**record.options["tie"], "matcher": "structure"}
-    assert "the requested matcher is structure" in said(
+    assert "Not all pairs were matched by structure: " in said(
         replace(matched(record), options={**record.options, "tie": tie})
     )
 
@@ -124,18 +126,17 @@ def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert (
-        "The squares of the corrections are 0.7 times those expected from the stated accuracies: no prior was widened."
-        in said(held, prior_ratio=0.7)
+    assert "The stated accuracies were kept: the squares of the corrections are 0.7 times those expected." in said(
+        held, prior_ratio=0.7
     )
     text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
-    assert f"the priors of 2 images were widened, at most 3.2 times ({record.views[1].name})" in text
-    assert "no prior was widened" not in text
+    assert f"the accuracies of 2 images were widened, at most 3.2 times ({record.views[1].name})" in text
+    assert "The stated accuracies were kept" not in text
     assert "Squared corrections" not in said(held, prior_ratio=None)
     assert "Taken as shared" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
     assert (
-        "no prior was widened. As an error common to all images, the stated accuracies were widened 1.8 times."
+        "0.7 times those expected. As an error common to all images, the stated accuracies were widened 1.8 times."
         in shared
     )
 
@@ -216,10 +217,10 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     calm = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "no prior was widened" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
+    assert "The stated accuracies were kept" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
     slightly = said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
-    assert "the priors of 1 image were widened, at most 1.0 times" in slightly
-    assert "no prior was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
+    assert "the accuracies of 1 image were widened, at most 1.0 times" in slightly
+    assert "The stated accuracies were kept" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
     given = JustificationEntry(
         image="B", systematic_px=None, systematic_p=None, neighbour_correlated_px=0.0, num_images=1
     )

@@ -118,13 +118,13 @@ def pushed(view: int, cells: int, of: int):
 def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
     calm = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
     assert calm.answer.startswith(
-        "Mostly: in no image do residuals point the same way in more than half of the cells. A cell"
+        "Yes: in no image do residuals point the same way in more than half of the cells. Colour: size."
     )
     assert len(calm.panels) == 3
     assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
     assert len(calm.folds[0][1]) == 3
     told = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
-    assert told.answer.startswith("Not in B: in most of their cells the residuals point the same way. A cell")
+    assert told.answer.startswith("Not in B: in most of their cells the residuals point the same way. Colour")
     check = asked("random", observed=seen(pushed(1, 2, 3)), kind="check")
     assert check.folds == []
     assert 'id="panel-before0-t"' in check.panels[0][0]
@@ -299,7 +299,7 @@ def test_files_are_held_to_what_their_readers_found():
     fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
     outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
     section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
-    assert section.answer.startswith("Errors of at most 4.0e-03 px, on check points")
+    assert section.answer.startswith("Errors of at most 4.0e-03 px, on points over")
     fits, files = section.tables
     assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100%", "500", "lstsq"]
     assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
