@@ -28,7 +28,7 @@ from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, figure, known, metres
+from barpc.report.summary.words import counted, figure, known, metres, two_digits
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
@@ -373,7 +373,7 @@ def residual_panels(
 
 
 def _px(length: float) -> str:
-    return f"{float(f'{length:.2g}'):g} px"  # two digits, and no power of ten for residuals of hundreds of pixels
+    return f"{two_digits(length)} px"
 
 
 def panel_box(view: ViewEntry) -> Array:

@@ -192,7 +192,7 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         rest = len(views) - len(alike)
         more = f", then at {counted(rest, 'more image')}" if rest else ""
         part = _REPORT_PARTS.get(views[0].cause or "", "images")
-        yield StepEntry("review", f"Look at {listed(alike, NAMED)} ({label}){more}.", part=part)
+        yield StepEntry("review", f"Review {listed(alike, NAMED)} ({label}){more}.", part=part)
     elif summary.left_out:
         names = listed([one.path for one in summary.left_out], NAMED)
         yield StepEntry("review", f"Check the files that were left out: {names}.")

@@ -16,7 +16,7 @@ from barpc.base.statistics import SURE, SURELY
 from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
 from barpc.report.summary.block import AXES, LeftEntry, left_entries, matters, strangeness
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres
+from barpc.report.summary.words import CAUSES, NAMED, counted, known, metres, two_digits
 from barpc.report.unseen import unseen_parts
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
@@ -28,6 +28,7 @@ ENOUGH_GCPS = 3  # Control points that constrain a view without any tie point
 WORST_LEFT = 0.15  # px: a larger misfit of one RPC anywhere needs review
 NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher states: more needs review
 
+_WHOLE = 0.9  # share of the rows or columns that is the whole image
 _CONTROL_WORDS = {
     "rejected": "{} rejected, as the others contradict {}: check coordinates, axes and image positions",
     "contradicts": "{} with residuals above 4 standard deviations, used nevertheless: the stated accuracies are too "
@@ -83,7 +84,7 @@ def _poorly_fitted_parts(view: ViewEntry, adjustment: Adjustment) -> Causes:
         if one.image == view.name and matters(one) and (what := inconsistency(one)):
             place, cause = one.place, "clouds, water, change there"
             if one.axis == AXES[0] and one.rejected <= MANY_REJECTED:  # nothing on the ground is as long as the pass
-                place, cause = f"{place}, over all rows,", "detectors or resampling"
+                place, cause = f"{place}, over all rows", "detectors or resampling"
             yield "place", {"place": place, "what": what, "cause": cause}
 
 
@@ -174,21 +175,20 @@ def inconsistency(one: LeftEntry) -> str:
     if one.moving:
         return ""
     if one.rejected > MANY_REJECTED:
+        far = two_digits(one.rejected_median_px)
         return (
-            f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
-            f"{one.rejected_median_px:.2f} px"
+            f"{100 * one.rejected:.0f} % of the tie points disagree with the rest of the image, typically by {far} px"
         )
-    return f"their tie points share a residual of {one.off_px:.2f} px" if one.off_px > SMOOTH_LEFT else ""
+    return f"the tie points share a residual of {one.off_px:.2f} px" if one.off_px > SMOOTH_LEFT else ""
 
 
 def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
     """Return the region with most of a view's rejected tie points in words; empty without one."""
     for one in left_entries(adjustment):
         if one.image == view.name and one.rejected > MANY_REJECTED and not one.moving:
-            return (
-                f"; most in {one.place}, where {100 * one.rejected:.0f} % were, half of these by more than "
-                f"{one.rejected_median_px:.2f} px"
-            )
+            whole = one.last - one.first > _WHOLE * view.size[AXES.index(one.axis)]
+            far = f"typically by {two_digits(one.rejected_median_px)} px"
+            return f", {far}" if whole else f"; most in {one.place} ({100 * one.rejected:.0f} %, {far})"
     return ""
 
 

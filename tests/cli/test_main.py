@@ -229,7 +229,11 @@ def test_only_a_process_of_its_own_has_its_garbage_left_alone(
     with pytest.raises(SystemExit):
         main()
     assert asked == [50_000, "streams", True, "freeze"]
-    assert given == [{"args": ["info", "a b"], "prog_name": "barpc", "standalone_mode": False}]
+    (one,) = given
+    assert (one.pop("obj").folder, one) == (
+        None,
+        {"args": ["info", "a b"], "prog_name": "barpc", "standalone_mode": False},
+    )
 
 
 # --- the log ----------------------------------------------------------------------------------------------

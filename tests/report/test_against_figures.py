@@ -314,7 +314,7 @@ def _(s, gains):
     assert ("--dem" in gains) <= (s.scene.dem is None or s.scene.dem.num_held == 0)
 
 
-@says(r"Look at (.*?)(?: and \d+ more)? \((.*?)\).*\.")
+@says(r"Review (?!: )(.*?)(?: and \d+ more)? \((.*?)\).*\.")
 def _(s, names, _label):
     assert {*names.split(", ")} <= {view.name for view in s.views if view.advice}
 
@@ -465,13 +465,13 @@ def _(s, good, num, agreement):
     assert not agreement or s.tracks.num_observations
 
 
-@says(r"There are no tie points in use\.(?: Tied .*)?")
+@says(r"There are no tie points in use\.(?: Connected .*)?")
 def _(s):
     assert not any(s.tracks.by_length.values())
 
 
 @says(
-    r"Tie points connect (all images|the images in (\d+) separate groups)\.(?: Tied to one .*?\.)?"
+    r"Tie points connect (all images|the images in (\d+) separate groups)\.(?: Connected to one .*?\.)?"
     r"((?: \d+.* in \d+.*)?)"
 )
 def _(s, how, groups, lengths):

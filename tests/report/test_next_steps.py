@@ -243,7 +243,7 @@ def test_a_flagged_image_is_not_handed_over_and_the_part_that_shows_it_is_linked
     assert "C.tif" in use.text
     assert "B." not in use.text
     assert "A - C (a pixel is 2.0 m)" in use.text
-    assert review.text.startswith("Look at B (")
+    assert review.text.startswith("Review B (")
     views = [replace(view, correction=a_correction()) for view in views]
     files = files_of(a_summary(views, pairs), observed=seen([(0, 0, (0.0, 0.0), (1.0, 1.0), (0.1, 0.1), True)]))
     assert section(files, review.part) is not None

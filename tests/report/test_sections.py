@@ -99,8 +99,11 @@ def test_how_images_hang_together():
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
     assert answer(ring) == "Tie points connect all images."
-    assert answer(ring[:3]) == "Tie points connect all images. Tied to one other image only: A, D."
-    assert answer(ring[:1]) == "Tie points connect the images in 3 separate groups. Tied to one other image only: A, B."
+    assert answer(ring[:3]) == "Tie points connect all images. Connected to one other image only: A, D."
+    assert (
+        answer(ring[:1])
+        == "Tie points connect the images in 3 separate groups. Connected to one other image only: A, B."
+    )
     assert answer(ring[:1], 2) == "Tie points connect all images."
     assert answer([]) == "Tie points connect the images in 4 separate groups."
 
@@ -359,7 +362,7 @@ def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
     assert [row[0].text for row in table.rows] == ["F", "E", "D", "C", "G", "B", "A"]
     assert table.marks == ["5", "4", "3", "2", "6", "1", "0"]
     assert [row[2].text for row in table.rows][:3] == [
-        "not tied to the others",
+        "not connected to the others",
         "contradicts the others",
         "large residuals of check tie points",
     ]

@@ -172,7 +172,7 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
     assert [line.partition(": view_")[0] for line in causes] == [
         "100 images: needs review, contradicts the others",
         "100 images: needs review, large residuals of check tie points",
-        "99 images: weakly tied, few tie points",
+        "99 images: weakly connected, few tie points",
     ]
     assert "view_0298, view_0295, view_0292, view_0289, view_0286 and 95 more" in causes[0]
 

@@ -52,7 +52,7 @@ def test_a_view_with_few_tie_points_is_weakly_tied():
     assert view["status"] == "weak"
     assert str(view["num_observations"]) in view["advice"]
     assert summary["headline"] == "1 image needs review (of 4)."
-    assert any(line.startswith(f"{view['name']}: weakly tied: only") for line in summary["verdict"])
+    assert any(line.startswith(f"{view['name']}: weakly connected: only") for line in summary["verdict"])
 
 
 def test_a_view_without_tie_points_to_the_others_is_not_adjusted():

@@ -70,7 +70,7 @@ class PairEntry(Record):
     epipolar_after: OffsetEntry | None = column("The same through the new cameras")
     matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
     tied_by: str | None = column(
-        "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
+        "Matcher that succeeded, and whether its thresholds were relaxed", head="matched by", default=None
     )
     decoy_share: Number = column(
         "Share of false matches, by search bands without true ones", head="false matches", form=".1%", default=None

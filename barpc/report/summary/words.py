@@ -15,7 +15,7 @@ STATUS_WORDS = {
     "adjusted": "adjusted",
     "consistent": "consistent",
     "tied": "tied",
-    "weak": "weakly tied",
+    "weak": "weakly connected",
     "doubtful": "needs review",
     "failed": "not adjusted",
 }
@@ -61,6 +61,17 @@ def known(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two digits.
+
+    Examples
+    --------
+    >>> two_digits(33.11), two_digits(0.256), two_digits(684.0)
+    ('33', '0.26', '680')
+    """
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def figure(value: float) -> str:
     """Return a number with one decimal, or with one digit where it would read 0.0.
 
@@ -103,7 +114,7 @@ CAUSES = {
     "no_overlap": Cause("failed", "in no matched pair",
         "no pair with it was selected for matching (overlap, angle or list), and its camera was not changed",
         "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap in a file given with --options"),
-    "untied": Cause("failed", "not tied to the others",
+    "untied": Cause("failed", "not connected to the others",
         "no tie points connect it to the main group of images{tried}, and its camera was not changed",
         "check for clouds, water and other dates, or supply matches (--matches)"),
     "other_rpc": Cause("failed", "RPC does not match the image",
@@ -137,18 +148,18 @@ CAUSES = {
     "systematic": Cause("doubtful", "systematic residuals",
         "systematic residuals of {size:.2f} px {along} remain: {why}"),
     "rejected": Cause("doubtful", "many tie points rejected",
-        "{share:.0f} % of its tie points were rejected, with neighbouring errors in the same direction{place}",
+        "{share:.0f} % of its tie points were rejected; neighbours err in the same direction, so it is no noise{place}",
         "check for clouds, water, change"),
     "wrong_matches": Cause("doubtful", "wrong matches",
         "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of "
         "mismatches, and check tie points have residuals of {error:.2f} px",
         "check for repeated patterns and noise, or supply matches (--matches)"),
     "place": Cause("doubtful", "inconsistent rows or columns",
-        "{place} are inconsistent with the rest of the image: {what}", "check for {cause}"),
+        "in {place} {what}", "check for {cause}"),
     "gap": Cause("doubtful", "rows or columns with few tie points",
         "{place} have {found} of about {due} tie points expected from their detail, so an error there would not show",
         "check for clouds, water, change there, or a jump in the image"),
-    "beside": Cause("doubtful", "tied to a contradicting image",
+    "beside": Cause("doubtful", "connected to a contradicting image",
         "check tie points have residuals of {error:.2f} px, and most of them are observed in {other}, too, whose tie "
         "points contradict the others",
         "check that image first"),
