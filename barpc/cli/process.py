@@ -68,7 +68,7 @@ def hold_streams() -> None:
 
 
 class Kept:
-    """What an interrupted verb leaves, in words: of a run with a `folder` the results of finished tasks."""
+    """Results of an interrupted verb that are kept, in words: of a run with a `folder` those of finished tasks."""
 
     folder: Path | None = None
     stage = "its start"

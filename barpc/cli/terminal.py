@@ -107,7 +107,7 @@ class Formatter(logging.Formatter):
 
 
 def print_summary(summary: Summary) -> None:
-    """Print the verdict, what moved and how sure, the reservations, the next commands: at most `MOST_LINES` lines.
+    """Print verdict, motion, uncertainty, reservations and next commands of a run in at most `MOST_LINES` lines.
 
     With `-v` every sentence, below the tables of views, pairs and control.
     """

@@ -104,7 +104,7 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
 
 
 def _damage_of(file: PathOrUrl, reason: str) -> str:
-    """Return what is wrong with a TIFF by GDAL's message; empty where that is another error."""
+    """Return the damage of a TIFF file by GDAL's message, in words; empty where that is another error."""
     directory = re.search(r"Failed to read directory at offset (\d+)", reason)
     size = 0 if isinstance(file, Remote) else file.stat().st_size
     if directory and 0 < size <= int(directory[1]):

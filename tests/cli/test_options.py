@@ -229,7 +229,7 @@ def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:
         if line.endswith(":") and not line.startswith(" "):
             found[line[:-1]] = flags = []
         elif line.startswith("  -"):
-            flags += [word.strip(",") for word in line.split()[:2] if word.startswith("--")]
+            flags += [word.strip(",") for word in line.split()[:3] if word.startswith("--")]
     return found
 
 

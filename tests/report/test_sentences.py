@@ -335,12 +335,12 @@ def test_an_affine_in_the_image_says_what_it_was_better_than():
         line, shape = [one for one in said(run_of(found)) if "affine" in one or "tilted" in one]
         assert reasons(found) == [line, shape]
         assert line == (
-            "Rotations and translations leave 0.950 px at check tie points, an affine transform per image 0.200 px: the "
-            "affine is used. This is unusual: was an image resampled, or does its RPC belong to another image?"
+            "Rotations and translations leave 0.950 px at check tie points, an affine transform per image 0.200 px: "
+            "the affine is used. This is unusual: was an image resampled, or does its RPC belong to another image?"
         )
         assert shape == (
-            f"The scene may be tilted, by 40 cm at its eastern and {metres(tilt)} at its northern edge (800 m out), and "
-            f"bent, by {metres(max(0.8, bend))}. Add GCPs or a DEM before using heights."
+            f"The scene may be tilted, by 40 cm at its eastern and {metres(tilt)} at its northern edge (800 m out), "
+            f"and bent, by {metres(max(0.8, bend))}. Add GCPs or a DEM before using heights."
         )
 
 
