@@ -2,12 +2,12 @@
 
 Images become tie points, tie points become corrections, corrections compose into P_BA, and P_BA is fitted into an RPC.
 The names below are the public ones; they are imported when first used, so that ``import barpc`` costs nothing.
-A function is called as the verb of the command line: `barpc.fit`, `barpc.dsm` and `barpc.export` are folders, too.
+A function is called as the verb of the command line; `barpc.fit`, `dsm`, `export` and `report` are verbs, and
+folders for `from barpc.fit import ...` alone.
 """
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 
 TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one would cost
@@ -15,14 +15,14 @@ TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one w
 __version__ = "0.4.0"
 
 _PUBLIC_MODULES = {
-    "barpc.verbs.runs": "adjust check dsm export match verify",
+    "barpc.verbs.runs": "adjust check dsm export match open_run plan report verify",
     "barpc.verbs.points": "localize project triangulate",
     "barpc.verbs.converting": "convert",
     "barpc.verbs.describe": "info",
     "barpc.verbs.fitting": "fit",
     "barpc.verbs.orthoimages": "ortho",
     "barpc.pipeline.calibrate": "calibrate",
-    "barpc.pipeline": "AdjustResult",
+    "barpc.pipeline": "AdjustResult OpenedRun Plan",
     "barpc.cameras": "open_camera",
     "barpc.sensor": "SensorModel",
     "barpc.sensor.rpc": "RPC",
@@ -32,28 +32,31 @@ _PUBLIC_MODULES = {
     "barpc.sensor.image_corrections": "RowSpline Splined",
     "barpc.scene": "View Tracks GroundPoints",
     "barpc.rpcio": "read_rpc write_rpc",
-    "barpc.fit": "fit_rpc fit_rpc_points",
+    "barpc.fit": "RpcFit fit_rpc fit_rpc_points",
     "barpc.base.options": "RunOptions TieOptions AdjustOptions FitOptions",
     "barpc.base.verb_options": "DsmOptions",
-    "barpc.base.errors": "BarpcError BarpcWarning",
+    "barpc.base.errors": "BarpcError BarpcWarning ReservationError",
 }
 _PUBLIC = {name: module for module, names in _PUBLIC_MODULES.items() for name in names.split()}
 
 if TYPE_CHECKING:
-    from types import ModuleType
     from typing import Any
 
     from barpc.base.errors import BarpcError as BarpcError
     from barpc.base.errors import BarpcWarning as BarpcWarning
+    from barpc.base.errors import ReservationError as ReservationError
     from barpc.base.options import AdjustOptions as AdjustOptions
     from barpc.base.options import FitOptions as FitOptions
     from barpc.base.options import RunOptions as RunOptions
     from barpc.base.options import TieOptions as TieOptions
     from barpc.base.verb_options import DsmOptions as DsmOptions
     from barpc.cameras import open_camera as open_camera
+    from barpc.fit import RpcFit as RpcFit
     from barpc.fit import fit_rpc as fit_rpc
     from barpc.fit import fit_rpc_points as fit_rpc_points
     from barpc.pipeline import AdjustResult as AdjustResult
+    from barpc.pipeline import OpenedRun as OpenedRun
+    from barpc.pipeline import Plan as Plan
     from barpc.pipeline.calibrate import calibrate as calibrate
     from barpc.rpcio import read_rpc as read_rpc
     from barpc.rpcio import write_rpc as write_rpc
@@ -80,42 +83,23 @@ if TYPE_CHECKING:
     from barpc.verbs.runs import dsm as dsm
     from barpc.verbs.runs import export as export
     from barpc.verbs.runs import match as match
+    from barpc.verbs.runs import open_run as open_run
+    from barpc.verbs.runs import plan as plan
+    from barpc.verbs.runs import report as report
     from barpc.verbs.runs import verify as verify
-else:
-    ModuleType = type(sys)
-
 __all__ = ["__version__", *sorted(_PUBLIC)]
-_FOLDERS = frozenset({"dsm", "export", "fit"})
-
-
-class _Verb(ModuleType):
-    """A folder with the name of a verb: called, it is the verb."""
-
-    def __call__(self, *args: Any, **keywords: Any) -> Any:
-        return self.__wrapped__(*args, **keywords)
-
-    @property
-    def __wrapped__(self) -> Any:
-        name = self.__name__.rpartition(".")[2]
-        return getattr(import_module(_PUBLIC[name]), name)
-
-
-class _Package(ModuleType):
-    """barpc itself, in which an import of a folder puts it in the place of its verb."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in _FOLDERS and isinstance(value, ModuleType):
-            value.__class__ = _Verb
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+for _folder in ("dsm", "export", "fit", "report"):  # its first import takes the name, its verb's from here on
+    import_module(f"{__name__}.{_folder}")
+    globals().pop(_folder, None)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'barpc' has no attribute {name!r}")
-    return import_module(f"barpc.{name}") if name in _FOLDERS else getattr(import_module(_PUBLIC[name]), name)
+    found = getattr(import_module(_PUBLIC[name]), name)
+    if type(found) is type(__getattr__):
+        found = import_module("barpc.verbs.python").of_python(found)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:

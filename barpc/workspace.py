@@ -181,6 +181,14 @@ class Workspace:
             self._lock.release()
             raise
 
+    @classmethod
+    def require_free(cls, folder: str | Path, overwrite: bool, keep: Iterable[Path], names: Iterable[str]) -> None:
+        """Raise OutputError where a run cannot begin in a folder; nothing is made or written."""
+        self = cls.__new__(cls)
+        self.folder, self._adds = Path(folder).absolute(), False
+        self._keep = frozenset(path.resolve() for path in keep)
+        self._check_free(overwrite, names)
+
     def _check_free(self, overwrite: bool, names: Iterable[str]) -> None:
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder}: is a file; give -o a folder")

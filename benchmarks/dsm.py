@@ -36,9 +36,9 @@ from scipy.ndimage import maximum_filter, minimum_filter
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from barpc.base.verb_options import DsmOptions
-from barpc.dsm import NoSurfaceError, make_dsm, stereo
-from barpc.dsm.stereo import Tile, block_of_images, gathered, surface_tile
-from barpc.dsm.surface import Grid
+from barpc.dsm import stereo
+from barpc.dsm.stereo import NoSurfaceError, Tile, block_of_images, gathered, surface_tile
+from barpc.dsm.surface import Grid, make_dsm
 from barpc.export.shots import read_scene
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import image_file
@@ -132,7 +132,8 @@ def rendered(side: int, kind: str = "usual") -> dict[str, object]:
         made = Ground(side, kind, Path(folder))
         out, call = Path(folder) / "dsm.tif", json.dumps([made.paths, made.alt])
         code = (
-            "import json,sys,time; from barpc.dsm import make_dsm; from barpc.base.verb_options import DsmOptions\n"
+            "import json,sys,time; from barpc.dsm.surface import make_dsm\n"
+            "from barpc.base.verb_options import DsmOptions\n"
             "paths, alt = json.loads(sys.argv[1]); start = time.process_time()\n"
             "make_dsm(paths, sys.argv[2], DsmOptions(alt=tuple(alt))); cpu = time.process_time() - start\n"
             "print(cpu, open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"

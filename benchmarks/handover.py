@@ -28,8 +28,8 @@ from rasterio.warp import transform
 from rasterio.windows import from_bounds
 
 from barpc import read_rpc
-from barpc.export import export_run
 from barpc.export.shots import Scene, Shot, pairs_of, read_scene
+from barpc.export.targets import export_run
 from barpc.rpcio import WRITABLE
 
 Figures = dict[str, list[str]]

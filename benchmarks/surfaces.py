@@ -31,8 +31,8 @@ from rasterio.warp import Resampling, reproject
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from barpc.export import export_run
 from barpc.export.shots import read_scene
+from barpc.export.targets import export_run
 from benchmarks.dsm import nmad
 from benchmarks.handover import S2P
 from benchmarks.real import ROOT, measured

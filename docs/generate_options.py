@@ -1,6 +1,6 @@
-"""Write docs/options.md and docs/man/barpc.1 from the declarations of the options and the verbs' flags.
+"""Write docs/options.md, docs/man/barpc.1 and barpc/base/keywords.py from the declared options and the verbs' flags.
 
-python docs/generate_options.py            # writes both
+python docs/generate_options.py            # writes all
 python docs/generate_options.py --print    # prints the page of options
 """
 
@@ -10,23 +10,26 @@ import argparse
 import inspect
 import re
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import click
 
-from barpc.base.declarations import Options, Rule, declared
+from barpc.base import verb_options
+from barpc.base.declarations import Declared, Options, Rule, declared
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import COMMANDS, cli
 from barpc.cli.flags import ADJUSTMENT, REMOTE, RUN, TIE, field_of, flag_name
+from barpc.verbs.options import FLAG_NAMES
 
 PAGE = Path(__file__).with_name("options.md")
 MANUAL = Path(__file__).parent / "man" / "barpc.1"
+KEYWORDS = Path(verb_options.__file__).with_name("keywords.py")
 TABLES = {"": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions}
 """Table of an options file -> the record it fills; "" is the file's top level."""
 
 HEAD = """# Options
 
-<!-- Written by docs/generate_options.py. Edit barpc/base/options.py, verb_options.py and the verbs' help texts, then run it again. -->
+<!-- Written by docs/generate_options.py from barpc/base/options.py, verb_options.py and the verbs. -->
 
 Every option has a default; a file given with `--options` wins over it, and a flag over both. An unknown name, a wrong
 type or a value out of range is refused before anything is computed. In brackets: what it may hold, and the default.
@@ -39,14 +42,12 @@ rpc_formats = ["txt", "geom"]
 points_per_image = 8000
 ```
 
-From Python the same, with the records named in the headings (`barpc.base.declarations.schema(barpc.RunOptions)`: the JSON
-schema of such a file):
+From Python the same, as keywords of `barpc.adjust` or with the records named in the headings:
 
 ```python
 import barpc
 
-options = barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
-print(options)  # what differs from the defaults
+barpc.RunOptions(adjust=barpc.AdjustOptions(sigma_attitude=3.0))
 ```
 """
 
@@ -136,6 +137,63 @@ def page() -> str:
     return "\n".join(lines) + "\n"
 
 
+KEYWORD_HEAD = '''"""The keywords of the verbs, for type checkers. Written by docs/generate_options.py: edit the records of options."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypedDict
+
+from barpc.base.options import AdjustOptions, FitOptions, TieOptions
+
+PathLike = str | os.PathLike[str]
+Files = PathLike | Sequence[PathLike]
+'''
+
+
+def keyword_type(one: Declared) -> str:
+    """Return what a keyword takes, as a type checker reads it."""
+    kind, of_path = one.kind, one.rule.unit in ("file", "dir")
+    if isinstance(one.default, Options):
+        return f"{kind.__name__} | Mapping[str, Any]"
+    if get_origin(kind) is Literal:
+        found = str(kind).removeprefix("typing.").replace("'", '"')
+    elif get_origin(kind) is tuple:
+        found = "Files" if of_path else f"Sequence[{get_args(kind)[0].__name__}]"
+    else:
+        found = "PathLike" if of_path else kind.__name__
+    return f"{found} | None" if one.optional else found
+
+
+def keywords() -> str:
+    """Return the module of the keywords: a TypedDict a verb, or what several verbs share."""
+    run = {
+        name: one
+        for record in (TieOptions, AdjustOptions, FitOptions, RunOptions)
+        for name, one in declared(record).items()
+    }
+    verbs: dict[str, dict[str, Declared]] = {"Run": run | {flag: run[name] for name, flag in FLAG_NAMES.items()}}
+    for name, record in vars(verb_options).items():
+        if getattr(record, "__module__", "") == verb_options.__name__ and record is not verb_options.HeightOptions:
+            more = declared(FitOptions) if record is verb_options.RefitOptions else {}
+            verbs[name.removesuffix("Options")] = {**more, **declared(record)}
+    parts = [KEYWORD_HEAD]
+    for name, known in verbs.items():
+        lines = [f"    {field}: {keyword_type(one)}" for field, one in known.items()]
+        words = "every run" if name == "Run" else f"`{name}Options`"
+        parts += [
+            "\n".join(
+                [
+                    f"\n\nclass {name}Keywords(TypedDict, total=False):",
+                    f'    """Keywords of {words}."""',
+                    "",
+                    *lines,
+                    "",
+                ]
+            )
+        ]
+    return "".join(parts)
+
+
 def roff(text: str) -> str:
     """Plain text as a line of a manual page: a dash is one to be typed, a dot in front is no macro."""
     text = re.sub(r"\s+", " ", text).replace("\\", "\\e").replace("-", "\\-")
@@ -173,6 +231,7 @@ def main() -> None:
     else:
         PAGE.write_text(page(), encoding="utf-8")
         MANUAL.write_text(manual(), encoding="utf-8")
+        KEYWORDS.write_text(keywords(), encoding="utf-8")
 
 
 if __name__ == "__main__":

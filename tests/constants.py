@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from types import ModuleType
 from typing import Any, TypeVar
 from unittest import mock
 
@@ -42,6 +44,12 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
 """Record -> name -> where the constant is read."""
 
 
+def home(place: str) -> tuple[ModuleType, str]:
+    """The module of a constant, and its name there: `barpc.fit` is a verb, and leads to no module."""
+    module, _, name = place.rpartition(".")
+    return import_module(module), name
+
+
 @contextmanager
 def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
     """The record of options; values of constants hold as long as the context does."""
@@ -50,7 +58,7 @@ def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
             if name in values:
                 value = values.pop(name)
                 for place in places:
-                    stack.enter_context(mock.patch(place, value))
+                    stack.enter_context(mock.patch.object(*home(place), value))
         yield record(**values)
 
 
@@ -116,6 +124,6 @@ def sized(monkeypatch: pytest.MonkeyPatch) -> Sized:
     def put(**values: Any) -> None:
         for name, value in values.items():
             for place in SIZES[name]:
-                monkeypatch.setattr(place, value)
+                monkeypatch.setattr(*home(place), value)
 
     return put

@@ -1,4 +1,4 @@
-"""The entry: tracks in, corrections out."""
+"""The entry point of bundle adjustment: from tracks to corrected cameras."""
 
 from __future__ import annotations
 
@@ -63,20 +63,20 @@ def adjust_tracks(
     views, tracks : sequence of View, Tracks
         N views and their tie points; `Tracks.view` counts the views.
     options : AdjustOptions or None, None: the defaults
-    gcps : GroundPoints or None, points of known position and where they are seen
+    gcps : GroundPoints or None, points of known position with their image coordinates
     dem : callable or None, lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside
     centers : (N, 3) or None, camera centres [m], ECEF; None: regressed from the sensors
     prior : BlockPrior or None
         An earlier block, some of whose views are among these: their corrections and joint covariance are the prior,
         and they need no tie points. `tracks` then holds tie points with a new view only.
     known : (K,) or None
-        Observations of its views that the earlier block was learnt from, or may have been: of these counts what they
-        tell with the others, and not again what they tell alone. None: all are new.
-    reference : Reference or None, control of an orthoimage and the terrain `dem`
-    altimetry : Altimetry or None, heights that no image coordinates go with
+        Observations that `prior` contains, or may contain: only their information together with new ones is added.
+        None: all are new.
+    reference : Reference or None, points matched in an orthoimage, with heights of `dem`
+    altimetry : Altimetry or None, heights without image coordinates
     keep_largest, hold_out : bool
-        Go on with the largest group of connected views; keep a tenth of the tracks out, to measure the result on.
-    common : CommonErrors or None, errors that images have in common, of what was taken off `tracks` before
+        Continue with the largest group of connected views; hold out a tenth of the tracks, to check the result.
+    common : CommonErrors or None, uncertainty of errors common to images that were removed from `tracks` before
 
     Returns
     -------
@@ -111,7 +111,7 @@ def adjust_tracks(
 
 
 def consistent_observations(views: Sequence[View], tracks: Tracks, options: AdjustOptions | None = None) -> BoolArray:
-    """Return which observations (K,) agree with the cameras as they are: an adjustment that moves none would use them.
+    """Return the mask (K,) of inliers with the cameras fixed as delivered.
 
     Errors as of `adjust_tracks`.
     """
@@ -123,7 +123,7 @@ def consistent_observations(views: Sequence[View], tracks: Tracks, options: Adju
 def _solved_adjustment(
     parts: Parts, options: AdjustOptions, solve: Solver, altimetry: Altimetry | None, common: CommonErrors | None
 ) -> Adjustment:
-    """Return the block solved by the model that the data choose, held by heights too where there are some."""
+    """Solve the block with the selected model, and with altimetry if given."""
     given = parts.inner, parts.outer
     try:
         model = select_model(parts, options, solve)
@@ -145,7 +145,7 @@ def _solved_adjustment(
 
 
 def _warn(outcome: Outcome) -> None:
-    """Warn where the last solve did not settle, or its priors were not learnt."""
+    """Warn if the last solve did not converge, or prior variances could not be estimated."""
     if not outcome.settled:
         message = f"the adjustment did not settle in {ITERATIONS} steps: check its residuals before its result is used"
         warnings.warn(message, BarpcWarning, stacklevel=4)
@@ -157,9 +157,9 @@ def _warn(outcome: Outcome) -> None:
 def _with_apart(
     whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block]
 ) -> Adjustment:
-    """Return the result with the view that the others were adjusted without: adjusted alone, or as delivered.
+    """Return the result with the foreign view added: resected, or as delivered.
 
-    `parts` have its observations, those that might take part and those kept out; it is measured on the others' points.
+    `parts` are the adjusted and the held-out observations with that view. Its residuals are at the others' points.
     """
     v, params = apart.view, whole.params.copy()
     placed = None if apart.placed is None else resect(found, others, parts[0], v)
@@ -186,14 +186,14 @@ def _with_apart(
     scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
     scale[v], odd[v] = apart.scale, apart.scale > 1.0
     tested = replace(whole.prior, scale=scale, odd=odd)
-    told = replace(apart, placed=placed)
-    return replace(whole, apart=told, params=params, sensors=sensors, prior=tested, **new)
+    as_resected = replace(apart, placed=placed)
+    return replace(whole, apart=as_resected, params=params, sensors=sensors, prior=tested, **new)
 
 
 def _adjustment(
     model: SelectedModel, found: Solution, options: AdjustOptions, common: CommonErrors | None
 ) -> Adjustment:
-    """Assemble the `Adjustment`, its points and observations in the order of the tracks given."""
+    """Assemble the `Adjustment`, with points and observations in the order of the input tracks."""
     parts, outcome, final = model.parts, found.outcome, found.final
     block = parts.inner
     covariance = outcome.covariance(found.problem.free)
@@ -247,9 +247,9 @@ def _adjustment(
 
 
 def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
-    """Return the points (P, 3) [m], NaN where nothing was kept, and the residuals of all observations before and after.
+    """Return the points (P, 3) [m], NaN without an inlier, and the residuals of all observations before and after.
 
-    Those of check tie points and of moving groups are of points triangulated anew.
+    For check tie points and moving groups, points are triangulated with the cameras fixed.
     """
     outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
     moved = [measure(found.problem, params, parts.apart) for params in cameras]
@@ -265,12 +265,13 @@ def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, 
 
 
 def _neighbour_correlation(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
+    """Return the evidence (N,) [nats] that rejected tie points of an image are displaced like their neighbours."""
     wrong = is_tie & block.use & ~outcome.inlier & np.isfinite(outcome.residual).all(axis=0)
     return neighbours_alike(block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views))
 
 
 def _reported_findings(found: Solution, parts: Parts, points: Array) -> Iterator[Finding]:
-    """Yield the findings as they are reported, with the place and size of a motion."""
+    """Yield the findings for the report; a moving group as its position and size."""
     number = 0
     for one in found.findings:
         if one.moved is None:
@@ -283,7 +284,7 @@ def _reported_findings(found: Solution, parts: Parts, points: Array) -> Iterator
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
-    """Return the tests of GCPs and of a reference's points, whose observations (M + R,) were kept or not."""
+    """Return the fields of `Adjustment` on GCPs and reference points; `inlier` (M + R,) is of their observations."""
     w, gcps = block.in_order(_control_w(found, block, covariance.of_noise)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
@@ -297,7 +298,7 @@ def _control(found: Solution, block: Block, covariance: Covariance, inlier: Bool
 
 
 def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
-    """Return Baarda's w (K,) of the observations of known points; NaN for all others, and those that do not count."""
+    """Return Baarda's w (K,) of the observations of known points; NaN for others, outliers and those not sampled."""
     outcome, w = found.outcome, np.full(len(block.point), np.nan)
     held = outcome.problem.point_prior
     is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
@@ -311,7 +312,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Report the motion and accuracy of the scene and their sources; an earlier run keeps its own scene."""
+    """Return motion and accuracy of the scene, and the shares of their sources; a continued run keeps its own scene."""
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _with_survey_errors(_datum_report(found, block, covariance), found, block)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
@@ -319,9 +320,9 @@ def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tu
 
 
 def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> GaugeReport:
-    """Return the accuracy of a scene with the errors that ground control points of one survey have in common.
+    """Return the accuracy of a scene with the common errors of GCPs from one survey.
 
-    They are worth `MAX_INDEPENDENT_ERRORS` independent points, at most: of thousands the place is no better known.
+    These weigh no more than `MAX_INDEPENDENT_ERRORS` independent points, however many there are.
     """
     used = np.ones(len(block.gcps.names), dtype=bool) if found.tested is None else found.tested.used
     if not found.heights.has_control or used.sum() <= MAX_INDEPENDENT_ERRORS:
@@ -333,11 +334,12 @@ def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> Ga
 
 
 def _datum_report(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:
+    """Return motion and accuracy of the scene without common errors of GCPs."""
     joint = found.problem.joint_prior
     if joint is not None and joint.scene is not None:
         return earlier_scene(covariance, joint, joint.scene, found.final.params)
     number = np.arange(len(found.seen))
-    # places that were given do not move with the cameras: they tell of the scene only where nothing else does
+    # known points do not move with the cameras: they represent the scene only if there are no tracks
     kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
     counted = next((kind for kind in kinds if kind.any()), found.seen)
     prior = found.outcome.problem.camera_prior.sigma

@@ -1,4 +1,4 @@
-"""Resection of one view by the points that the other views agree on, and a diagnosis of its RPC."""
+"""Resection of one view by the ground points of the other views, and a diagnosis of its RPC."""
 
 from __future__ import annotations
 
@@ -21,45 +21,44 @@ from barpc.sensor.image_corrections import bsplines
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A view whose camera was estimated alone against known points."""
+    """A resected view: its camera was estimated alone, from known ground points."""
 
-    params: Array  # (q,)
-    covariance: Array  # (q, q) with the points as they are
-    rows: BoolArray  # (K,) of the block: its observations of points that the others know
-    xy: Array  # (2, n) where these are [px]
-    squared: Array  # (n,) squared residuals of these over their variances
-    left: Array  # (2, n) residuals where splines over the rows follow what the camera does not, over their sigmas
-    noise: float  # observed over stated standard deviation of the residuals, by the median
+    params: Array  # (q,) unknowns of the camera
+    covariance: Array  # (q, q) of these, uncertainty of the points included
+    rows: BoolArray  # (K,) of the block: the n observations used
+    xy: Array  # (2, n) their image coordinates [px]
+    squared: Array  # (n,) squared residuals over variances
+    left: Array  # (2, n) residuals over sigmas of a second fit, with splines over the rows
+    noise: float  # observed over expected standard deviation of the residuals, by the median
 
     @property
     def meets(self) -> bool:
-        """Whether it meets the points to the noise."""
+        """Whether the camera fits the points to the noise."""
         return self.noise < MUCH_NOISE
 
     def agree(self, limit: float) -> BoolArray:
-        """Return the observations (n,) within a number of standard deviations."""
+        """Return the mask (n,) of observations within `limit` standard deviations."""
         return np.asarray(self.squared <= 2.0 * limit * limit)
 
     def contradicted(self, limit: float) -> float:
-        """Return the share of observations beyond a number of standard deviations and a smooth displacement of rows."""
+        """Return the share of observations beyond `limit` standard deviations of the fit with splines."""
         return float(self._far(limit).mean())
 
     def is_coherent(self, limit: float) -> bool:
-        """Return whether observations beyond that are displaced like their neighbours: the camera is wrong,
-        not the matches.
+        """Return whether outliers have residuals like their neighbours: then the camera is wrong, not the matches.
 
-        Errors that know nothing of each other differ by 1.4 times what they are.
+        Independent residuals differ by 1.4 times their size; coherent ones by less than it.
         """
         seen = np.asarray(np.isfinite(self.left).all(axis=0))
-        if seen.mean() < 0.5:  # it does not see the place at all
+        if seen.mean() < 0.5:  # most points are outside the domain of the camera
             return True
         far = self._far(limit) & seen
         if far.sum() < FEW:
             return False
         left = self.left[:, far].T
         nearest = np.asarray(kd_tree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
-        apart, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
-        return bool(np.median(apart) < np.median(size))
+        difference, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
+        return bool(np.median(difference) < np.median(size))
 
     def _far(self, limit: float) -> BoolArray:
         return ~np.asarray((self.left**2).sum(axis=0) <= 2.0 * limit * limit)
@@ -67,29 +66,25 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class RpcDiagnosis:
-    """A diagnosis of a view's RPC: as accurate as stated, by an offset, other heights or swapped axes, or not at all.
+    """The change that makes the RPC of a view as accurate as stated; unknown if all fields have their defaults."""
 
-    Where it is, and more than half of its tie points contradict the others', these may be wrong as well as it.
-    """
-
-    offset: Array | None = None  # (2,) col, row [px] by which it puts points too far
-    height: float | None = None  # [m] by which its heights are too high, where that explains as much
-    swapped: bool = False
-    as_stated: bool = False
+    offset: Array | None = None  # (2,) col, row [px] of projected minus observed points
+    height: float | None = None  # [m] by which heights are too high, if that explains the offset
+    swapped: bool = False  # whether col and row are exchanged
+    as_stated: bool = False  # no change: then its tie points may be wrong instead of the RPC
 
 
 def retained_tracks(found: Solution, block: Block) -> BoolArray:
-    """Return the tracks (P,) with two or more observations kept."""
+    """Return the mask (P,) of tracks with two or more inliers."""
     kept = np.bincount(block.point[found.outcome.inlier], minlength=block.num_points) >= 2
     kept[block.num_tracks :] = False
     return kept
 
 
 def resect(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
-    """Estimate the camera of a view alone against the points of a solution of the `others`; None with too few
-    of them.
+    """Resect a view by the ground points of a solution of the `others`; None with too few common points.
 
-    Its camera is as good as free. Residuals are judged by the others' noise and what their points are known to.
+    The camera prior is so wide that it hardly acts. Variances of residuals are those of the noise and of the points.
     """
     rows = (block.view == view) & retained_tracks(found, others)[block.point]
     unknowns = found.problem.cameras.unknowns
@@ -104,12 +99,12 @@ def resect(found: Solution, others: Block, block: Block, view: int) -> Placed | 
 
 
 def median_noise(squared: Array) -> float:
-    """Return the observed over expected standard deviation, by the median of squares (n,) of two coordinates each."""
+    """Return the observed over expected standard deviation, from the median of squares (n,) of two coordinates."""
     return float(np.sqrt(np.median(squared) / chdtri(2.0, 0.5)))
 
 
 class _Sight:
-    """One view's observations of points that others know."""
+    """Observations of one view, of ground points from the other views, with covariances."""
 
     def __init__(self, found: Solution, others: Block, block: Block, view: int, rows: BoolArray) -> None:
         self.problem, self.view, self.xy = found.problem, view, block.xy[:, rows]
@@ -130,15 +125,14 @@ class _Sight:
         return self.cameras.project(params, self.ecef, self.bounds)
 
     def fit(self, splines: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return the view's unknowns (q,), their covariance, and residuals (2, n) over their standard
-        deviations.
+        """Return the unknowns (q,) of the view, their covariance, and residuals (2, n) over standard deviations.
 
-        Robust, as rounds are (`barpc.ba.robust.rounds`): beside them splines (m, n) move columns and rows.
+        Robust, with a scale that shrinks as in `barpc.ba.robust.rounds`. `splines` (m, n) also displace col and row.
         """
         params = self.problem.camera_prior.mean.copy()
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines
         size, m = params.shape[1], len(beside)
-        # a row may be anywhere near, in px
+        # wide priors: of the camera, and of splines [px]
         sigma = np.append(GROSS * self.problem.camera_prior.sigma[self.view], np.full(2 * m, TIMES))
         moved, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
         matrix = np.diag(sigma**-2.0)
@@ -169,10 +163,10 @@ class _Sight:
 
 
 def diagnose_rpc(found: Solution, block: Block, placed: Placed, view: int) -> RpcDiagnosis:
-    """Find the one change with which a view's RPC is as good as stated.
+    """Find the one change with which the RPC of a view is as accurate as stated.
 
-    Each is asked of the delivered camera at the points of the others: half of these are then met to what the camera is
-    stated to be known to.
+    Each change is applied to the delivered camera at the ground points of the others. The median residual must then be
+    below the stated accuracy.
     """
     problem, point = found.problem, block.point[placed.rows]
     xy = block.xy[:, placed.rows]
@@ -186,20 +180,21 @@ def diagnose_rpc(found: Solution, block: Block, placed: Placed, view: int) -> Rp
     constants = problem.cameras.unknowns.constants
     metres = float(np.sqrt((problem.camera_prior.sigma[view, :constants:3] ** 2).sum()))
     stated = metres * float(np.nanmedian(np.linalg.norm(projected.by_point, axis=1)))
-    if not placed.meets and _half(off) < SURELY * stated:
+    if not placed.meets and _median_length(off) < SURELY * stated:
         return RpcDiagnosis(as_stated=True)
     swapped = projected.image[::-1] - xy
-    if _half(swapped) < SURELY * stated < _half(off):
+    if _median_length(swapped) < SURELY * stated < _median_length(off):
         return RpcDiagnosis(swapped=True)
     offset = np.nanmedian(off, axis=1)
-    if not (_half(off - offset[:, None]) < stated):
+    if not (_median_length(off - offset[:, None]) < stated):
         return RpcDiagnosis()
     height = float(np.nanmedian((by_height * off).sum(axis=0) / (by_height**2).sum(axis=0)))
-    explains = _half(off - height * by_height) < stated and abs(height) < GEOID  # no mistaken height surface is farther
+    near = abs(height) < GEOID  # height surfaces differ by less
+    explains = near and _median_length(off - height * by_height) < stated
     return RpcDiagnosis(offset=offset, height=height if explains else None)
 
 
-def _half(off: Array) -> float:
-    """Return the median length of the offsets (2, n) [px]; infinity for an offset that is none."""
+def _median_length(off: Array) -> float:
+    """Return the median length of residuals (2, n) [px]; those that are not finite count as infinite."""
     length = np.linalg.norm(off, axis=0)
     return float(np.median(np.where(np.isfinite(length), length, np.inf)))

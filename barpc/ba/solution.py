@@ -1,4 +1,4 @@
-"""A block solved with one model: its start, the rounds of rejection, and its residuals."""
+"""The solution of a block with one model: start, rounds of outlier rejection, residuals."""
 
 from __future__ import annotations
 
@@ -29,53 +29,53 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
-_FAR_OFF = 150.0  # m: no camera is delivered so
-_TREND = MUCH_NOISE * NOISE_FLOOR  # px: another model is tried
-_SKEW = 1e-3  # of half an image's length, as drift: 3 microradian a second
-MUCH_BETTER = 0.7  # of the error on tracks that took no part: another model may do much to heights
-CLEARLY = 0.8  # of what is left, that another start or model leaves at most; or of a view's observations, kept at least
+_FAR_OFF = 150.0  # m: offset from a reference beyond the accuracy of delivered cameras
+_TREND = MUCH_NOISE * NOISE_FLOOR  # px: systematic residuals above it make other models be tried
+_SKEW = 1e-3  # of half the length of an image, of a drift: 3 microradian a second
+MUCH_BETTER = 0.7  # largest ratio of check residuals at which another model is accepted that may change heights
+CLEARLY = 0.8  # the same ratio for another start or model; also least share of inliers of a view
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A block solved with one model: its start, its rounds, and its residuals."""
+    """A block solved with one model."""
 
-    problem: Problem  # as it was solved last
-    state: State  # where it started: delivered cameras, points triangulated with them
-    before: Array  # (2, K) residuals there [px]
-    heights: PointConstraints  # what holds points
+    problem: Problem  # of the last solve
+    state: State  # at the start: delivered cameras, points triangulated with them
+    before: Array  # (2, K) residuals at the start [px]
+    heights: PointConstraints  # priors on points
     outcome: Outcome  # of the rounds
-    start: HeldOut  # what the tracks that took no part say before
-    after: HeldOut  # and after
-    tested: ControlTest | None  # control points against the rest
-    # "drift", "jitter" -> what was smooth before another degree was taken, splines or steps followed
+    start: HeldOut  # residuals of check tie points at the start
+    after: HeldOut  # and at the end
+    tested: ControlTest | None  # tests of control points
+    # "drift", "jitter" -> systematic residuals for which the degree was raised, or splines and steps were added
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
-    findings: tuple[Finding, ...] = ()  # what explains ties beside the cameras, the first taken first
-    agreed: Agreement | None = None  # which control points hold it
-    deformed: Deformation | None = None  # by control
+    findings: tuple[Finding, ...] = ()  # terms and moving groups, in order of selection
+    agreed: Agreement | None = None  # control points in use
+    deformed: Deformation | None = None  # of an image by control
 
     @property
     def final(self) -> State:
-        """The minimum."""
+        """The state at the end."""
         return self.outcome.state
 
     @property
     def goes_on(self) -> bool:
-        """Whether it goes on from an earlier block."""
+        """Whether it continues an earlier run."""
         return self.problem.joint_prior is not None and self.problem.joint_prior.earlier
 
     @property
     def seen(self) -> BoolArray:
-        """Points (P,) with an observation that was kept."""
+        """Mask (P,) of points with an inlier."""
         seen = np.zeros(self.problem.structure.num_points, dtype=bool)
         seen[self.problem.structure.point[self.outcome.inlier]] = True
         return seen
 
     def first_points(self, block: Block, some: BoolArray) -> Array:
-        """Return the points (P, 3) [m] that the delivered cameras give for where the adjusted ones show them.
+        """Return the points `some` (P,) triangulated by the delivered cameras, (P, 3) [m]; NaN for others.
 
-        NaN for the others. Nothing but the cameras moves between the two: no observation that was cut, no place that
-        was given, and no height where the rays of a point tell none.
+        Observations are the projections by the adjusted cameras, without priors but for the altitude of weak points.
+        So the difference to the adjusted points is that of the cameras alone.
         """
         points, shown, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
         mended = replace(self.problem, xy=shown, point_prior=staying(points, np.flatnonzero(some & weak)))
@@ -86,32 +86,32 @@ class Solution:
 
     @property
     def has_trend(self) -> bool:
-        """Whether systematic residuals are left that another model may explain: smooth, or of rejected observations."""
+        """Whether residuals are systematic, or larger at check tie points, so that another model may be better."""
         return bool(self.outcome.smooth.found(_TREND).any()) or self._meets_worse
 
     @property
     def has_waves(self) -> bool:
-        """Whether neighbours share something that splines over the rows or steps between detectors may follow.
+        """Whether neighbouring residuals are correlated, so that splines or detector steps may explain them.
 
-        Observations of a view that shakes may be rejected: check tie points have it then.
+        Observations of a view with jitter may be rejected; then the residuals of check tie points are larger.
         """
         tested = self.outcome.smooth
         return bool((tested.found(_TREND) | (tested.shared > _TREND)).any()) or self._meets_worse
 
     @property
     def _meets_worse(self) -> bool:
-        """Whether check tie points are met surely worse than those in use."""
+        """Whether residuals of check tie points are much larger than those of the inliers."""
         return self.after.error > MUCH_NOISE * self.outcome.noise
 
     @property
     def is_skew(self) -> bool:
-        """Whether the drift that was learnt shears images more than a platform does: one of them was turned."""
+        """Whether the estimated drift shears images more than platforms do, as where an image was resampled."""
         learnt = self.outcome.prior.drift_sigma
         if not learnt or learnt[0] < 2.0 * DRIFT_SIGMA:
             return False
         problem = self.problem
         by_point = problem.project_points(self.final.params, self.final.points).by_point
-        pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # a metre
+        pixels = float(np.nanmedian(np.linalg.norm(by_point[1], axis=0)))  # per metre
         return learnt[0] > _SKEW * float(np.median(problem.cameras.unknowns.half[1])) / pixels
 
 
@@ -123,11 +123,10 @@ def solve_block(
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> Solution:
-    """Solve a block with the model of the options, again from an agreement or with more drift where residuals
-    ask for it.
+    """Solve a block with the model of the options: with tie points first, then with the consistent control points.
 
-    By its tie points first; then with the control points that agree with each other there. Measured on the
-    observations of `outer`.
+    Where residuals suggest it, solved again from a consensus of observations, or with a higher degree of the drift.
+    `outer` has the check observations.
     """
     problem = make_problem(block, options, centers, prior)
     state, given = first_state(_placed(problem, block), block, options, dem)
@@ -135,7 +134,7 @@ def solve_block(
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
     before, agreed, free = rounds.residual, None, None
-    if block.gcps.names and not (block.point < block.num_tracks).any():  # control is all that holds the cameras
+    if block.gcps.names and not (block.point < block.num_tracks).any():  # only control constrains the cameras
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, heights, block.use)
     outcome = rounds.run()
@@ -165,9 +164,9 @@ def solve_block(
 
 
 def _placed(problem: Problem, block: Block) -> Problem:
-    """Return the problem with cameras translated by their offsets from a reference, where these are large.
+    """Return the problem with cameras translated by their offsets from a reference, if these are large.
 
-    From hundreds of metres away no step from the delivered cameras lowers the cost.
+    Hundreds of metres are beyond the convergence radius of the adjustment.
     """
     unknowns = problem.cameras.unknowns
     if block.reference is None or not unknowns.translates or problem.joint_prior is not None:
@@ -185,9 +184,9 @@ def _placed(problem: Problem, block: Block) -> Problem:
 
 
 def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
-    """Return the block; solved again with the drift priors of the tie points alone where control deforms an image.
+    """Return the solution; if control deforms an image, solved again with drift priors from the tie points alone.
 
-    Where there are no tie points, control points that agree are all that shows a drift.
+    Without tie points the control points determine the drift.
     """
     heights, problem = found.heights, found.problem
     if not heights.kinds or not (block.point < block.num_tracks).any():
@@ -210,7 +209,7 @@ def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
 def _with_more_drift(
     solved: tuple[Problem, Outcome], block: Block, options: AdjustOptions, heights: PointConstraints
 ) -> tuple[Problem, Outcome]:
-    """Return the block solved with a drift of one degree more; as it was where few of its observations agree then."""
+    """Return problem and outcome with one degree of drift more; those given if most inliers are lost by it."""
     problem, outcome = solved
     unknowns = problem.cameras.unknowns
     more = make_problem(block, options, unknowns.center, None, unknowns.drift + 1)
@@ -218,12 +217,12 @@ def _with_more_drift(
     there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
     there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
     tried = Rounds(more, block, there, heights, outcome.inlier).run()
-    # the few left of many agree with anything
+    # few remaining observations fit any model
     return (more, tried) if tried.inlier.sum() > 0.5 * outcome.inlier.sum() else solved
 
 
 def _check_inliers(outcome: Outcome, block: Block) -> None:
-    """Raise AdjustError where the cuts leave no control, and no view the tie points that a camera takes."""
+    """Raise AdjustError if no control and in no view enough tie points are inliers."""
     kept = np.bincount(block.view[outcome.inlier])
     if kept.max(initial=0) < MIN_OBSERVATIONS and not (block.point[outcome.inlier] >= block.num_tracks).any():
         raise AdjustError(
@@ -235,10 +234,10 @@ def _check_inliers(outcome: Outcome, block: Block) -> None:
 def _without_distorting_control(
     found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions
 ) -> Solution:
-    """Return the block constrained by control; that `free` of it where residuals of check tie points grow by it."""
+    """Return the constrained solution, or the one `free` of control if control raises check residuals."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
-    # ties of a view are worth 1 / noise_floor^2 in all: its q unknowns are known to q noise_floor^2 [px^2] by them
+    # allowed increase [px^2]: the common error noise_floor of the tie points of a view, for each of its q unknowns
     known = free.final.params.shape[1] * options.noise_floor**2
     if raised <= known or not is_better(without, found.after, outer):
         return found
@@ -248,24 +247,24 @@ def _without_distorting_control(
 
 
 def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
-    """Return the control points that agree at an outcome without control, and the constraints on points."""
+    """Return the control points that are consistent with an outcome without control, and the constraints with these."""
     every, first = np.arange(len(block.gcps.names)), block.num_tracks
     of = block.point - first
-    lost = np.isin(every, of[block.use & ~outcome.inlier])  # by hundreds of sigmas
-    told = np.isin(every, of[outcome.inlier]) & ~lost
-    # on ground that moves: seen, and excluded with it
-    gone = np.isin(every, block.gcps.point) & ~np.isin(every, of[block.use])
+    rejected = np.isin(every, of[block.use & ~outcome.inlier])  # outliers by hundreds of sigmas
+    known = np.isin(every, of[outcome.inlier]) & ~rejected
+    # observed, but on moving ground that was excluded
+    moving = np.isin(every, block.gcps.point) & ~np.isin(every, of[block.use])
     covariance = outcome.covariance(outcome.problem.free)
     faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
-    found = agreement(offsets_of(covariance, block, outcome.state.points, faint), told)
-    found = replace(found, used=found.used & ~lost & ~gone)
+    found = agreement(offsets_of(covariance, block, outcome.state.points, faint), known)
+    found = replace(found, used=found.used & ~rejected & ~moving)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
     return found, replace(heights, control=(kept, *heights.control[1:]), has_control=bool(found.used.any()))
 
 
 def finished(found: Solution, problem: Problem, block: Block, outer: Block, outcome: Outcome) -> Solution:
-    """Complete the rounds of a problem: control tested, held-out tracks measured; the start is that of `found`."""
+    """Return `found` with the outcome of a problem, control points tested and check residuals measured."""
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.covariance(problem.free), outcome.state.points
@@ -276,6 +275,6 @@ def finished(found: Solution, problem: Problem, block: Block, outer: Block, outc
 
 
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
-    """Return whether the rounds may have ended between two solutions: much noise, or a view that lost much."""
+    """Return whether the rounds may have ended in a local minimum: much noise, or a view with many outliers."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
     return outcome.noise > MUCH_NOISE or bool((kept < CLEARLY * had).any())

@@ -86,6 +86,14 @@ class OutputError(BarpcError, OSError):
     """A result cannot be written: it exists already, the disk is full, the folder is read-only."""
 
 
+class ReservationError(BarpcError):
+    """A run has a reservation (exit code 3), which `check=True` makes an error: `result`, whose files are written."""
+
+    def __init__(self, message: str, result: object = None) -> None:
+        super().__init__(message)
+        self.result = result
+
+
 class BarpcWarning(UserWarning):
     """Something the user should know that does not stop the run."""
 

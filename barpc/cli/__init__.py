@@ -47,7 +47,7 @@ COMMANDS = {
     "ortho": "Orthoimages on one grid, by GDAL's warper.",
     "calibrate": "Estimate a sensor's interior distortion from finished runs.",
     "verify": "Whether inputs, outputs and cameras of a run are unchanged.",
-    "report": "Make report.html of a finished run again, or compare two runs.",
+    "report": "Make report.html of a run again, compare two, or list many.",
 }
 """Verb -> its line in `barpc --help`; the code is the function `<verb>` of `barpc.cli.<verb>`, or of these:"""
 _COMMAND_MODULES = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +14,20 @@ from barpc.cli.process import Kept
 from barpc.cli.terminal import EXIT_GATE, at_work, is_quiet, output_width, print_summary, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
-    from barpc.pipeline import AdjustResult
+    from barpc.pipeline import AdjustResult, Plan
 
+MOST_PAIRS = 10  # of a plan on the terminal
 _images_argument = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
 _out_dir = click.option("-o", "--out-dir", "--output", required=True, metavar="DIR", help="Folder for the results.")
 
 
 @click.command("adjust", cls=Grouped)
 @_images_argument
-@_out_dir
+@click.option("-o", "--out-dir", metavar="DIR", help="Folder for the results; needed unless with --dry-run.")
 @paper
+@click.option("--dry-run", is_flag=True, help="Say pairs, time, memory, datum and doubts; write nothing.")
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
-def adjust(**flags: Any) -> int:
+def adjust(dry_run: bool, **flags: Any) -> int:
     r"""Correct the cameras of overlapping images and write fresh RPCs.
 
     Tie points are matched across the images, a bundle adjustment estimates a rotation and a translation of
@@ -44,7 +47,9 @@ def adjust(**flags: Any) -> int:
     """
     from barpc.verbs import runs
 
-    return _run_pipeline(runs.adjust, flags)
+    if flags["out_dir"] is None and not dry_run:
+        raise click.MissingParameter(param_type="option", param_hint="'-o' / '--out-dir'")
+    return _run_pipeline(runs.plan, flags, _tell_plan) if dry_run else _run_pipeline(runs.adjust, flags)
 
 
 @click.command("match", cls=Grouped)
@@ -81,14 +86,26 @@ def check(**flags: Any) -> int:
     return _run_pipeline(runs.check, flags)
 
 
-def _run_pipeline(work: Callable[..., AdjustResult], flags: dict[str, Any]) -> int:
+def _run_pipeline(work: Callable[..., Any], flags: dict[str, Any], tell_of: Callable[[Any], int] | None = None) -> int:
     """Run a verb of the pipeline with the options of the flags, and print the result."""
     options, where = run_options(flags, flags["options_file"]), [flags["out_dir"]] if "out_dir" in flags else []
     images = image_paths(flags["images"], flags["image_list"], options.keep_going)
     kept = click.get_current_context().find_object(Kept) or Kept()
-    kept.folder = Path(where[0]) if where else None
+    kept.folder = Path(where[0]) if where and where[0] else None
     with at_work() as progress:
-        return _tell_result(work(images, *where, options, jobs=flags["jobs"], progress=kept.following(progress)))
+        result = work(images, *where, options, jobs=flags["jobs"], progress=kept.following(progress))
+        return (tell_of or _tell_result)(result)
+
+
+def _tell_plan(plan: Plan) -> int:
+    rows = (f"{a} - {b}: {share:.0%} in common, {angle:.1f} deg" for a, b, share, angle in plan.pairs[:MOST_PAIRS])
+    more = [f"and {len(plan.pairs) - MOST_PAIRS} more (--json has all)"] * (len(plan.pairs) > MOST_PAIRS)
+    fast, slow = plan.cpu_seconds
+    cost = f"about {fast:.0f} to {slow:.0f} CPU s and {plan.memory_mb / 1000:.1f} GB"
+    pairs = f"{len(plan.pairs)} pair{'s' * (len(plan.pairs) != 1)} to match first"
+    head = f"{len(plan.views)} image{'s' * (len(plan.views) != 1)}, {pairs}: {cost}"
+    tell(asdict(plan), head, *rows, *more, *plan.datum)
+    return tell_gate("the input has reservations:", list(plan.doubts)) if plan.doubts else 0
 
 
 def _tell_result(result: AdjustResult) -> int:

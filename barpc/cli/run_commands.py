@@ -19,33 +19,36 @@ _TARGET_NAMES = ("satnerf", "colmap", "s2p", "cars", "asp", "stac", "points")
 
 
 @click.command("report")
-@click.argument("run_dir", metavar="RUN_DIR")
-@click.argument("other", required=False, metavar="[OTHER_RUN]")
-def report(run_dir: str, other: str | None) -> int:
-    r"""Make report.html of a finished run again, from its summary.json and tables; or compare two runs.
+@click.argument("run_dirs", nargs=-1, required=True, metavar="RUN [OTHER_RUN]")
+@click.option("--csv", is_flag=True, help="A line for each of any number of runs: verdict, figures, reasons.")
+def report(run_dirs: tuple[str, ...], csv: bool) -> int:
+    r"""Make report.html of a finished run again, from its summary.json and tables; compare two runs; or list many.
 
-    Two finished runs of the same images are compared on the terminal: errors, cameras, options.
+    Two finished runs of the same images are compared on the terminal: errors, cameras, options. Exit code 3 with
+    --csv: a folder holds no finished run; its line has the reason.
 
     \b
     Examples:
       barpc report adjusted
       barpc report adjusted adjusted_with_drift
-      barpc report --json monday tuesday
+      barpc report --csv scenes/*/adjusted > scenes.csv
     """
-    if other is None:
-        if wants_json():
-            raise click.UsageError("--json goes with two runs; the summary.json of one is there already")
-        from barpc.pipeline.outputs import remake_report
+    from barpc.report.overview import NO_RUN, as_csv
+    from barpc.verbs import runs
 
-        tell(None, remake_report(run_dir))
-        return 0
-    from barpc.report.compare import compare_runs
-
-    comparison = compare_runs(run_dir, other)
-    if wants_json():
-        echo(json.dumps(comparison, indent=1))
+    if wants_json() and len(run_dirs) == 1 and not csv:
+        raise click.UsageError("--json goes with two runs or --csv; the summary.json of one is there already")
+    found = runs.report(*run_dirs, csv=csv)
+    if csv:
+        echo(json.dumps(found, indent=1) if wants_json() else as_csv(found))
+        lacking = [row["run"] for row in found if row["status"] == NO_RUN]
+        return tell_gate(f"{len(lacking)} of {len(found)} folders hold no finished run:", lacking) if lacking else 0
+    if len(run_dirs) == 1:
+        tell(None, found)
+    elif wants_json():
+        echo(json.dumps(found, indent=1))
     else:
-        print_comparison(comparison)
+        print_comparison(found)
     return 0
 
 
@@ -68,7 +71,7 @@ def export(run_dir: str, out_dir: str, target: str, **flags: Any) -> int:
       barpc export adjusted splats --to colmap --images --tolerance 0.05
       barpc export adjusted stereo --to s2p && s2p stereo/config.json
     """
-    from barpc.export import UnknownTimeError
+    from barpc.export.light import UnknownTimeError
     from barpc.verbs import runs
 
     try:
@@ -202,7 +205,7 @@ def dsm(source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int
       barpc dsm both_dates -o change.tif --minus first_date
       barpc dsm adjusted -o dsm.tif --gsd 2 --crs EPSG:2154 -j 4
     """
-    from barpc.dsm import NoSurfaceError
+    from barpc.dsm.stereo import NoSurfaceError
     from barpc.report.records import json_form
     from barpc.verbs import runs
 

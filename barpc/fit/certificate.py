@@ -152,6 +152,12 @@ class RpcFit(Shown):
         Standard deviation of projections [px] of ground 100 m above or below given points by the first power of the
         altitude alone, at least; 0 for a model.
     few : str, the model that fewer than 40 points carry, and its error, in words; empty for a whole RPC
+
+    Examples
+    --------
+    >>> found = barpc.fit("data_samples/view_00.tif")
+    >>> found.verdict(0.01), bool(found.max_ckp.max() < 1e-6)
+    ('', True)
     """
 
     rpc: RPC

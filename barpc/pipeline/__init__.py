@@ -11,10 +11,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from barpc.base.options import RunOptions
     from barpc.pipeline.loading import LoadedViews, load_views
-    from barpc.pipeline.run import AdjustResult, adjust, check
+    from barpc.pipeline.planning import Plan
+    from barpc.pipeline.results import OpenedRun
+    from barpc.pipeline.run import AdjustResult, adjust, check, plan
 
-__all__ = ["AdjustResult", "LoadedViews", "RunOptions", "adjust", "check", "load_views"]
-_MODULES = {"RunOptions": "barpc.base.options", **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading")}
+__all__ = ["AdjustResult", "LoadedViews", "OpenedRun", "Plan", "RunOptions", "adjust", "check", "load_views", "plan"]
+_MODULES = {
+    "RunOptions": "barpc.base.options",
+    "OpenedRun": f"{__name__}.results",
+    "Plan": f"{__name__}.planning",
+    **dict.fromkeys(("LoadedViews", "load_views"), f"{__name__}.loading"),
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -35,6 +35,9 @@ from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
 from barpc.sensor.timing import Clocked
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import CalibrateKeywords, PathLike
     from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
@@ -69,11 +72,11 @@ class _FinishedRun:
 
 
 def calibrate(
-    runs: Sequence[str | Path],
-    out: str | Path,
+    runs: Sequence[PathLike],
+    out: PathLike,
     *,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[CalibrateKeywords],
 ) -> dict[str, Any]:
     """Estimate the interior distortion of one sensor from finished runs, for `adjust` to apply.
 
@@ -137,9 +140,9 @@ def _images_of(folder: Path) -> _OpenedRun:
     return earlier, views, sensors, sources
 
 
-def _refuse_shared_images(runs: Sequence[str | Path], opened: Sequence[_OpenedRun]) -> None:
+def _refuse_shared_images(runs: Sequence[PathLike], opened: Sequence[_OpenedRun]) -> None:
     """Raise InputError where two runs have an image in common, which would count twice."""
-    seen: dict[str, str | Path] = {}
+    seen: dict[str, PathLike] = {}
     for folder, (earlier, *_) in zip(runs, opened, strict=True):
         for image in earlier.images:
             if image.sha256 in seen and seen[image.sha256] != folder:
@@ -173,7 +176,7 @@ class _OnLine:
     columns: Array
 
 
-def _one_line(runs: Sequence[str | Path], opened: Sequence[_OpenedRun], name: str) -> list[_OnLine]:
+def _one_line(runs: Sequence[PathLike], opened: Sequence[_OpenedRun], name: str) -> list[_OnLine]:
     """Return where the images of each run lie on the line of a sensor.
 
     The line is the longest of all. A product of fewer columns lies somewhere within it: in its middle, to a standard

@@ -15,9 +15,10 @@ import numpy as np
 
 from barpc.base import manifest
 from barpc.base.atomic import STATE
-from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.errors import BarpcError, InputError, OutputError, listed
 from barpc.base.geodesy import Array
 from barpc.base.identity import fingerprint
+from barpc.base.keywords import PathLike
 from barpc.base.manifest import LAST, REPORT_FILE, SUMS, Layer
 from barpc.base.options import RunOptions
 from barpc.base.remote import is_url
@@ -215,6 +216,17 @@ class Proved:
         return self.now in PASSED_STATES
 
 
+class Verification(tuple[Proved, ...]):
+    """The state of every file of a folder, a `Proved` each; it is false where one of them has changed."""
+
+    def __bool__(self) -> bool:
+        return all(one.passed for one in self)
+
+    def __repr__(self) -> str:
+        wrong = [f"{one.file} {one.now}" for one in self if not one.passed]
+        return f"Verification({len(self)} files, {listed(wrong, 3) or 'none has changed'})"
+
+
 def prove(
     folder: Path, places: Sequence[Path] = (), expected: str | None = None, progress: Progress | None = None
 ) -> list[Proved]:
@@ -355,7 +367,7 @@ def _file_digest(path: Path) -> str | None:
         return None
 
 
-def remake_report(folder: Path | str) -> Path:
+def remake_report(folder: PathLike) -> Path:
     """Make report.html of a finished run again, from its files.
 
     Raises

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
-from html import escape
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
@@ -21,8 +19,7 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consist
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
-from barpc.base.frozen import html_table
-from barpc.base.geodesy import ground_from_ecef
+from barpc.base.geodesy import feature_collection, ground_from_ecef
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
 from barpc.base.remote import here
@@ -49,8 +46,10 @@ from barpc.pipeline.inputs import (
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, remake_report, write_tables, write_views
+from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures
+from barpc.pipeline.planning import Plan, planned
+from barpc.pipeline.results import RunResult
 from barpc.pipeline.verify_outputs import unverified
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name, require_pair_names
@@ -58,16 +57,15 @@ from barpc.rasters.dem import Dem
 from barpc.report import Run, Summary, summarize
 from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
-from barpc.report.records import json_form, table
-from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE
+from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE, outline_features
 from barpc.report.summary import InputEntry, StageEntry
-from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import local_image
 from barpc.scene import BoolArray, Reference, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
+from barpc.tie.pairing.overlaps import Pair, best_pairs, possible_pairs
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, timed
@@ -76,7 +74,7 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AdjustResult:
+class AdjustResult(RunResult):
     """The result of a run.
 
     Parameters
@@ -100,32 +98,6 @@ class AdjustResult:
     record: Summary
     root: str = ""
 
-    @cached_property
-    def summary(self) -> dict[str, Any]:
-        """Content of summary.json."""
-        found: dict[str, Any] = json_form(self.record)
-        return found
-
-    def __repr__(self) -> str:
-        tracks, place = self.run.tracks, self.run.out_dir
-        counts = f"{len(self.views)} views, {tracks.num_points} tie points, {len(tracks)} observations"
-        written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
-        return f"AdjustResult({self.run.kind}: {counts}, {self.record.status}{written})"
-
-    def _repr_html_(self) -> str:
-        record, adjusted = self.record, self.record.adjusted
-        shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
-        heads, *rows = shown.texts
-        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in record.reasons)
-        page = Path(self.run.out_dir) / "report.html" if self.run.out_dir else None
-        link = f'<a href="{escape(str(page))}">report.html</a>' if page is not None and page.is_file() else ""
-        return html_table(shown.caption, rows, heads) + f"<ul>{reasons}</ul>" * bool(reasons) + link
-
-    @property
-    def passed(self) -> bool:
-        """Whether every image was used and every quality gate met."""
-        return self.record.passed
-
     @property
     def adjustment(self) -> Adjustment:
         """The adjustment itself; its views are `run.views`."""
@@ -137,14 +109,9 @@ class AdjustResult:
         """The tie points; `Tracks.view` counts `run.views`."""
         return self.run.tracks
 
-    def report(self) -> Path:
-        """Make report.html of this run again from the files in its folder (extra `report`); return its path.
-
-        A run that wrote no files (a check), or jinja2 that is not installed, is an InputError.
-        """
-        if not self.run.out_dir:
-            raise InputError("a check writes no files, so there is nothing to make a report of")
-        return remake_report(Path(self.run.out_dir))
+    def to_geojson(self) -> dict[str, Any]:
+        """Return the outlines of the images with their figures, as GeoJSON."""
+        return feature_collection(outline_features(self.run, self.record))
 
 
 @one_blas_thread()
@@ -312,6 +279,29 @@ def check(
     if (found := _agreeing(run, options.adjust)) is not None:
         run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
+
+
+def plan(
+    images: Sequence[Image],
+    out_dir: str | Path | None = None,
+    options: RunOptions | None = None,
+    *,
+    processes: int = 1,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Plan:
+    """Return the plan of `adjust`; files are opened as there, and nothing is matched or written."""
+    options = with_located(options or RunOptions())
+    run = _with_views("adjust", images, options, Work(executor, progress))
+    if out_dir is not None:
+        names, keep = _planned_files(run, options, Path(out_dir))
+        Workspace.require_free(out_dir, options.overwrite, keep, names)
+    dem, pairs = side_inputs(options, run.views), list[Pair]()
+    if len(run.views) > 1 and not options.matches_only:
+        scope = _scope(run, options, dem)
+        pairs = possible_pairs(run.views, options.tie, scope)
+        pairs = pairs if scope.only else best_pairs(pairs, len(run.views), options.tie.neighbours)
+    return planned(run, options, dem, pairs, processes)
 
 
 def _agreeing(run: Run, options: AdjustOptions) -> BoolArray | None:
@@ -535,14 +525,7 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return replace(run, tracks=given_tracks(options.matches, views))
     if len(views) < 2:
         return run
-    old = _is_old(run)
-    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
-    if options.overlap_list is not None:
-        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
-    elif run.earlier is not None:
-        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
-    if options.aoi is not None:
-        scope = replace(scope, area=read_area(options.aoi))
+    scope = _scope(run, options, terrain)
     if options.matches:
         scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
     try:
@@ -556,6 +539,17 @@ def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = 
         return _with_ties(kept, options, work, terrain)
     detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
     return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
+
+
+def _scope(run: Run, options: RunOptions, terrain: Dem | None) -> Scope:
+    """Return the pairs and the area in which tie points are looked for."""
+    views, old = run.views, _is_old(run)
+    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
+    if options.overlap_list is not None:
+        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
+    elif run.earlier is not None:
+        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
+    return scope if options.aoi is None else replace(scope, area=read_area(options.aoi))
 
 
 def _with_own_cameras(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:

@@ -7,6 +7,7 @@ known, `sigma` [px], in any order. npz: arrays `names`, `view`, `track`, `xy` (K
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,9 +118,7 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
     """Write tie points as ``.csv`` or ``.npz``; `read_links` reads them back to the bit."""
     path = Path(path)
     if path.suffix.lower() == ".npz":
-        with path.open("wb") as file:
-            view, track = tracks.view, tracks.point
-            np.savez_compressed(file, names=np.array(names), view=view, track=track, xy=tracks.xy, sigma=tracks.sigma)
+        path.write_bytes(matches_npz(tracks, names))
         return
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path}: tie points are written as .csv or .npz")
@@ -129,6 +128,13 @@ def write_matches(path: Path | str, tracks: Tracks, names: Sequence[str]) -> Non
         rows = (array.tolist() for array in (tracks.view, tracks.point, tracks.xy, tracks.sigma))
         for view, point, (col, row), sigma in zip(*rows, strict=True):
             text.write(f"{cells[view]},{col!r},{row!r},{point},{sigma!r}\r\n")
+
+
+def matches_npz(tracks: Tracks, names: Sequence[str]) -> bytes:
+    """Return tie points as the bytes of an ``.npz``."""
+    file, view, track = io.BytesIO(), tracks.view, tracks.point
+    np.savez_compressed(file, names=np.array(names), view=view, track=track, xy=tracks.xy, sigma=tracks.sigma)
+    return file.getvalue()
 
 
 def asp_text(first: Array, second: Array) -> str:

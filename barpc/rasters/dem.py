@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -26,6 +25,7 @@ from rasterio.windows import Window
 
 from barpc.base.errors import BarpcWarning, ImageError, InputError
 from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, HeightDatum
+from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl, location
 from barpc.base.safe_io import GRID, opened
 from barpc.rasters.raster import open_raster, reprojected, transformed
@@ -60,7 +60,7 @@ class HeightGrid:
     period: float  # columns in a full turn of longitude where the grid goes around the Earth, else 0
 
     @classmethod
-    def open(cls, path: Path | str) -> HeightGrid:
+    def open(cls, path: PathLike) -> HeightGrid:
         """Return a grid from ``.hgt`` (SRTM), ``.gtx`` (NOAA), ``.pgm`` (GeographicLib) or any raster with a CRS.
 
         InputError where it is none.
@@ -200,9 +200,7 @@ class Dem:
     after: tuple[Dem, ...] = ()  # those that count where this one has no height, in their order
 
     @classmethod
-    def open(
-        cls, path: Path | str | Sequence[Path | str], geoid: Path | str | None = None, heights: str | None = None
-    ) -> Dem:
+    def open(cls, path: Files, geoid: PathLike | None = None, heights: str | None = None) -> Dem:
         """Open one DEM or several (``.hgt``, or any raster with a CRS), each with its own geoid or the one given.
 
         A geoid is a ``.gtx`` or raster, a name of `GEOIDS`, or "none" for ellipsoidal heights; `heights` the same for
@@ -216,7 +214,7 @@ class Dem:
         another had to be taken.
         """
         said = None if geoid is None else os.fspath(geoid)
-        grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, Path)) else path)]
+        grids = [HeightGrid.open(one) for one in ((path,) if isinstance(path, (str, os.PathLike)) else path)]
         first, *others = [cls._of(*both) for both in zip(grids, _given_geoids(grids, said, heights), strict=True)]
         words, known = "; ".join(one.description for one in (first, *others)), all(o.known for o in (first, *others))
         return replace(first, description=words, known=known, after=tuple(others))

@@ -13,6 +13,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
+from barpc.base.keywords import PathLike
 from barpc.base.options import file_options
 from barpc.base.remote import is_url
 from barpc.report.finished import FinishedRun
@@ -29,7 +30,7 @@ _MOTION_NODES = 3  # along each side of an image: places at which the motion of 
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
 
 
-def compare_runs(folder_a: Path | str, folder_b: Path | str) -> dict[str, Any]:
+def compare_runs(folder_a: PathLike, folder_b: PathLike) -> dict[str, Any]:
     """Compare the results of two runs of the same images, by their folders.
 
     Returns ``views`` in both: errors, and ``rpc_difference_px``, the largest distance between where the two runs' RPC

@@ -11,6 +11,7 @@ from pathlib import Path
 from barpc.base.atomic import STATE
 from barpc.base.errors import InputError
 from barpc.base.identity import recorded
+from barpc.base.keywords import PathLike
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.sealed import Sealed
@@ -37,7 +38,7 @@ class FinishedRun:
     summary: Summary
 
     @classmethod
-    def open(cls, folder: Path | str) -> FinishedRun:
+    def open(cls, folder: PathLike) -> FinishedRun:
         """Open a run folder.
 
         InputError where it is none, or its summary was changed since. Nothing proves a run of release 0.3: its files

@@ -26,6 +26,7 @@ from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plai
 from barpc.base.geodesy import Array, feature_collection, geojson_feature
 from barpc.base.manifest import LAST
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
+from barpc.pointio.matches import matches_npz
 from barpc.pointio.names import cell, from_cell
 from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
@@ -41,6 +42,8 @@ from barpc.sensor.geometry import footprints
 FOLDER = "tables"
 """Folder in that of a run for what is neither a corrected camera, nor its report and summary."""
 PRIOR_FILE, IMAGES = "block.npz", "images.json"  # the files in it that a later run starts from
+
+MATCHES = "matches.npz"  # all tie points, in use or not, to the bit
 
 _PLACE = "lon", "lat", "height_above_datum"
 RESIDUALS = (*_PLACE, "mean_residual", "num_observations", "mean_residual_before", "track")
@@ -132,10 +135,11 @@ def _rounded(value: float | None, digits: int) -> str:
 
 def _footprints_geojson(run: Run, summary: Summary) -> Iterable[bytes]:
     """Return every image at the scene's altitude, through the adjusted cameras, or for a check as they are."""
-    return [(json.dumps(feature_collection(_outlines(run, summary))) + "\n").encode()]
+    return [(json.dumps(feature_collection(outline_features(run, summary))) + "\n").encode()]
 
 
-def _outlines(run: Run, summary: Summary) -> list[dict[str, Any]]:
+def outline_features(run: Run, summary: Summary) -> list[dict[str, Any]]:
+    """Return the outlines of the images as features of GeoJSON, with their figures."""
     rings = footprints(run.after or run.before, [view.size for view in run.views], run.altitude)
     names, altitude = ViewEntry.FOOTPRINT.split(), {"altitude_m": summary.altitude_m}
     return [
@@ -146,7 +150,7 @@ def _outlines(run: Run, summary: Summary) -> list[dict[str, Any]]:
 
 def map_layers(run: Run, summary: Summary) -> list[Layer]:
     """Return the layers of a run for a GIS: footprints, tie points, GCPs and check points, with their residuals."""
-    outlines, ties = [one for one in _outlines(run, summary) if one["geometry"]], _per_track(run)
+    outlines, ties = [one for one in outline_features(run, summary) if one["geometry"]], _per_track(run)
     kinds = ("TEXT", "TEXT", "TEXT", "INTEGER", "DOUBLE", "DOUBLE", "DOUBLE", "DOUBLE")
     columns = [f"{name} {kind}" for name, kind in zip((*ViewEntry.FOOTPRINT.split(), "altitude_m"), kinds, strict=True)]
     shapes = [shapely.geometry.shape(one["geometry"]) for one in outlines]
@@ -194,11 +198,16 @@ def gcps_geojson(run: Run) -> bytes:
     return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
 
 
+def _matches_npz(run: Run, _: Summary) -> Iterable[bytes]:
+    return [matches_npz(run.tracks, [view.name for view in run.views])]
+
+
 TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
     "residuals.csv": _residuals_csv,
     "observations.csv": _observations_csv,
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints_geojson,
+    MATCHES: _matches_npz,
 }
 """File name -> the parts of its bytes, of a run and its summary."""
 SURFACE = "surface.json"

@@ -229,7 +229,12 @@ holds_physical = _has(r"<(\w+:)?(ATTLIST|Refined_Model|Scene_Source)\b", markup=
 
 
 def write_rpc(
-    rpc: RPC, path: Path | str, *, format: str | None = None, overwrite: bool = False, size: Size | None = None
+    rpc: RPC,
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    overwrite: bool = False,
+    size: Size | None = None,
 ) -> None:
     """Write an RPC to a text file; every number reads back to the bit.
 
@@ -260,7 +265,8 @@ def write_rpc(
     >>> barpc.read_rpc("view_00.RPB") == rpc
     True
     """
-    write_text(path, _text_of(rpc, Path(path), format, size), overwrite=overwrite)
+    path = Path(path)
+    write_text(path, _text_of(rpc, path, format, size), overwrite=overwrite)
 
 
 def _text_of(rpc: RPC, path: Path, name: str | None, size: Size | None) -> str:

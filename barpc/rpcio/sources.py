@@ -7,6 +7,7 @@ found, and what it passed over, is always said.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -178,7 +179,7 @@ def hidden_by(paths: Iterable[Path]) -> Iterator[tuple[Path, Path, RPC]]:
                     yield found, image, read_rpc(image)
 
 
-def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RPC:
+def read_rpc(path: str | os.PathLike[str], *, first_pixel: float | None = None, band: int = 1) -> RPC:
     """Read the RPC of an image or of an RPC file; `read_rpc_source` says where it came from, too.
 
     Parameters
@@ -202,7 +203,7 @@ def read_rpc(path: Path | str, *, first_pixel: float | None = None, band: int = 
     return read_rpc_source(path, first_pixel=first_pixel, band=band).rpc
 
 
-def read_rpc_source(path: Path | str, *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
+def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None = None, band: int = 1) -> RpcSource:
     """Read the RPC of an image or of an RPC file, and where it came from.
 
     For an image: the vendor's file beside it, the RPC in a GeoTIFF or NITF, GDAL's ``.aux.xml``, OSSIM's ``.geom``,

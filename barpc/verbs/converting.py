@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -49,6 +49,11 @@ from barpc.verbs.images import every, place_of
 from barpc.verbs.moving import moved, refitted
 from barpc.verbs.points import altitude_of, exchanged, terrain_of
 from barpc.workspace import Workspace
+
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import ConvertKeywords, PathLike
 
 Window = tuple[int, int, int, int]
 GroundBox = tuple[float, float, float, float]
@@ -93,12 +98,12 @@ class Converted:
 
 def convert(
     source: ImageLike | Iterable[ImageLike],
-    target: str | Path | None = None,
+    target: PathLike | None = None,
     /,
     *,
-    out_dir: str | Path | None = None,
+    out_dir: PathLike | None = None,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[ConvertKeywords],
 ) -> Converted:
     """Write the RPC of an image in another format, or those of many images into a folder, and read them back.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +20,15 @@ from barpc.sensor.rpc import RPC
 from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, exchanged, ground_at, terrain_of
 
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import InfoKeywords
+
 
 def info(
     images: ImageLike | Iterable[ImageLike],
-    **keywords: Any,
+    **keywords: Unpack[InfoKeywords],
 ) -> Any:
     """Return the source of a camera, its coverage and view angles; of several images, each pair's angle.
 

@@ -7,8 +7,7 @@ import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from barpc.base.atomic import replacing
 from barpc.base.declarations import declared
@@ -26,6 +25,11 @@ from barpc.verbs.converting import check_target
 from barpc.verbs.images import place_of
 from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.points import terrain_of
+
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import PathLike, RefitKeywords
 
 _MOSAIC_GRID = (20, 20, 10)  # three swaths, 250 km: coarser grids cost a third of the accuracy
 
@@ -52,11 +56,11 @@ class Fitted:
 
 def fit(
     source: ImageLike | SensorModel,
-    output: str | Path | None = None,
+    output: PathLike | None = None,
     options: OptionsLike | FitOptions = None,
     *,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RefitKeywords],
 ) -> RpcFit:
     """Fit an RPC to a camera or to points, and certify it on points that the fit has not seen.
 
@@ -128,11 +132,11 @@ def _fit_source(
     points, size = read_points(spec) if spec else (None, None)
     if points is not None:
         if points.note:
-            warnings.warn(points.note, Remark, stacklevel=4)
+            warnings.warn(points.note, Remark, stacklevel=5)
         if (alt := points.ground[:, 2]).min() == alt.max():
             flat = f"all points are at {alt[0]:g} m"
             valid = f"{flat}: the RPC has no terms in height and is valid at that altitude only"
-            warnings.warn(valid, Remark, stacklevel=4)
+            warnings.warn(valid, Remark, stacklevel=5)
         ground, image, sigma = points.ground, points.image, points.sigma
         return fit_rpc_points(ground, image, sigma=sigma, size=size, options=options, strict=False), size, ()
     camera = open_camera(source)
@@ -154,7 +158,7 @@ def _fit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> R
         if not found.verdict(options.tolerance):
             return found
         over = f"fitted over the scene's altitudes, {low:g} to {high:g} m"
-        warnings.warn(f"no RPC represents all altitudes on Earth here: {over}", Remark, stacklevel=5)
+        warnings.warn(f"no RPC represents all altitudes on Earth here: {over}", Remark, stacklevel=6)
     return fit_rpc(camera.model, camera.extent, (low, high), options=options, strict=False)
 
 

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Mapping
 from functools import cache
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from barpc.base.declarations import Options, declared, with_values
 from barpc.base.errors import InputError
+from barpc.base.keywords import PathLike
 from barpc.base.options import RunOptions, read_options
 
-OptionsLike = RunOptions | Mapping[str, Any] | str | Path | None
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import RunKeywords
+
+OptionsLike = RunOptions | Mapping[str, Any] | PathLike | None
 FLAG_NAMES = {"rpc_formats": "rpc_format"}
 """Fields whose flags, and keywords, have another name."""
 
@@ -27,7 +33,7 @@ def _tables() -> dict[str, tuple[str, str]]:
     return found | {flag: found[name] for name, flag in FLAG_NAMES.items()}
 
 
-def run_options(options: OptionsLike = None, /, **keywords: Any) -> RunOptions:
+def run_options(options: OptionsLike = None, /, **keywords: Unpack[RunKeywords]) -> RunOptions:
     """Return the options of a run.
 
     Parameters
@@ -45,8 +51,8 @@ def run_options(options: OptionsLike = None, /, **keywords: Any) -> RunOptions:
     >>> run_options({"tie": {"band": 2}}, gcp="points.csv", drift=0)
     RunOptions(tie=TieOptions(band=2), adjust=AdjustOptions(drift=0), gcp=('points.csv',))
     """
-    if isinstance(options, (str, Path)):
-        options = read_options(options)
+    if isinstance(options, (str, os.PathLike)):
+        options = read_options(os.fspath(options))
     elif not isinstance(options, RunOptions):
         options = with_keywords(RunOptions(), options or {})
     return with_keywords(options, keywords)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyproj
@@ -41,6 +41,11 @@ from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
 from barpc.workspace import Workspace
 
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from barpc.base.keywords import OrthoKeywords, PathLike
+
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
 _FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
 _STRETCH = 100.0  # of lengths by a map: Mercator's is 57 at a latitude of 89 degrees
@@ -68,7 +73,11 @@ class Ortho(Shown):
 
 
 def ortho(
-    images: ImageLike | Iterable[ImageLike], out_dir: str | Path, *, progress: Progress | None = None, **keywords: Any
+    images: ImageLike | Iterable[ImageLike],
+    out_dir: PathLike,
+    *,
+    progress: Progress | None = None,
+    **keywords: Unpack[OrthoKeywords],
 ) -> list[Ortho]:
     """Make orthoimages of images with RPCs, by GDAL's warper, as Cloud-Optimised GeoTIFFs on one grid.
 
@@ -117,7 +126,7 @@ def ortho(
     sides = [float(ground_sample_distance(one.rpc, at)[1]) for one, at in zip(cameras, middles, strict=True)]
     grid = map_crs(choices.crs, middles[0]), float(choices.gsd or 0.0) or float(f"{min(sides):.2g}")
     names, done = [f"{name}.tif" for name in unique_names(files)], list[Ortho]()
-    with Workspace(out_dir, overwrite=choices.overwrite, keep=files, names=names, adds=True) as workspace:
+    with Workspace(Path(out_dir), overwrite=choices.overwrite, keep=files, names=names, adds=True) as workspace:
         for name, camera, file in zip(names, cameras, files, strict=True):
             doubts = tuple(f"{file.name}: {one.sentence}." for one in camera.doubts)
             warp = _Warp.of(camera, file, terrain, alt, grid, workspace.partial)

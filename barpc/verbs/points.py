@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
 from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_from_ecef, wrap_longitude
+from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl
 from barpc.cameras import ImageLike, open_camera
 from barpc.rasters.dem import Dem, localize_on_terrain
@@ -23,8 +23,6 @@ from barpc.verbs.images import one_or_many, place_of
 
 _SAME_PLACE = 0.01  # deg: places that are one; others that are seen alike lie degrees away
 
-Files = str | Path | Sequence[str | Path]
-
 
 def project(
     image: ImageLike | SensorModel,
@@ -32,7 +30,7 @@ def project(
     *,
     alt: npt.ArrayLike | None = None,
     dem: Files | None = None,
-    geoid: str | None = None,
+    geoid: PathLike | None = None,
 ) -> Array:
     """Project ground points into an image.
 
@@ -66,7 +64,7 @@ def project(
     camera, terrain = open_camera(image), terrain_of(dem, geoid)
     points = with_altitudes(ground, alt, terrain)
     if wrong := far_outside(camera, points.reshape(-1, 3)):
-        warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
+        warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=3)
     return camera.model.project(points)
 
 
@@ -76,7 +74,7 @@ def localize(
     alt: npt.ArrayLike | None = None,
     *,
     dem: Files | None = None,
-    geoid: str | None = None,
+    geoid: PathLike | None = None,
 ) -> Array:
     """Localise image points on the ground, at an altitude or on a DEM.
 
@@ -118,7 +116,7 @@ def localize(
     else:
         found = ground_at(camera, points.reshape(-1, 2), 0.0, terrain).reshape(*points.shape[:-1], 3)
     if wrong := far_outside(camera, found.reshape(-1, 3)):
-        warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=2)
+        warnings.warn(f"{camera.path}: {wrong}", BarpcWarning, stacklevel=3)
     return found
 
 
@@ -170,13 +168,13 @@ def triangulate(images: Sequence[ImageLike | SensorModel], at: npt.ArrayLike) ->
 # --- altitudes --------------------------------------------------------------------------------------------
 
 
-def terrain_of(dem: Files | None = None, geoid: str | None = None, alt: npt.ArrayLike | None = None) -> Dem | None:
+def terrain_of(dem: Files | None = None, geoid: PathLike | None = None, alt: npt.ArrayLike | None = None) -> Dem | None:
     """Return the terrain of DEMs, if any are given; UsageError for a geoid alone, or beside an altitude."""
     if geoid is not None and not dem:
         raise UsageError("--geoid goes with --dem")
     if dem and alt is not None:
         raise UsageError("give either --alt or --dem")
-    return Dem.open(dem if isinstance(dem, (str, os.PathLike)) else list(dem), geoid) if dem else None
+    return Dem.open(dem, geoid) if dem else None
 
 
 def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: Dem | None) -> Array:
@@ -207,7 +205,7 @@ def altitude_of(camera: Camera, image: PathOrUrl, given: float | None = None) ->
     stated = camera.model.height_default if isinstance(camera.model, RPC) else None
     if stated is not None:
         return stated
-    warnings.warn(f"{image}: {_unknown(camera)}; give --alt or --dem", Remark, stacklevel=3)
+    warnings.warn(f"{image}: {_unknown(camera)}; give an altitude or a DEM", Remark, stacklevel=4)
     return camera.altitude
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from barpc import pipeline
 from barpc.base.declarations import with_values
-from barpc.base.errors import UsageError
+from barpc.base.errors import ReservationError, UsageError
 from barpc.base.verb_options import DsmOptions, ExportOptions, VerifyOptions
 from barpc.cameras import ImageLike
 from barpc.verbs.images import every, one_or_many
@@ -19,23 +19,27 @@ from barpc.verbs.options import OptionsLike, run_options
 from barpc.verbs.workers import executor_for
 
 if TYPE_CHECKING:
-    from barpc.dsm import Surface
-    from barpc.pipeline import AdjustResult
-    from barpc.pipeline.outputs import Proved
-    from barpc.tie.tasks import Progress
+    from typing import Unpack
 
-PathLike = str | Path
+    from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
+    from barpc.dsm.surface import Surface
+    from barpc.pipeline import AdjustResult, Plan
+    from barpc.pipeline.outputs import Verification
+    from barpc.pipeline.results import OpenedRun
+    from barpc.tie.tasks import Progress
 
 
 def adjust(
     images: ImageLike | Iterable[ImageLike],
+    /,
     out_dir: PathLike,
     options: OptionsLike = None,
     *,
+    check: bool = False,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Correct the cameras of overlapping images and write fresh RPCs.
 
@@ -46,6 +50,7 @@ def adjust(
         `barpc.open_camera`; a View brings its own model (a frozen dataclass, so that results can be cached).
     out_dir : path, folder for the results: one VRT and one ``_RPC.TXT`` an image, ``summary.json``, ``report.html``
     options : RunOptions, mapping as of a TOML file, or path of one; None: the defaults
+    check : bool, raise ReservationError where the result has not `passed`: the files are written, and are its `result`
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
     jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
         ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
@@ -71,18 +76,62 @@ def adjust(
     """
     chosen, where = run_options(options, **keywords), os.fspath(out_dir)
     with executor_for(jobs, executor) as workers:
-        return pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
+        done = pipeline.adjust(every(images), options=chosen, out_dir=where, executor=workers, progress=progress)
+    if check and not done.passed:
+        raise ReservationError(" ".join((done.record.headline, *done.record.reasons)), done)
+    return done
+
+
+def plan(
+    images: ImageLike | Iterable[ImageLike],
+    /,
+    out_dir: PathLike | None = None,
+    options: OptionsLike = None,
+    *,
+    executor: Executor | None = None,
+    jobs: int | str = 1,
+    progress: Progress | None = None,
+    **keywords: Unpack[RunKeywords],
+) -> Plan:
+    """Return the plan of `barpc.adjust`: pairs, time, memory, the datum assumed, doubts on the input.
+
+    Parameters
+    ----------
+    images, options, executor, jobs, progress, **keywords : as of `barpc.adjust`; all files are opened as there
+    out_dir : path, optional, where results are to go: what is in the way there is said
+
+    Returns
+    -------
+    Plan; nothing is matched or written
+
+    Raises
+    ------
+    BarpcError
+        As of `barpc.adjust`, before it starts to match.
+
+    Examples
+    --------
+    >>> found = barpc.plan("data_samples/*.tif", points_per_image=500)
+    >>> found.views, found.doubts
+    (('view_00', 'view_01', 'view_02'), ())
+    """
+    chosen, processes = run_options(options, **keywords), jobs + (jobs > 1) if isinstance(jobs, int) else 1
+    where = None if out_dir is None else os.fspath(out_dir)
+    with executor_for(jobs, executor) as workers:
+        how: dict[str, Any] = {"processes": processes, "executor": workers, "progress": progress}
+        return pipeline.plan(every(images), where, chosen, **how)
 
 
 def match(
     images: ImageLike | Iterable[ImageLike],
+    /,
     out_dir: PathLike,
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Match tie points and stop, for ``adjust(..., matches=...)`` and other tools.
 
@@ -112,12 +161,13 @@ def match(
 
 def check(
     images: ImageLike | Iterable[ImageLike],
+    /,
     options: OptionsLike = None,
     *,
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[RunKeywords],
 ) -> AdjustResult:
     """Measure how well the cameras of overlapping images agree; nothing is adjusted or written.
 
@@ -153,7 +203,7 @@ def dsm(
     executor: Executor | None = None,
     jobs: int | str = 1,
     progress: Progress | None = None,
-    **keywords: Any,
+    **keywords: Unpack[DsmKeywords],
 ) -> Surface:
     """Make a first surface model of a finished run, or of images with their cameras.
 
@@ -183,7 +233,7 @@ def dsm(
     >>> surface.gsd, surface.known > 1000
     (2.0, True)
     """
-    from barpc.dsm import make_dsm
+    from barpc.dsm.surface import make_dsm
 
     chosen = with_values(options or DsmOptions(), keywords, "dsm")
     given, _ = one_or_many(source)
@@ -191,7 +241,7 @@ def dsm(
     if run is None and chosen.minus is not None:
         raise UsageError("--minus goes with a RUN: errors common to two dates are unknown for images alone")
     with executor_for(jobs, executor) as workers:
-        return make_dsm(run or every(given), out, chosen, executor=workers, progress=progress)
+        return make_dsm(run or every(given), os.fspath(out), chosen, executor=workers, progress=progress)
 
 
 def run_folder(source: Sequence[Any]) -> Path | None:
@@ -207,7 +257,7 @@ def export(
     run_dir: PathLike,
     out_dir: PathLike,
     to: str,
-    **keywords: Any,
+    **keywords: Unpack[ExportKeywords],
 ) -> list[Path]:
     """Hand a finished run to another tool: its images, corrected cameras and tie points in files that it reads.
 
@@ -225,8 +275,8 @@ def export(
     Raises
     ------
     InputError
-        No such tool, no finished adjustment, altitudes that are no interval; `barpc.export.UnknownTimeError`: the time
-        of acquisition of an image is unknown, and the tool needs it.
+        No such tool, no finished adjustment, altitudes that are no interval; its child `UnknownTimeError`: the time of
+        acquisition of an image is unknown, and the tool needs it.
     OutputError
         The folder is in use, not empty, or the run's own.
 
@@ -236,9 +286,76 @@ def export(
     >>> [path.name for path in barpc.export("finished", "nerf", "satnerf", time=["2020-06-01T10:30:00"])][:2]
     ['view_00.json', 'view_01.json']
     """
-    from barpc.export import export_run
+    from barpc.export.targets import export_run
 
     return export_run(run_dir, to, out_dir, with_values(ExportOptions(), keywords, "export"))
+
+
+def open_run(run_dir: PathLike) -> OpenedRun:
+    """Open a finished run: the result of `adjust` or `match`, from the files in its folder.
+
+    Parameters
+    ----------
+    run_dir : path of a finished run
+
+    Returns
+    -------
+    OpenedRun, with `views`, `tracks`, `tables`, `summary`, `record`, `passed`, `report()`, `to_geojson()`
+
+    Raises
+    ------
+    InputError
+        The folder holds no finished run, or a file that is asked for was changed since.
+
+    Examples
+    --------
+    >>> _ = barpc.match("data_samples/view_0[01].tif", "opened", points_per_image=500)
+    >>> run = barpc.open_run("opened")
+    >>> len(run.tracks) == len(run.tables.observations.xy), run.summary["kind"]
+    (True, 'match')
+    """
+    from barpc.pipeline.results import OpenedRun
+
+    return OpenedRun.open(Path(run_dir))
+
+
+def report(run_dir: PathLike, *others: PathLike, csv: bool = False) -> Any:
+    """Make report.html of a finished run again, compare two runs, or list any number of runs.
+
+    Parameters
+    ----------
+    run_dir, *others : path of a finished run; of two to compare, of the same images; with `csv` of any number
+    csv : bool, a row for each run instead
+
+    Returns
+    -------
+    Path, of report.html; of two runs a dict, the figures of `barpc report --json A B`; with `csv` a list of dicts, the
+    rows of `barpc report --csv`: verdict, figures and reasons of each run
+
+    Raises
+    ------
+    InputError
+        No finished run, or one that was changed since; with `csv` its `status` is "none", with the reason.
+
+    Examples
+    --------
+    >>> _ = barpc.match("data_samples/view_0[01].tif", "listed", points_per_image=500)
+    >>> [(row["status"], row["images"]) for row in barpc.report("listed", "data_samples", csv=True)]
+    [('good', 2), ('none', None)]
+    """
+    if csv:
+        from barpc.report.overview import overview
+
+        return overview((run_dir, *others))
+    if len(others) > 1:
+        raise UsageError(f"{len(others) + 1} runs: give one, two to compare, or any number with --csv")
+    if others:
+        from barpc.report.compare import compare_runs
+
+        return compare_runs(run_dir, *others)
+    from barpc.pipeline.outputs import remake_report
+
+    return remake_report(run_dir)
 
 
 def verify(
@@ -246,8 +363,8 @@ def verify(
     places: PathLike | Sequence[PathLike] = (),
     *,
     progress: Progress | None = None,
-    **keywords: Any,
-) -> list[Proved]:
+    **keywords: Unpack[VerifyKeywords],
+) -> Verification:
     """Compare the files of a run or export with its SHA256SUMS, and its cameras with those certified.
 
     Parameters
@@ -260,7 +377,7 @@ def verify(
 
     Returns
     -------
-    list of Proved, a file each: `kind`, `file`, `now`, `note`, `passed`
+    Verification, a tuple of a row for each file: `kind`, `file`, `now`, `note`, `passed`; false where one has changed
 
     Raises
     ------
@@ -270,10 +387,10 @@ def verify(
     Examples
     --------
     >>> _ = barpc.match("data_samples/view_0[01].tif", "tied", points_per_image=500)
-    >>> all(one.passed for one in barpc.verify("tied"))
-    True
+    >>> barpc.verify("tied")
+    Verification(... files, none has changed)
     """
-    from barpc.pipeline.outputs import prove
+    from barpc.pipeline.outputs import Verification, prove
 
     chosen = with_values(VerifyOptions(), keywords, "verify")
     folders, expect = [places] if isinstance(places, (str, os.PathLike)) else places, chosen.expect
@@ -282,4 +399,4 @@ def verify(
         from barpc.verbs.figures import reread_figures
 
         found += reread_figures(Path(run_dir))
-    return found
+    return Verification(found)

@@ -79,7 +79,7 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, chan
     if look == "height":  # a prior tells of one view where the others agree, which a pair always does
         assert adjust_tracks(block.views, block.tracks).apart is None
     if look != "axes":
-        monkeypatch.setattr(foreign_camera, "_TELLING", 2)
+        monkeypatch.setattr(foreign_camera, "_EACH_LEFT_OUT", 2)
     found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
     assert found.apart is not None
     assert found.apart.views == (2,)
@@ -354,8 +354,10 @@ def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> No
         (RpcDiagnosis(as_stated=True), None, (1, 2), False),
     ],
 )
-def test_what_sees_the_place_may_be_its_own(look: RpcDiagnosis, placed: Any, views: tuple[int, ...], own: bool) -> None:
-    assert foreign_camera.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_its_own == own
+def test_an_image_of_the_place_may_be_distorted(
+    look: RpcDiagnosis, placed: Any, views: tuple[int, ...], own: bool
+) -> None:
+    assert foreign_camera.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_distorted == own
 
 
 @pytest.mark.slow

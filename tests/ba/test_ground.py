@@ -77,7 +77,7 @@ def test_what_is_believed_of_a_dem_holds_all_tracks_but_those_held_already(monke
     bent = np.linspace(-1.0, 1.0, 4 * NUM_BENDS).reshape(4, NUM_BENDS)
     alt, slopes = np.array([340.0, 341.0, np.nan, 343.0]), np.tile([0.2, -0.1], (4, 1))
     found = RegularisedDem(alt, slopes, bent, np.ones(3), 2.0, 4.0, 1.0, True)
-    monkeypatch.setattr(PointConstraints, "_believed", lambda self, given: found if given is points else None)
+    monkeypatch.setattr(PointConstraints, "_weighted_dem", lambda self, given: found if given is points else None)
     asked: list[float] = []
     relief: Any = SimpleNamespace(common_sigma=lambda bias: asked.append(bias) or np.arange(1.0, NUM_BENDS + 1.0))
     by_altimetry = flat_heights(points, np.array([3]), 350.0, 1.0, 0.0)

@@ -285,5 +285,5 @@ def test_a_track_moves_by_the_share_of_what_is_right_of_it_that_moves() -> None:
     nothing, stands = np.zeros(3), np.array([0.4, 0.2, 0.3, 0.0, 0.0, 0.0])
     moves = np.array([0.05, 0.05, 0.0, 0.0, 0.2, 0.0])
     subsets = SimpleNamespace(begins=(nothing, np.array([0, 2, 4])))
-    gone = mixture._Expected(nothing, nothing, [stands, moves], []).gone(subsets)
+    gone = mixture._Expected(nothing, nothing, [stands, moves], []).moved(subsets)
     np.testing.assert_allclose(gone, [0.1 / 0.7, 0.0, 1.0])

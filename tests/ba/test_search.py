@@ -16,7 +16,7 @@ from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, search
-from barpc.ba.select.beam import Selection, TermSearch, _same, _SearchState, _Taken, _uncovered
+from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _Taken, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
 from barpc.ba.terms import TERMS
@@ -204,7 +204,7 @@ def test_lines_lost_in_two_of_four_views_are_given_back_to_both(seed: int) -> No
     adjusted = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     first, second = sorted(world.plan.injected, key=lambda one: one.views)
     assert [(one.kind, one.view) for one in sorted(adjusted.findings, key=lambda one: one.view)] == [
-        ("step", *first.views), ("step", *second.views)
+        ("lines_lost", *first.views), ("lines_lost", *second.views)
     ]  # fmt: skip
     judged = judge(world, adjusted.sensors)
     assert max(*judged.p99, judged.hit) < 0.06
@@ -278,9 +278,9 @@ def test_ground_that_moves_is_found_beside_a_sinusoid_and_the_cameras_are_those_
     ],
 )
 def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
-    assert _same(interval(*one), interval(*other)) == _same(interval(*other), interval(*one)) == same
-    assert not _same(interval(*one), interval(*other, view=1))
-    assert not _same(interval(*one), interval(*other, axis=0))
+    assert _overlap(interval(*one), interval(*other)) == _overlap(interval(*other), interval(*one)) == same
+    assert not _overlap(interval(*one), interval(*other, view=1))
+    assert not _overlap(interval(*one), interval(*other, axis=0))
     rows = [interval(*one), interval(*other), interval(50, 60)]
     assert _uncovered(rows) == ([rows[0], rows[2]] if same else rows)
 

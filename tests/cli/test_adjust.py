@@ -301,7 +301,10 @@ def test_help_imports_nothing_heavy():
     ("command", "unwanted"),
     [
         ("main()", "scipy.linalg scipy.sparse scipy.spatial scipy.special cv2 shapely jinja2 boto3 barpc.ba barpc.tie"),
-        ("_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading", "barpc.ba barpc.report boto3"),
+        (
+            "_enter_worker(); import barpc.pipeline.executor, barpc.pipeline.loading",
+            "barpc.ba barpc.report.outcome boto3",
+        ),
         ("sys.argv[1:] = ['adjust', 'none.tif', 'no.tif', '-o', 'out']; main()", "scipy.spatial scipy.optimize jinja2"),
     ],
     ids=["info", "worker", "adjust"],
@@ -362,3 +365,13 @@ def test_adjusted_images_can_be_adjusted_again(crops, finished, tmp_path):
     assert str(crops[0].name) in text
     with rasterio.open(tmp_path / "two/view_00.vrt") as new, rasterio.open(crops[0]) as old:
         np.testing.assert_array_equal(new.read(), old.read())
+
+
+def test_a_dry_run_needs_no_folder_and_a_run_does(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = barpc("adjust", *VIEWS, "--dry-run")
+    assert code == 0
+    assert out.startswith("3 images, 3 pairs to match first: about ")
+    assert not list(tmp_path.iterdir())
+    code, _, err = barpc("adjust", *VIEWS)
+    assert (code, "Missing option '-o' / '--out-dir'" in err) == (2, True)

@@ -209,10 +209,10 @@ def a_map(**changes) -> Camera:
 def test_what_an_unknown_altitude_is_worth_is_measured_in_the_middle():
     camera = a_map()
     told = r"^map.tif: terrain height unknown, 25 m assumed \(the middle of the camera's altitude range\)"
-    with pytest.warns(Remark, match=f"{told}: an error of 100 m shifts the result by 5 px; give --alt or --dem$"):
+    with pytest.warns(Remark, match=f"{told}: an error of 100 m shifts the result by 5 px; give an altitude or a DEM$"):
         assert altitude_of(camera, Path("map.tif")) == 25.0
     assert camera.model.asked == [([99.5, 49.5], 25.0)]
-    with pytest.warns(Remark, match=f"{told}; give --alt or --dem$"):
+    with pytest.warns(Remark, match=f"{told}; give an altitude or a DEM$"):
         assert altitude_of(a_map(size=None), Path("map.tif")) == 25.0
     assert altitude_of(camera, Path("map.tif"), 0.0) == 0.0
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc import dsm
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
 from barpc.cli.terminal import Lines, progress_told
+from barpc.dsm import stereo, surface
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.geometry import base_to_height, triangulate
@@ -423,10 +423,10 @@ def test_a_surface_is_told_in_three_lines_or_as_json_and_its_flags_are_its_optio
     def make(source, out, options, **_):
         given.append((source, str(out), options))
         if options.band == 2:
-            raise dsm.NoSurfaceError("nothing to match")
-        return dsm.Surface(str(out), ("a - b", "a - c"), 2.5, (4, 3), 7, 0.5, 0.25, 0.5, np.nan, 1.125)
+            raise stereo.NoSurfaceError("nothing to match")
+        return surface.Surface(str(out), ("a - b", "a - c"), 2.5, (4, 3), 7, 0.5, 0.25, 0.5, np.nan, 1.125)
 
-    monkeypatch.setattr(dsm, "make_dsm", make)
+    monkeypatch.setattr(surface, "make_dsm", make)
     (tmp_path / "run").mkdir()
     (tmp_path / "run/summary.json").write_text("{}")
     flags = ["--gsd", 2.5, "--alt", 10, 20, "--pairs", 2, "--minus", "first", "--overwrite"]

@@ -14,6 +14,8 @@ from barpc.base.verb_options import ExportOptions
 from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell_result
 from barpc.cli.fit import _certificate
+from barpc.export import targets
+from barpc.report import compare
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
@@ -136,7 +138,7 @@ def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
     monkeypatch.setattr("barpc.verbs.fitting.terrain_range", terrain_range)
     assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
     assert run("fit", source, "--dem", "d.tif", "--dem", "e.tif") == 0
-    assert asked == [((600, 500), (["d.tif"], "g.gtx"), 50.0), ((600, 500), (["d.tif", "e.tif"], None), 500.0)]
+    assert asked == [((600, 500), (("d.tif",), "g.gtx"), 50.0), ((600, 500), (("d.tif", "e.tif"), None), 500.0)]
     assert [row[1] for row in fitted] == [(50.0, 150.0), (-400.0, 600.0)]
     assert run("fit", source, "--dem", "d.tif", "--alt-range", "0", "300") == 0
     assert len(asked) == 2
@@ -179,7 +181,7 @@ def test_two_runs_are_compared_and_one_is_reported_again(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = {"a": "x", "b": "y", "views": [], "pairs": [], "lines": ["All alike."]}
-    monkeypatch.setattr("barpc.report.compare.compare_runs", lambda one, two: {**found, "a": one, "b": two})
+    monkeypatch.setattr(compare, "compare_runs", lambda one, two: {**found, "a": one, "b": two})
     monkeypatch.setattr("barpc.pipeline.outputs.remake_report", lambda one: f"{one}/report.html")
     assert run("report", "one") == 0
     assert capsys.readouterr().out == "one/report.html\n"
@@ -259,7 +261,7 @@ def test_an_export_names_its_files_and_says_where_images_stay(
     if vrt:
         (tmp_path / "a.vrt").touch()
     asked = list[Any]()
-    monkeypatch.setattr("barpc.export.export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")])
+    monkeypatch.setattr(targets, "export_run", lambda *a, **k: asked.append((a, k)) or [Path("x"), Path("y")])
     words = ("export", str(tmp_path), "out", "--to", target)
     assert run(*words) == 0
     said = capsys.readouterr()

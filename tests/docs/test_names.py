@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import click
 import pytest
 
+import barpc
 from barpc.base.declarations import declared
 from barpc.base.options import RunOptions
 from barpc.cli import COMMANDS, cli
@@ -87,6 +89,34 @@ KEYWORDS = {"atmosphere", "bistatic", "first_pixel", "strict", "model", "executo
 @pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_option_in_a_sentence_exists(page):
     assert [wrong for code in inline(page) for wrong in wrong_options(code)] == []
+
+
+IMPORT = re.compile(r"^ *(?:from (barpc[\w.]*) import ([\w, ]+)|import (barpc\.[\w.]+))", re.MULTILINE)
+
+
+def private(code: str) -> list[str]:
+    """What Python code takes from modules of the package that is neither in `barpc` nor on the page of the API."""
+    listed = set(re.findall(r"^::: (\S+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE))
+    taken = [
+        f"{of}.{name.split(' as ')[0].strip()}"
+        for of, names, _ in IMPORT.findall(code)
+        for name in names.split(",")
+        if of
+    ]
+    taken += [whole for *_, whole in IMPORT.findall(code) if whole]
+    return [name for name in taken if name not in listed and name.removeprefix("barpc.") not in barpc.__all__]
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_code_of_a_page_takes_public_names_only(page):
+    assert [name for block in blocks(page, "python") for name in private(block.text)] == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_take_public_names_only(path):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    assert [name for cell in cells if cell["cell_type"] == "code" for name in private("".join(cell["source"]))] == []
+    assert private("from barpc.base.geodesy import Array, fit_rpc\nimport barpc.ba") != []
 
 
 def found(name: str) -> bool:

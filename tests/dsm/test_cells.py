@@ -11,8 +11,8 @@ import pytest
 from pyproj import CRS, Transformer
 
 from barpc.base.verb_options import DsmOptions
-from barpc.dsm import NoSurfaceError, stereo
-from barpc.dsm.stereo import TILE_NODES, CameraErrors, Tile, gathered
+from barpc.dsm import stereo
+from barpc.dsm.stereo import TILE_NODES, CameraErrors, NoSurfaceError, Tile, gathered
 from barpc.dsm.surface import Grid
 from tests.tie.test_pairs import camera, views
 

@@ -13,8 +13,8 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
-from barpc.dsm import make_dsm
 from barpc.dsm.stereo import CameraErrors
+from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import triangulate

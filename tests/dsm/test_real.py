@@ -14,8 +14,8 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
-from barpc.dsm import make_dsm
 from barpc.dsm.stereo import block_of_run
+from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.report.runfiles import read_summary, read_tables
 from barpc.report.summary.words import metres

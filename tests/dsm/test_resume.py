@@ -15,7 +15,7 @@ import pytest
 
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
-from barpc.dsm import make_dsm
+from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.report.runfiles import SURFACE
 from tests.dsm.conftest import ALTS

@@ -17,10 +17,10 @@ from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.sealed import Sealed
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
-from barpc.dsm import NoSurfaceError, make_dsm, stereo
+from barpc.dsm import stereo
 from barpc.dsm import surface as surface_module
-from barpc.dsm.stereo import CORRECTION, PRIOR_FILE, Tile, _ranked_pairs, block_of_images
-from barpc.dsm.surface import _delivered, draped, show_in_report
+from barpc.dsm.stereo import CORRECTION, PRIOR_FILE, NoSurfaceError, Tile, _ranked_pairs, block_of_images
+from barpc.dsm.surface import _delivered, draped, make_dsm, show_in_report
 from barpc.pipeline import load_views
 from barpc.report.finished import FinishedRun
 from barpc.report.runfiles import run_key

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError, OutputError
 from barpc.base.verb_options import ExportOptions
 from barpc.cli import main
-from barpc.export import TARGETS, _link_image, export_run
 from barpc.export.colmap import _Pixels
 from barpc.export.light import sun_angles
 from barpc.export.shots import read_scene
+from barpc.export.targets import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.geometry import image_grid

@@ -26,7 +26,7 @@ from barpc.cameras import open_camera
 from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
 from barpc.cli.terminal import print_comparison
-from barpc.export import export_run
+from barpc.export.targets import export_run
 from barpc.pipeline.calibrate import read_calibration
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.correspondences import read_correspondences

@@ -13,13 +13,12 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from barpc import report
 from barpc.base.errors import BarpcError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions
 from barpc.pipeline import adjust, load_views, outputs, run
 from barpc.pointio.matches import write_matches
-from barpc.report import Run
+from barpc.report import Run, verdict
 from barpc.rpcio import formats
 from barpc.rpcio.images import put_tag
 from barpc.sensor.geometry import Several, epipolar_offset
@@ -110,7 +109,7 @@ def test_a_summary_asks_each_camera_as_often_in_a_large_block_as_in_a_small_one(
         with monkeypatch.context() as patch:
             for name in ("localize", "project", "project_jacobian"):
                 counted(patch, RPC, name, counts)
-            summary = report.summarize(Run("check", block.views, (), block.tracks))
+            summary = verdict.summarize(Run("check", block.views, (), block.tracks))
         assert len(summary.pairs) > 3 * num
         calls.append(counts.total() / num)
     assert calls[1] < 1.3 * calls[0] < 100
@@ -119,7 +118,7 @@ def test_a_summary_asks_each_camera_as_often_in_a_large_block_as_in_a_small_one(
 @pytest.mark.slow
 def test_pairs_measured_together_are_as_measured_alone(block):
     found = Run("check", block[0].views, (), block[0].tracks)
-    entries = {(pair.a, pair.b): pair for pair in report.summarize(found).pairs}
+    entries = {(pair.a, pair.b): pair for pair in verdict.summarize(found).pairs}
     xy, point = found.tracks.xy, found.tracks.point
     for ties in found.pairs:
         i, j = ties.views

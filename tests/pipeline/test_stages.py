@@ -8,6 +8,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -390,7 +391,7 @@ def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
 
     monkeypatch.setattr(stages, "_with_views", load)
     monkeypatch.setattr(stages, "_with_ties", lambda run, options, work: tied if run is loaded else None)
-    monkeypatch.setattr(stages, "summarize", lambda run: SimpleNamespace(passed=run is tied, status="good"))
+    monkeypatch.setattr(stages, "summarize", lambda run: a_record(run, passed=run is tied))
     result = stages.check(given, RunOptions(keep_going=True), progress=told)
     assert [view.name for view in result.views] == ["v2", "v0", "v1"]
     assert result.run is tied
@@ -398,14 +399,21 @@ def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
     assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
 
 
+def a_record(run: Run, **more: Any) -> Any:
+    """A summary with what a result prints."""
+    tracks = SimpleNamespace(num_tracks=0, num_observations=0)
+    return SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None, **more)
+
+
 def test_a_check_has_no_folder_to_make_a_report_of() -> None:
     run = Run("check", views(), (), NONE)
-    result = stages.AdjustResult((), run, SimpleNamespace(status="good"))  # type: ignore[arg-type]
+    result = stages.AdjustResult((), run, a_record(run))
     with pytest.raises(InputError, match="a check writes no files"):
         result.report()
-    assert repr(result) == "AdjustResult(check: 0 views, 0 tie points, 0 observations, good)"
+    assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
     for length, shown in ((50, "/" * 50), (51, "..." + "/" * 47)):
-        wrote = stages.AdjustResult((), replace(run, out_dir="/" * length), result.record)
+        result.record.out_dir = "/" * length  # type: ignore[misc]
+        wrote = stages.AdjustResult((), run, result.record)
         assert repr(wrote).endswith(f", in {shown})")
 
 

@@ -12,7 +12,7 @@ import rasterio
 from barpc import adjust
 from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
-from barpc.export import TARGETS
+from barpc.export.targets import TARGETS
 from barpc.rasters.raster import open_raster
 from tests.lanes import rest_slow
 from tests.reliability.conftest import barpc

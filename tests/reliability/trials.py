@@ -30,7 +30,7 @@ from rasterio.windows import Window
 
 import barpc.cli.adjust  # (imported before the forks)
 import barpc.cli.terminal
-import barpc.dsm
+import barpc.dsm.surface
 import barpc.pipeline.calibrate
 import barpc.verbs.orthoimages  # noqa: F401
 from barpc.cli import main as barpc_main

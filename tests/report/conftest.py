@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
 from barpc.pipeline.outputs import write_tables
-from barpc.report import Run, Summary
+from barpc.report import Run, Summary, verdict
 from barpc.report.records import json_form
 from barpc.rpcio import write_rpc
 from barpc.scene import View
@@ -60,12 +59,12 @@ def run_of_block(
 
 def summarize(run: Run) -> dict[str, Any]:
     """What summary.json holds of a run."""
-    return json_form(report.summarize(run))
+    return json_form(verdict.summarize(run))
 
 
 def written(run: Run, folder: Path) -> dict[str, Any]:
     """Tables, RPC files, report and summary of a run in a folder; the summary as the file holds it."""
-    summary = report.summarize(run)
+    summary = verdict.summarize(run)
     with Workspace(folder, overwrite=True) as workspace:
         summary = write_tables(workspace, run, summary)
         for view, fit in zip(run.views, run.fits, strict=bool(run.fits)):

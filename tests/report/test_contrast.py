@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc import report
+from barpc.report import page
 
-CSS = re.search(r"<style>(.*?)</style>", Path(report.__file__).with_name("template.html.j2").read_text(), re.DOTALL)[1]
+CSS = re.search(r"<style>(.*?)</style>", Path(page.__file__).with_name("template.html.j2").read_text(), re.DOTALL)[1]
 TEXT = ("fg", "muted", "after", "good", "look", "bad")
 DRAWN = ("before", "after", "good", "look", "bad", "third", "muted", "fg")
 PALE = ("line", "bg", "soft")  # what says nothing by itself: rules, grounds, outlines of letters

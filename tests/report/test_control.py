@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.report import Run
+from barpc.report import Run, verdict
 from barpc.report.page import decisions, report_html
 
 
 def summary_of(run: Run, gcps, **options):
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(**options), gcps)
-    return adjustment, report.summarize(replace(run, adjustment=adjustment, gcps=gcps, fits=(), written=()))
+    return adjustment, verdict.summarize(replace(run, adjustment=adjustment, gcps=gcps, fits=(), written=()))
 
 
 def test_control_that_is_as_stated_is_within_what_chance_allows(block_run):

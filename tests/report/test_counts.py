@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.constraints.ground import TerrainTest
-from barpc.report import page
+from barpc.report import page, verdict
 from barpc.report.page import decisions
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
@@ -65,7 +65,7 @@ def unknown_residuals(num: int, seen: bool) -> Any:
 
 @pytest.mark.parametrize(("num", "seen"), [(1, True), (1, False), (2, True), (2, False)])
 def test_check_points(num, seen, monkeypatch):
-    monkeypatch.setattr("barpc.report.verdict.check_residuals", lambda *_: unknown_residuals(num, seen))
+    monkeypatch.setattr(verdict, "check_residuals", lambda *_: unknown_residuals(num, seen))
     run = run_of(check_points=gcps(num), after=())
     (line,) = [line for line in block_verdict(run, the_views(3, 9))["verdict"] if "check point" in line]
     spoken([line])

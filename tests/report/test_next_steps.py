@@ -8,14 +8,14 @@ import click
 import numpy as np
 import pytest
 
-from barpc import report, simulate
+from barpc import simulate
 from barpc.ba import Adjustment, adjust_tracks
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.cli import cli
 from barpc.cli.terminal import print_summary
-from barpc.export import TARGETS
-from barpc.report import Run, Summary
+from barpc.export.targets import TARGETS
+from barpc.report import Run, Summary, verdict
 from barpc.report.next_steps import _REPORT_PARTS, next_steps
 from barpc.report.outcome import Added
 from barpc.report.page import _QUESTIONS, report_html
@@ -87,7 +87,7 @@ class Case:
         options = RunOptions(adjust=OPTIONS, gcp=("p.gcp",) if gcps else (), dem=("dem.tif",) if dem else ())
         written = tuple({f"{view.name}.vrt": {"gdal": 1e-9}, f"{view.name}_RPC.TXT": {}} for view in block.views)
         run = Run("adjust", block.views, (), block.tracks, adjustment=found, options=options, gcps=gcps)
-        return report.summarize(replace(run, written=written)), found
+        return verdict.summarize(replace(run, written=written)), found
 
     def off(self, found: Adjustment) -> Array:
         """How far the scene lies from its true place, east, north, up [m]."""

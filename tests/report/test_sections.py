@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from barpc import report
 from barpc.report import page
 from barpc.report.runfiles import Draped, ReliefWindow
 from barpc.report.summary import StageEntry, TablesEntry, TracksEntry
@@ -423,5 +422,5 @@ def test_an_offset_of_nothing_is_not_one_that_is_unknown(after, said):
 
 def test_no_rule_of_drawings_is_the_name_of_a_verdict():
     """An outline has its verdict as a class: a rule of that name drew outlines of tied images as dots."""
-    css = Path(report.__file__).with_name("template.html.j2").read_text(encoding="utf-8")
+    css = Path(page.__file__).with_name("template.html.j2").read_text(encoding="utf-8")
     assert not re.findall(rf"(?:^|[}}\s])\.({'|'.join(STATUS_WORDS)})\b", css)

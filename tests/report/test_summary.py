@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from barpc import report
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.report import Run
+from barpc.report import Run, verdict
 from barpc.report.outcome import pair_ties, triangulate_tracks
 from barpc.report.page import decisions
 from barpc.report.records import Number, column, json_form, table
@@ -48,7 +47,7 @@ def test_the_summary_of_views_added_to_an_earlier_run_follows_the_schema():
     old = block.tracks.select(block.tracks.view < 2)
     prior = block_prior(adjust_tracks(block.views[:2], old))
     adjustment = adjust_tracks(block.views, block.tracks, prior=prior)
-    record = report.summarize(Run("adjust", block.views, (), block.tracks, adjustment=adjustment))
+    record = verdict.summarize(Run("adjust", block.views, (), block.tracks, adjustment=adjustment))
     assert record.scene.drift_sigma_m == (None,)  # the earlier run's matrix has it
     assert faults(json.loads(json.dumps(json_form(record))), SCHEMA) == []
     assert "as in the earlier run" in " ".join(decisions(record))

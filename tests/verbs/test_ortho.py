@@ -103,7 +103,7 @@ def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
     off = errors(made.path, image, Dem.open(dem))
     assert np.isfinite(off).all()
     assert off.max() < 0.1
-    with pytest.raises(InputError, match="--crs EPSG:3857: lies at both ends of this map"):  # not 40,000 km of it
+    with pytest.raises(InputError, match="crs EPSG:3857: lies at both ends of this map"):  # not 40,000 km of it
         barpc.ortho(image, tmp_path / "far", alt=150, crs="EPSG:3857")
     (made,) = barpc.ortho(image, tmp_path / "middle", alt=150, crs="EPSG:3832")  # Mercator about 150 E
     assert errors(made.path, image, 150.0).max() < 0.2

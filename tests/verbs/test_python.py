@@ -19,6 +19,7 @@ from click.testing import CliRunner
 from rasterio.io import MemoryFile
 
 import barpc
+from barpc.base import keywords
 from barpc.base.declarations import Options, declared
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
@@ -29,18 +30,14 @@ from barpc.simulate import simulate_block
 from barpc.verbs.images import every
 from barpc.verbs.options import FLAG_NAMES, run_options
 from barpc.verbs.points import with_altitudes
+from barpc.verbs.python import in_keywords
+from tests.docs.test_pages import script
 from tests.rpcio.conftest import make_rpc
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
 VIEWS = sorted(SAMPLES.glob("view_*.tif"))
 GROUND = [5.4, 43.3, 120.0]
 PUBLIC = [name for name in barpc.__all__ if name != "__version__"]
-
-
-def public(name: str) -> Any:
-    """What stands behind a name: of a folder the verb that it is when called."""
-    found = getattr(barpc, name)
-    return found.__wrapped__ if inspect.ismodule(found) else found
 
 
 def test_a_terrain_gives_points_their_altitudes():
@@ -56,18 +53,18 @@ def test_a_terrain_gives_points_their_altitudes():
 
 
 def test_every_verb_is_a_function_with_its_flags_as_keywords():
-    assert set(COMMANDS) - {"report"} <= set(PUBLIC)  # of a report AdjustResult.report, and files
-    positional = {"images", "points", "numbers", "files", "run_dir", "places", "target"}
+    assert set(COMMANDS) <= set(PUBLIC)
+    positional = {"images", "points", "numbers", "files", "run_dir", "run_dirs", "places", "target"}
     printed = {"image_list", "options_file", "paper", "out", "output", "outlines", "help_all", "at"}
-    of_options = {name for table in (RunOptions, TieOptions, AdjustOptions, FitOptions) for name in declared(table)}
-    of_options |= set(FLAG_NAMES.values())
-    for verb in set(COMMANDS) - {"report"}:
+    printed |= {"dry_run"}  # `barpc.plan`
+    for verb in COMMANDS:
         command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
         assert command is not None
-        known = {*positional, *printed, *inspect.signature(public(verb)).parameters, *of_options}
+        taken = inspect.signature(getattr(barpc, verb)).parameters
+        typed = str(taken["keywords"].annotation)[len("Unpack[") : -1] if "keywords" in taken else ""
+        known = {*positional, *printed, *taken, *(getattr(keywords, typed).__annotations__ if typed else ())}
         for flag in command.params:
-            name = re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "")
-            assert name in known or re.search(rf"\b{name}\b", inspect.getdoc(public(verb)) or ""), (verb, name)
+            assert re.sub(r"^flag_(tie_|adjust_|fit_)?", "", flag.name or "") in known, (verb, flag.name)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +82,7 @@ def test_every_verb_is_a_function_with_its_flags_as_keywords():
 )
 def test_what_a_verb_cannot_take_is_refused_by_the_names_of_both(verb, given, keyword, wrong):
     with pytest.raises(InputError, match=rf"^{verb}: .*{keyword}\b") as caught:
-        public(verb)(*given, **{keyword: wrong})
+        getattr(barpc, verb)(*given, **{keyword: wrong})
     assert "\n" not in str(caught.value)
 
 
@@ -102,28 +99,111 @@ def test_a_flag_that_holds_no_number_is_wrong_usage(flag, words):
     assert f"'{flag}'" in found.output
 
 
-def test_folders_that_are_verbs_are_both():
+def test_folders_with_the_name_of_a_verb_do_not_hide_it():
+    """Whichever is imported first, and of `barpc` nothing that costs."""
     code = (
-        "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); first = barpc.fit; "
-        "import barpc.fit.methods as m, barpc.dsm; from barpc.export import TARGETS; from barpc import fit; "
-        "assert first is fit is barpc.fit is sys.modules['barpc.fit']; assert barpc.fit.methods is m; "
-        "import inspect; assert 'alt_range' in inspect.getdoc(barpc.fit.__wrapped__); "
-        "print(*map(callable, (barpc.fit, barpc.dsm, barpc.export, barpc.ba, barpc.sensor)))"
+        "import sys, barpc; assert not {'numpy', 'typing'} & sys.modules.keys(); "
+        "from barpc.fit import methods, fit_rpc; import barpc.dsm.surface, barpc.export.targets; "
+        "from barpc import fit; "
+        "assert fit is barpc.fit and methods is sys.modules['barpc.fit.methods']; "
+        "assert fit_rpc is barpc.fit_rpc.__wrapped__; "
+        "import importlib; importlib.reload(barpc); from barpc.fit.points import terrain_range; "
+        "help(barpc.fit); print(barpc.fit.__name__, barpc.dsm.__name__, barpc.export.__name__)"
     )
     done = subprocess.run(
         [sys.executable, "-S", "-c", f"import site; site.main(); {code}"], capture_output=True, text=True
     )
-    assert done.stdout.split() == ["True"] * 3 + ["False"] * 2, done.stderr
+    *told, names = done.stdout.splitlines() or [done.stderr]
+    assert names == "fit dsm export", done.stderr
+    assert told[0] == "Help on function fit in module barpc.verbs.fitting:"
+    assert "alt_range" in done.stdout
 
 
 @pytest.mark.parametrize("name", PUBLIC)
 def test_every_public_name_says_what_it_returns_and_shows_how(name):
-    thing = public(name)
+    thing = getattr(barpc, name)
     text = inspect.getdoc(thing) or ""
     if inspect.isfunction(thing):
         assert re.search(r"^Returns\n-------$", text, re.MULTILINE), name
     if not (inspect.isclass(thing) and issubclass(thing, (Exception, Warning, Options))):  # (of options: `run_options`)
         assert re.search(r"^Examples\n--------\n>>> ", text, re.MULTILINE), name
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda out: barpc.adjust(VIEWS, out), r"exists and is not empty; give overwrite=True or another out_dir$"),
+        (lambda out: barpc.dsm(VIEWS, out), r"another out$|out the name of a new file"),
+        (
+            lambda out: barpc.convert(VIEWS, out_dir=out, window=(0, 0, 9, 9)),
+            "^window goes with a TARGET, not with out",
+        ),
+        (lambda out: barpc.localize(VIEWS[0], [5, 5], 1.0, dem=out), "^give either alt or dem$"),
+        (lambda out: barpc.verify(out, expect="12"), "^verify: expect 12: a root has 64"),
+        (lambda out: barpc.adjust(VIEWS[:1], out / "new"), r"ground control points \(gcp\)"),
+        (lambda out: barpc.adjust(["https://a.b/c.tif"] * 2, out / "new"), "give allow_remote a.b"),
+        (lambda out: barpc.info(VIEWS[0], at=(43.3, 5.4, 0.0), alt=0.0), r"^at \(43.3"),
+    ],
+)
+def test_errors_speak_of_keywords(call, words, tmp_path):
+    (tmp_path / "own.txt").touch()
+    with pytest.raises(BarpcError, match=words) as caught:
+        call(tmp_path)
+    assert not re.search(r"(?<!\w)--?[a-z]", str(caught.value).replace(str(tmp_path), ""))
+
+
+def test_commands_and_names_of_files_in_errors_stay_as_they_are():
+    said = "/a --gcp/b--dem.tif, x-o.tif: see 'barpc fit --keep-going', --no-such; give --gcp FILE, -j 2"
+    assert in_keywords(said, "out") == said.replace("give --gcp", "give gcp").replace("-j 2", "jobs 2").replace(
+        "/a --gcp/", "/a gcp/")  # fmt: skip
+
+
+def test_a_warning_points_at_the_line_of_the_caller():
+    calls = (
+        lambda: barpc.project(VIEWS[0], [6.4, 44.3, 120.0]),
+        lambda: barpc.localize(VIEWS[0], [500, 500]),
+    )
+    for call in calls:
+        with pytest.warns(BarpcWarning) as caught:
+            call()
+        assert {one.filename for one in caught} == {__file__}
+
+
+# --- types ------------------------------------------------------------------------------------------------
+
+
+def test_the_keywords_are_what_the_records_declare():
+    """And as the generator writes them: the file is no second declaration."""
+    assert script("generate_options").keywords() == Path(keywords.__file__).read_text()
+    of_run = {name for table in (RunOptions, TieOptions, AdjustOptions, FitOptions) for name in declared(table)}
+    assert keywords.RunKeywords.__annotations__.keys() == of_run | set(FLAG_NAMES.values())
+    for verb in PUBLIC:
+        taken = inspect.signature(getattr(barpc, verb)).parameters.get("keywords") if verb in COMMANDS else None
+        assert taken is None or re.fullmatch(r"Unpack\[\w+Keywords\]", taken.annotation), verb
+
+
+CALLS = """
+import barpc, os, pathlib
+barpc.adjust("a.tif", pathlib.Path("out"), gcp=["a.csv", pathlib.Path("b.csv")], drift=None, images="copy")
+barpc.dsm("run", "out.tif", gsd=2, alt=(0.0, 9.0))
+barpc.fit("a.tif", alt_range=[0, 400], method="ridge")
+barpc.adjust("a.tif", "out", gpc="a.csv")
+barpc.adjust("a.tif", "out", loss="huber")
+barpc.dsm("run", "out.tif", gsd="2")
+barpc.export("run", "out", "s2p", alt_range=(1.0, 2.0))
+barpc.fit("a.tif", matcher="guided")
+"""
+
+
+@pytest.mark.nightly
+def test_mypy_refuses_keywords_that_are_none(tmp_path):
+    """A minute where nothing is cached."""
+    mypy = pytest.importorskip("mypy.api")
+    (tmp_path / "calls.py").write_text(CALLS)
+    told, _, code = mypy.run([str(tmp_path / "calls.py"), "--follow-imports=silent"])
+    wrong = [int(line.split(":")[1]) for line in told.splitlines() if ": error:" in line]
+    assert (code, wrong) == (1, [6, 7, 8, 9, 10]), told
+    assert 'Unexpected keyword argument "gpc" for "adjust"' in told
 
 
 # --- images -----------------------------------------------------------------------------------------------
@@ -144,6 +224,42 @@ def test_a_path_a_dataset_a_view_and_a_camera_are_one_image():
     assert every(path for path in VIEWS) == list(map(str, VIEWS))
     with pytest.raises(InputError, match="3 is no image: give a path"):
         open_camera(3)
+
+
+class Place:
+    """A path as other libraries have it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+
+def test_open_datasets_and_other_peoples_paths_are_files_everywhere(tmp_path):
+    profile = {"driver": "GTiff", "width": 8, "height": 8, "count": 1, "dtype": "float32", "crs": "EPSG:4326+4979"}
+    with rasterio.open(
+        tmp_path / "dem.tif", "w", **profile, transform=rasterio.Affine(0.01, 0, 5.36, 0, -0.01, 43.34)
+    ) as file:
+        file.write(np.full((1, 8, 8), 120.0, np.float32))
+    expected = barpc.localize(VIEWS[0], [[500, 500]], 120.0)
+    with rasterio.open(VIEWS[0]) as image, rasterio.open(tmp_path / "dem.tif") as dem:
+        for given, terrain in ((image, dem), (Place(VIEWS[0]), Place(tmp_path / "dem.tif")), (VIEWS[0], [dem])):
+            np.testing.assert_allclose(
+                barpc.localize(given, [[500, 500]], dem=terrain, geoid="none"), expected, rtol=0, atol=1e-4
+            )
+            assert barpc.read_rpc(given) == barpc.read_rpc(VIEWS[0])
+            assert barpc.info(given, dem=terrain, geoid="none")["center_alt_m"] == pytest.approx(120.0)
+            barpc.write_rpc(barpc.read_rpc(given), Place(tmp_path / "a.RPB"), overwrite=True)
+        assert barpc.fit(image, Place(tmp_path / "f_RPC.TXT"), dem=[dem], geoid="none").max_ckp.max() < 0.01
+    assert barpc.convert(Place(VIEWS[0]), Place(tmp_path / "b.RPB")).passed
+    assert run_options(Place(write(tmp_path / "o.toml", "[tie]\nband = 2\n"))).tie.band == 2
+
+
+def write(path: Path, text: str) -> Path:
+    """A file with a text."""
+    path.write_text(text)
+    return path
 
 
 def test_a_dataset_in_memory_has_no_file_that_can_be_read():
@@ -279,9 +395,9 @@ def test_an_altitude_that_is_assumed_is_said_and_two_contradict():
     with pytest.warns(Remark, match="terrain height unknown, 250 m assumed"):
         found = barpc.localize(VIEWS[0], [500, 500])
     assert found[2] == 250.0
-    with pytest.raises(UsageError, match="either --alt or --dem"):
+    with pytest.raises(UsageError, match="either alt or dem"):
         barpc.localize(VIEWS[0], [500, 500], 120.0, dem="a.tif")
-    with pytest.raises(UsageError, match="--geoid goes with --dem"):
+    with pytest.raises(UsageError, match="geoid goes with dem"):
         barpc.project(VIEWS[0], GROUND, geoid="egm96")
     with pytest.raises(InputError, match=r"image points of shape \(2, 2\) for 3 images: \(\.\.\., 3, 2\)"):
         barpc.triangulate(VIEWS, np.zeros((2, 2)))
@@ -337,7 +453,7 @@ def test_what_is_converted_is_a_sentence_with_the_worst_reader(tmp_path):
     assert number is not None
     assert 0 <= float(number[1]) < 1e-9
     assert float(number[1]) == float(f"{max(one.max_error for one in done.readings):.1g}")
-    with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and -o DIR"):
+    with pytest.raises(UsageError, match="give SOURCE and TARGET, or images and out_dir DIR"):
         barpc.convert(VIEWS, tmp_path / "a.RPB")
     with pytest.raises(InputError, match=r"unknown option 'windw'; known are .*window"):
         barpc.convert(VIEWS[0], tmp_path / "a.tif", windw=(0, 0, 9, 9))
@@ -379,9 +495,7 @@ def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path
     assert found.record.headline.split(".")[0] in shown
     assert "view_00" in shown
     assert "report.html" not in shown
-    reserved = replace(
-        found, record=replace(found.record, reasons=("a < b",)), run=replace(found.run, out_dir=str(tmp_path))
-    )
+    reserved = replace(found, record=replace(found.record, reasons=("a < b",), out_dir=str(tmp_path)))
     assert reserved._repr_html_().endswith("<ul><li>a &lt; b</li></ul>")
     (tmp_path / "report.html").touch()
     assert reserved._repr_html_().endswith(f'<a href="{tmp_path}/report.html">report.html</a>')
@@ -406,7 +520,8 @@ def test_jobs_are_processes_a_cluster_or_the_executor_given(monkeypatch):
 
 def test_a_verb_works_in_the_process_that_calls_it_unless_told_otherwise():
     """Processes of its own need a script behind `if __name__ == "__main__":`."""
-    defaults = {name: inspect.signature(public(name)).parameters.get("jobs") for name in COMMANDS if name in PUBLIC}
+    verbs = {name: getattr(barpc, name) for name in COMMANDS if name in PUBLIC}
+    defaults = {name: inspect.signature(verb).parameters.get("jobs") for name, verb in verbs.items()}
     found = {name: parameter.default for name, parameter in defaults.items() if parameter is not None}
     assert set(found) >= {"adjust", "match", "check", "dsm"}
     assert set(found.values()) == {1}

@@ -1,4 +1,4 @@
-"""Tracks and GCPs as one block of observations sorted by view, and its start by the delivered cameras."""
+"""A block: observations of tracks, GCPs and reference points, sorted by view, and its state with delivered cameras."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, Tracks, View, connected_groups
 from barpc.sensor.rpc import localize_stack
 
-MIN_OBSERVATIONS = 4  # tie points of a view, or it stops: six unknowns need three points, and one to check them
+MIN_OBSERVATIONS = 4  # least tie points of a view: six unknowns need three points, and a fourth is a check
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Observations of tracks and of GCPs together, sorted by view."""
+    """Observations of tracks, GCPs and reference points, sorted by view."""
 
     views: tuple[View, ...]  # N views
     view: IntArray  # (K,)
-    point: IntArray  # (K,) those from `num_tracks` on are GCPs, those from `num_known` on a reference's
+    point: IntArray  # (K,) from `num_tracks` on GCPs, from `num_known` on points of the reference
     xy: Array  # (2, K) observed col, row [px]
     sigma: Array  # (K,) [px], view weights applied
-    order: IntArray  # (K,) row of each observation in the tracks, then in the GCPs and the reference, as given
-    use: BoolArray  # (K,) false for observations in views that are left out
-    gcps: GroundPoints  # none where there are none
+    order: IntArray  # (K,) index of each observation in the input: tracks, then GCPs, then reference
+    use: BoolArray  # (K,) false for observations of left-out views
+    gcps: GroundPoints  # may be empty
     reference: Reference | None
     num_tracks: int
-    num_known: int  # tracks and GCPs
-    num_points: int  # and points of the reference
-    num_rows: int  # given, used or not
-    left_out: tuple[str, ...]  # views outside the largest group
-    known: BoolArray | None = None  # (K,) observations that an earlier block was learnt from; None: there is none
+    num_known: int  # number of tracks and GCPs
+    num_points: int  # number of tracks, GCPs and reference points
+    num_rows: int  # number of observations in the input
+    left_out: tuple[str, ...]  # views outside the largest connected group
+    known: BoolArray | None = None  # (K,) observations that the prior of an earlier block contains; None: no such prior
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,11 +61,11 @@ class Block:
 
     @property
     def alt_range(self) -> tuple[float, float]:
-        """Lowest and highest altitude [m] that any view is used for."""
+        """Lowest and highest altitude [m] of the altitude ranges of all views."""
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
 
     def without(self, rows: BoolArray) -> Block:
-        """Return the block without some of its observations (K,)."""
+        """Return the block without the observations of a mask (K,)."""
         keep = ~rows
         return replace(
             self,
@@ -79,13 +79,13 @@ class Block:
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Return rows (K, ...) in the order in which observations were given; zeros where the block has none."""
+        """Return values (K, ...) in the order of the input observations; zeros for those that the block lacks."""
         out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
 
     def groups(self, rows: BoolArray) -> list[list[int]]:
-        """Return the groups into which views fall that points of some observations (K,) connect, the largest first."""
+        """Return the groups of views that are connected by common points of observations (K,), the largest first."""
         order = np.flatnonzero(rows)
         order = order[np.lexsort((self.view[order], self.point[order]))]
         same = np.flatnonzero(np.diff(self.point[order]) == 0)
@@ -93,12 +93,12 @@ class Block:
         return connected_groups(len(self.views), [(int(i), int(j)) for i, j in pairs])
 
     def first_points(self) -> Array:
-        """Return the points (P, 3), ECEF [m], on the first observing view's rays at its middle altitude."""
+        """Return the points (P, 3), ECEF [m], on the ray of the first observing view, at its middle altitude."""
         return self._first_points.copy()
 
     @cached_property
     def own_points(self) -> tuple[IntArray, Structure]:
-        """The points (Q,) that are observed, and who sees them, counted by these."""
+        """The observed points (Q,), and the structure of observations with points numbered among these."""
         index, point = np.unique(self.point, return_inverse=True)
         return index, make_structure(self.view, point, len(self.views), len(index))
 
@@ -129,7 +129,7 @@ def join(
 ) -> Block:
     """Join tracks and GCPs into one block; arguments and errors as in `barpc.ba.adjust_tracks`.
 
-    Views that an earlier block has `held` are tied to each other by it, and need no tie points.
+    Views `held` by the prior of an earlier block are connected by it, and need no tie points.
     """
     names = [view.name for view in views]
     _check_names(names, options)
@@ -148,7 +148,7 @@ def join(
         raise InputError("tracks: a track is observed twice in one view; keep one observation or none")
     count = np.bincount(view, minlength=len(views))
     is_held = np.isin(names, list(held))
-    controlled = np.bincount(view[len(tracks.view) :], minlength=len(views)) > 0  # by points whose places are known
+    controlled = np.bincount(view[len(tracks.view) :], minlength=len(views)) > 0  # by known points
     controlled |= is_held
     few = [f"{names[v]} ({count[v]})" for v in np.flatnonzero((count < MIN_OBSERVATIONS) & ~controlled)]
     if few and not keep_largest:
@@ -187,7 +187,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 def _disconnected_views(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool, is_held: BoolArray
 ) -> tuple[str, ...]:
-    """Return the views outside the largest group, rows sorted by point; GCPs tie their views to each other."""
+    """Return the views outside the largest group, observations sorted by point; GCPs connect all their views."""
     point = np.where(point >= num_tracks, num_tracks, point)
     same = point[1:] == point[:-1]
     keys = np.unique((view[:-1] * len(names) + view[1:])[same])
@@ -196,10 +196,10 @@ def _disconnected_views(
     if len(groups) == 1:
         return ()
     named = [[names[v] for v in group] for group in groups]
-    told = "; ".join(listed(group, 5) for group in named[:5])
+    listing = "; ".join(listed(group, 5) for group in named[:5])
     if not keep_largest:
         raise DisconnectedError(
-            f"the views fall into {len(groups)} groups without common tie points: {told}; add overlapping "
+            f"the views fall into {len(groups)} groups without common tie points: {listing}; add overlapping "
             "views or matches (--matches), or adjust the largest group only (--keep-going)",
             named,
         )
@@ -217,7 +217,7 @@ def make_problem(
     drift: int | None = None,
     waves: AdditionalParameters | None = None,
 ) -> Problem:
-    """Set up observations, cameras and priors before anything is known about points; `drift` overrides the options'."""
+    """Return the problem of a block without priors on points; `drift` overrides the degree of the options."""
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
@@ -253,7 +253,7 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
 
 
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
-    """Return the camera centres (N, 3) [m]: the earlier block's where it had them."""
+    """Return the camera centres (N, 3) [m]: of views of the earlier block those that it had."""
     if centers is None:
         centers = make_unknowns(block.views, options.first_model).center
     known = dict(zip(prior.names, prior.center, strict=True))
@@ -263,7 +263,7 @@ def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, 
 def first_state(
     problem: Problem, block: Block, options: AdjustOptions, dem: Terrain | None
 ) -> tuple[State, PointConstraints]:
-    """Triangulate the points with the delivered cameras, and return priors for those that the rays do not fix."""
+    """Triangulate the points with the delivered cameras; also return the constraints on points."""
     params = problem.camera_prior.mean
     points = block.first_points()
     points[~np.isfinite(points)] = 0.0
@@ -286,9 +286,9 @@ def first_state(
 
 
 def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: Array) -> Relief:
-    """Return the DEM beside points (P, 3) [m] that stand where the rays of the delivered cameras put them.
+    """Return the comparison of the DEM with points (P, 3) [m] triangulated by the delivered cameras.
 
-    Their expected distance from it is of first order in the cameras: points move by -V^-1 A^T B with the cameras.
+    The expected distance of points from the DEM is linear in the camera priors: points move by -V^-1 A^T B dp.
     """
     assert heights.dem is not None
     structure, sigma = problem.structure, problem.camera_prior.sigma
@@ -300,11 +300,11 @@ def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: 
     strong[heights.tracks[~heights.weak[heights.tracks]]] = True
     sharp = np.linalg.norm(solve_lower(lower, up), axis=0)
     found = Relief.of(heights.dem, ground, strong, sharp, heights.options.dem_sigma)
-    let = np.zeros(3)
+    deviations = np.zeros(3)
     for m, fit in enumerate(found.fit):
         moved = solve_transposed(lower, solve_lower(lower, up * fit))
         pull = np.einsum("cxk,xk->ck", by_point, moved.take(structure.point, axis=1)) * weight
         by_unknown = structure.sum_views(np.einsum("ck,cqk->qk", pull, projected.by_unknown))
         free = problem.free.reshape(by_unknown.shape)
-        let[m] = np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan
-    return replace(found, cameras=let)
+        deviations[m] = np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan
+    return replace(found, cameras=deviations)

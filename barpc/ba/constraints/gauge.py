@@ -1,11 +1,11 @@
-"""The datum of a block: shift, tilt, turn and bending of the scene, the weakest first, and their constraints.
+"""The datum of a block: uncertainty of shift, tilt, turn, scale and bending of the scene, and its sources.
 
-A change of the camera unknowns moves the points by dX = -V^-1 W^T dp. The mean of that move and its
-best-fitting tilts, turn, scale, twist and bending are linear in dp: ten numbers with a covariance.
+A change dp of the camera unknowns moves the points by dX = -V^-1 W^T dp. Ten motions of the scene (`MOTIONS`) are
+fitted to dX by least squares; they are linear in dp and have a covariance.
 
-Of all changes of cameras and points that move the scene in one of its motions, one is the most probable: the cheapest.
-What each source pays of its cost is its share of the information on the motion. Tie points have none: they tie cameras
-and points to each other, and what bends between them is paid for those who hold on to the Earth.
+Of all changes of cameras and points that have a given motion, one has the least cost. The part of that cost in each
+prior or control is its share of the information on the motion. Tie points have no share: they constrain cameras and
+points only relative to each other.
 """
 
 from __future__ import annotations
@@ -27,53 +27,50 @@ from barpc.base.statistics import MANY, SAMPLE
 from barpc.scene import BoolArray, IntArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
-"""The scene's motions [m]: shift; then rise to the east and north, turn and scale, at the scene's edge; what heights do
-that go with the product of east and north and with the square of each, beside a plane, from the lowest to the highest
-place of the scene. A rotation that changes with the row does the last: rows follow each other along the flight."""
+"""Motions of the scene [m]: shift; tilts, turn and scale as displacements at the radius of the scene; twist and bends
+as height ranges over the scene: heights proportional to east x north, to the squares of east and of north, each without
+its best-fitting plane. A rotation that changes with the row (drift) causes the latter."""
 SIMILAR = MOTIONS.index("twist")
-"""The first of these that bend the scene: those before keep its shape."""
+"""Number of motions that keep the shape of the scene; the others, from here on, bend it."""
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")
-"""The priors of the cameras, as delivered or of an earlier run; views that are fixed; GCPs; the DEM or assumed
-altitudes, with what these are wrong by together; a reference orthoimage, with what it is wrong by as a whole; heights
-without image coordinates."""
-_OF_HEIGHTS = 3  # with a reference: errors in common that are a terrain's, in front of its own
+"""Sources of information: camera priors as delivered, or of an earlier run; fixed views; GCPs; the DEM or assumed
+altitudes, with their common errors; a reference orthoimage, with its common errors; altimetry (heights without image
+coordinates)."""
+_OF_HEIGHTS = 3  # with a reference: common errors of the terrain, before those of the orthoimage
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One of the scene's motions, and how the others go with it."""
+    """One of the motions of the scene, with the correlated part of the others."""
 
     sigma: float  # its posterior standard deviation [m]
-    # (10,) all `MOTIONS` where this one is off by that [m]: a column of their covariance over it
-    motion: Array
-    meaning: str  # which it is
+    motion: Array  # (10,) expected errors of all `MOTIONS` if this one is wrong by sigma [m]
+    meaning: str  # its name
 
 
 @dataclass(frozen=True)
 class GaugeReport:
-    """Motion of the scene by an adjustment, and its standard deviations."""
+    """Motion of the scene by an adjustment, and posterior standard deviations of its motions."""
 
-    # (3,) mean move of the points from their place under the delivered cameras, east, north, up [m]
+    # (3,) mean displacement of the points from those of the delivered cameras, east, north, up [m]
     shift: Array
-    sigma: Array  # (3,) posterior standard deviation of the scene's place, east, north, up [m]
+    sigma: Array  # (3,) posterior standard deviation of the position, east, north, up [m]
     motion_sigma: Array  # (10,) the same for all `MOTIONS` [m]
     modes: tuple[Mode, ...]  # the weakest first
-    # RMS distance of the points from their middle [m]: where tilts, turn and scale are measured
-    radius: float
-    by_unknown: Array = field(repr=False)  # (10, N q) the motions by the unknowns of the cameras
-    own: Array = field(repr=False)  # (10, 10) their covariance where the cameras are known [m^2]
-    # (3,) how far off the delivered cameras let the scene be, east, north, up [m], by their priors as the block widened
-    # them; NaN where that is not known
+    radius: float  # RMS distance of the points from their middle [m], at which tilts, turn and scale are measured
+    by_unknown: Array = field(repr=False)  # (10, N q) derivative of the motions by the camera unknowns
+    own: Array = field(repr=False)  # (10, 10) their covariance with the cameras fixed [m^2]
+    # (3,) prior standard deviation of the position, from camera priors as widened, east, north, up [m]; NaN: unknown
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
 
 def gauge_report(
     covariance: Covariance, points: Array, before: Array, use: BoolArray, prior: Array | None = None
 ) -> GaugeReport:
-    """Report how an adjustment moved the scene: points (P, 3), ECEF [m], after and before it; those that
-    count in `use` (P,).
+    """Report how an adjustment moved the scene, from points (P, 3), ECEF [m], after and before it.
 
-    `prior` (N, q) are the standard deviations of the cameras' unknowns as delivered; infinite ones do not count.
+    `use` (P,) is the mask of points to use; `prior` (N, q) are prior standard deviations of the camera unknowns,
+    of which infinite ones are ignored.
     """
     shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
     index = np.flatnonzero(use)
@@ -94,9 +91,9 @@ def gauge_report(
 
 
 def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array) -> GaugeReport:
-    """Report the scene of an earlier block, by unknowns (N, q) of its cameras that were adjusted again.
+    """Report the scene of an earlier block, from the unknowns (N, q) of its cameras that were adjusted again.
 
-    Whatever was added tells more of it: new points are another scene, and may know theirs less.
+    New observations only reduce its uncertainty. New points form another scene, which may be more uncertain.
     """
     by_unknown = np.zeros((len(MOTIONS), params.size))
     by_unknown[:, prior.index] = scene.by_unknown
@@ -107,7 +104,7 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
 def _assembled_report(
     covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | float], radius: float
 ) -> GaugeReport:
-    """`motions`: by unknowns, their covariance where these are known, and by common errors then (10, k)."""
+    """`motions`: derivative by unknowns, covariance with these fixed, derivative by common errors with these fixed."""
     by_unknown, own, direct = motions
     motion_covariance = by_unknown @ covariance.of_noise.solve(by_unknown.T) + own
     if covariance.shared is not None:
@@ -118,7 +115,7 @@ def _assembled_report(
 
 
 def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> Array | float:
-    """Return the motions (10, k) by errors that images have in common, with the cameras held."""
+    """Return the derivative of the motions (10, k) by errors that images have in common, with the cameras fixed."""
     if covariance.shared is None:
         return 0.0
     chunks = ((pick[:, part], covariance.shared.of_points(index[part])) for part in parts(len(index), MANY))
@@ -126,8 +123,9 @@ def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> A
 
 
 def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:
-    """Return the motions by the cameras' unknowns (10, N q), their covariance (10, 10) with cameras known; `pick`
-    (10, n, 3) is their derivative by the moves of points.
+    """Return the derivative of the motions (10, N q) by camera unknowns, and their covariance with these fixed.
+
+    `pick` (10, n, 3) is their derivative by the points of `use`, `share` the sampled part of all points.
     """
     reduced, index = covariance.reduced, np.flatnonzero(use)
     # L^-1 of each motion's weights: dX = -L^-T Y dp
@@ -145,10 +143,10 @@ def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, sha
 
 
 def motions_of_moves(local: Array) -> Array:
-    """Return the matrix (10, n, 3) from moves of points, east, north and up, to the motions of the scene they make.
+    """Return the matrix (10, n, 3) from displacements of points, east, north, up, to least-squares `MOTIONS`.
 
-    In least squares, `MOTIONS` in the unit of the moves; `local` (n, 3): where the points are, in radii of the scene
-    from its middle. What so few or so narrow points do not tell is 0.
+    `local` (n, 3) are the points relative to their middle, in radii of the scene. Motions that the points do not
+    determine are 0.
     """
     n = len(local)
     e, o, one, zero = local[:, 0], local[:, 1], np.ones(n), np.zeros(n)
@@ -163,7 +161,7 @@ def motions_of_moves(local: Array) -> Array:
 
 
 def _bending_modes(east: Array, north: Array) -> Array:
-    """Return the heights (3, n) of a twist and two bends without the plane in them, each a metre in all."""
+    """Return the heights (3, n) of a twist and two bends, without a plane, each with a range of one metre."""
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
     if not len(east):
@@ -173,10 +171,7 @@ def _bending_modes(east: Array, north: Array) -> Array:
 
 
 def weakest_modes(motion_covariance: Array) -> tuple[Mode, ...]:
-    """Return the motions of the scene, the weakest first, by their covariance (10, 10) [m^2].
-
-    With each the motions (10,) [m] that go along with one standard deviation of it; zeros with one that is held.
-    """
+    """Return the motions of the scene, the most uncertain first, from their covariance (10, 10) [m^2]."""
     sigma = np.sqrt(np.maximum(np.diag(motion_covariance), 0.0))
     along = np.where(sigma > 0, motion_covariance, 0.0) / np.where(sigma > 0, sigma, 1.0)
     weakest = np.argsort(-sigma, kind="stable").tolist()
@@ -186,50 +181,49 @@ def weakest_modes(motion_covariance: Array) -> tuple[Mode, ...]:
 def datum_shares(
     covariance: Covariance, by_unknown: Array, problem: Problem, state: State, weight: Array, known: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Return the share (10,) of each source in the information on the scene's motions; NaN where no free
-    camera tells.
+    """Return the share (10,) of each source in the information on the motions; NaN for motions of fixed cameras.
 
     Parameters
     ----------
     covariance : Covariance, at the solution
     by_unknown : (10, N q), motions by the unknowns of the cameras
-    problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
-    known : (int, int), points from the first on are GCPs, from the second on a reference's
+    problem, state, weight : of the last solve; weight (K,) is 1 / sigma of each observation
+    known : (int, int), indices of the first GCP and of the first reference point
     """
     moves = covariance.of_noise.solve(by_unknown.T)
     variance = np.einsum("mn,nm->m", by_unknown, moves)
-    told = variance > 0.0
-    scale = np.where(told, 1.0 / np.sqrt(np.where(told, variance, 1.0)), 0.0)
+    determined = variance > 0.0
+    scale = np.where(determined, 1.0 / np.sqrt(np.where(determined, variance, 1.0)), 0.0)
     unknowns = (moves * scale).reshape(problem.structure.num_views, -1, len(variance))
-    paid = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
-    paid["cameras"] += (problem.camera_prior.whitened(unknowns) ** 2).sum(axis=(0, 1))
+    cost_of = dict(zip(SOURCES, np.zeros((len(SOURCES), len(variance))), strict=True))
+    cost_of["cameras"] += (problem.camera_prior.whitened(unknowns) ** 2).sum(axis=(0, 1))
     if (joint := problem.joint_prior) is not None:
         flat = unknowns.reshape(-1, len(variance))[joint.index]
-        paid["earlier_run" if joint.earlier else "cameras"] += (flat * (joint.information @ flat)).sum(axis=0)
+        cost_of["earlier_run" if joint.earlier else "cameras"] += (flat * (joint.information @ flat)).sum(axis=0)
     prior = problem.point_prior
     if (prior is not None and len(prior.index)) or not problem.free.all():
         reduced, structure = covariance.reduced, problem.structure
         number, fixed = np.arange(structure.num_points), ~problem.free.reshape(structure.num_views, -1)[:, 0]
         kinds = {"gcps": (number >= known[0]) & (number < known[1]), "reference": number >= known[1]}
-        asked = np.isin(number, structure.point[fixed[structure.view]])
-        asked[[] if prior is None else prior.index] = True
+        with_prior = np.isin(number, structure.point[fixed[structure.view]])
+        with_prior[[] if prior is None else prior.index] = True
         points = np.zeros((len(number), 3, len(variance)))
-        points[asked] = reduced.carried(unknowns, np.flatnonzero(asked))
-        held = _point_shares(paid, problem, reduced, unknowns, points, kinds)
-        _add_observation_shares(paid, problem, state, weight, (unknowns, points), held)
+        points[with_prior] = reduced.carried(unknowns, np.flatnonzero(with_prior))
+        held = _point_shares(cost_of, problem, reduced, unknowns, points, kinds)
+        _add_observation_shares(cost_of, problem, state, weight, (unknowns, points), held)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return {source: np.where(told, cost / sum(paid.values()), np.nan) for source, cost in paid.items()}
+        return {source: np.where(determined, cost / sum(cost_of.values()), np.nan) for source, cost in cost_of.items()}
 
 
 def _point_shares(
-    paid: Mapping[str, Array],
+    cost_of: Mapping[str, Array],
     problem: Problem,
     reduced: Reduced,
     unknowns: Array,
     points: Array,
     kinds: Mapping[str, BoolArray],
 ) -> Mapping[str, BoolArray]:
-    """Add the cost of moving known points and heights; the points (P,) of each kind that are held."""
+    """Add the costs of points with priors to `cost_of`; return the mask (P,) of such points of each kind."""
     held = {kind: np.zeros(len(rows), dtype=bool) for kind, rows in kinds.items()}
     prior, count = problem.point_prior, unknowns.shape[2]
     if prior is None:
@@ -238,29 +232,29 @@ def _point_shares(
     shared = np.zeros((prior.common.shape[2], count))
     if reduced.common is not None:
         shared = reduced.common.step(unknowns.reshape(-1, count))
-    left = ((prior.rows @ points[prior.index] - prior.common @ shared) ** 2).sum(axis=1)
+    own_costs = ((prior.rows @ points[prior.index] - prior.common @ shared) ** 2).sum(axis=1)
     for kind, rows in kinds.items():
         own = rows[prior.index]
         held[kind][prior.index] = own
-        paid[kind][:] += left[own].sum(axis=0)
+        cost_of[kind][:] += own_costs[own].sum(axis=0)
         rest &= ~own
     of_heights = _OF_HEIGHTS if held["reference"].any() else FIRST_PLACED
-    placed = rest & prior.common[:, :, FIRST_PLACED:].any(axis=(1, 2))
-    paid["altimetry"][:] += left[placed].sum(axis=0) + (shared[FIRST_PLACED:] ** 2).sum(axis=0)
-    paid["heights"][:] += left[rest & ~placed].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
-    paid["reference"][:] += (shared[of_heights:FIRST_PLACED] ** 2).sum(axis=0)
+    by_altimetry = rest & prior.common[:, :, FIRST_PLACED:].any(axis=(1, 2))
+    cost_of["altimetry"][:] += own_costs[by_altimetry].sum(axis=0) + (shared[FIRST_PLACED:] ** 2).sum(axis=0)
+    cost_of["heights"][:] += own_costs[rest & ~by_altimetry].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
+    cost_of["reference"][:] += (shared[of_heights:FIRST_PLACED] ** 2).sum(axis=0)
     return held
 
 
 def _add_observation_shares(
-    paid: Mapping[str, Array],
+    cost_of: Mapping[str, Array],
     problem: Problem,
     state: State,
     weight: Array,
     moves: tuple[Array, Array],
     held: Mapping[str, BoolArray],
 ) -> None:
-    """Add the cost of moving the observations of known points, and of tie points in fixed views."""
+    """Add the costs of observations of known points, and of tie points in fixed views, to `cost_of`."""
     structure, (unknowns, points) = problem.structure, moves
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
     known = np.any(list(held.values()), axis=0)
@@ -277,6 +271,6 @@ def _add_observation_shares(
         change += np.einsum("cxk,kxm->ckm", projected.by_point[..., part], points[at])
         cost = ((change * weight[rows[part], None]) ** 2).sum(axis=0)
         for kind, held_points in held.items():
-            paid[kind][:] += cost[held_points[at]].sum(axis=0)
+            cost_of[kind][:] += cost[held_points[at]].sum(axis=0)
         if not is_free[v]:
-            paid["fixed_views"][:] += cost[~known[at]].sum(axis=0)
+            cost_of["fixed_views"][:] += cost[~known[at]].sum(axis=0)

@@ -1,4 +1,4 @@
-"""Priors on points: GCPs, a terrain, and heights for tracks that rays alone do not determine."""
+"""Priors on points: GCPs, a DEM, and heights for tracks that rays alone do not determine."""
 
 from __future__ import annotations
 
@@ -29,18 +29,16 @@ from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 from barpc.sensor.curve import cross
 
 FIRST_PLACED = NUM_BENDS
-"""Errors in common in front of altimetry's own: a terrain's bends, or a terrain's and a reference's."""
-DEM_BIAS = 20.0  # m, where none is stated
-KNOWN_BIAS = 5.0  # m: the same, where it is known what its heights count from
-MAX_INDEPENDENT_ERRORS = (
-    25.0  # independent errors that those of a reference are worth together, at most: they resemble each other
-)
-_STAYS = 1.0  # m: rays of weak points tell heights to hundreds of metres (0.05 m under 0.01 degrees: 290 m)
-_FLAT_SIGMA = 50.0  # m: least spread of altitudes that tracks held without a DEM are given
+"""Index of the first common error of altimetry; those before it are of a DEM, or of a DEM and a reference."""
+DEM_BIAS = 20.0  # m: common error of a DEM, if not stated
+KNOWN_BIAS = 5.0  # m: the same, if its vertical datum is known
+MAX_INDEPENDENT_ERRORS = 25.0  # effective number of independent points of a DEM or reference with correlated errors
+_ALTITUDE_SIGMA = 1.0  # m: keeps weak points at an altitude; 0.05 m across rays at 0.01 degrees is 290 m in height
+_FLAT_SIGMA = 50.0  # m: least prior sigma of altitudes without a DEM
 
 
 def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
-    """Return one block of several that speak of different points, and share their errors; None where all are empty."""
+    """Concatenate priors on different points, with equal columns of common errors as the same; None: all are empty."""
     given = [prior for prior in priors if prior is not None and len(prior.index)]
     if not given:
         return None
@@ -51,7 +49,7 @@ def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
 
 
 def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
-    """Return GCPs as priors on the points `index` (G,): east, north and up by their sigmas."""
+    """Return GCPs as priors on the points `index` (G,), with their sigmas east, north and up."""
     rows = enu_basis(gcps.lonlatalt) / gcps.sigma[..., None]
     return PointPrior(index, ecef_from_ground(gcps.lonlatalt), rows, np.zeros((len(index), 3, 0)))
 
@@ -59,15 +57,15 @@ def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
 def reference_control(reference: Reference, index: IntArray) -> PointPrior:
     """Return the points of a reference as priors on the points `index` (R,).
 
-    What they share: the height and slopes of the terrain, as points held to it do, the orthoimage's own place, and
-    that what was matched may stand above the terrain (houses, trees). A terrain's errors reach over many points: all
-    of these are worth `MAX_INDEPENDENT_ERRORS` independent heights, at most.
+    Common errors: offset and tilts of the DEM (shared with the points constrained to it), offset of the orthoimage,
+    and a height of matched features above the DEM (houses, trees). Errors of a DEM are correlated: sigmas of heights
+    are enlarged, so that all weigh no more than `MAX_INDEPENDENT_ERRORS` independent ones.
     """
     sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0))]
     alone = ground_control(replace(reference.points, sigma=sigma), index)
     common = np.zeros((len(index), 3, 6))
     common[:, 2, 0] = reference.bias[2] / sigma[:, 2]
-    common[:, 2, 1:3] = _slopes(alone.mean, alone.mean) * (reference.bias[2] / sigma[:, 2:])
+    common[:, 2, 1:3] = _normalised(alone.mean, alone.mean) * (reference.bias[2] / sigma[:, 2:])
     common[:, 2, 5] = reference.points.sigma[:, 2] / sigma[:, 2]
     common[:, 0, 3], common[:, 1, 4] = reference.bias[0] / sigma[:, 0], reference.bias[1] / sigma[:, 1]
     return replace(alone, common=common)
@@ -82,13 +80,11 @@ def terrain_heights(
     span: Array | None = None,
     level: BoolArray | None = None,
 ) -> PointPrior:
-    """Return priors that hold points `index` (Q,) of (P, 3) to a terrain: their height above its tangent
-    plane.
+    """Return priors that constrain points `index` (Q,) of (P, 3) to the local tangent planes of a DEM.
 
-    Single altitudes are known to `sigma` [m]; all of them may be wrong by `common_sigma` [m], and by a slope that
-    is as much at the scene's edges. Points where the terrain is unknown are left out.
-    The edges are the points' own, or those of `span` (n, 3) [m], with which they share these errors. Points that are
-    `level` (Q,) are constrained in height alone.
+    `sigma` [m] is that of single heights, `common_sigma` [m] that of a common offset, and of tilts at the edges of the
+    scene. These edges are those of the points, or of `span` (n, 3) [m] if other priors share the errors. For points
+    that are `level` (Q,) the slope is ignored. Points without a DEM height are left out.
     """
     ground = ground_from_ecef(points[index])
     alt = terrain(ground[:, 0], ground[:, 1])
@@ -99,30 +95,29 @@ def terrain_heights(
     return _heights(np.column_stack([ground[:, :2], alt]), index, normal, sigma, common_sigma, span)
 
 
-def _believed_heights(ground: Array, index: IntArray, believed: RegularisedDem, common_sigma: Array) -> PointPrior:
-    """Return the constraints of points `index` (Q,), at ground points (Q, 3), to a DEM of estimated accuracy.
+def _weighted_heights(ground: Array, index: IntArray, weighted: RegularisedDem, common_sigma: Array) -> PointPrior:
+    """Return priors that constrain points `index` (Q,), at ground points (Q, 3), to a DEM of estimated accuracy.
 
-    All of it may be wrong by a level, slopes and bends that are as much as `common_sigma` (`NUM_BENDS`,) [m] at the
-    scene's edges.
+    `common_sigma` (`NUM_BENDS`,) [m] are the sigmas of its offset, tilts and bends, at the edges of the scene.
     """
-    normal, sigma = np.column_stack([-believed.slopes, np.ones(len(ground))]), believed.effective_sigma
-    held = _heights(np.column_stack([ground[:, :2], believed.alt]), index, normal, sigma, 0.0)
-    common = np.zeros((len(held.index), 3, NUM_BENDS))
-    common[:, 0] = believed.bends[np.isfinite(believed.alt)] * (common_sigma / sigma)
-    return replace(held, common=common)
+    normal, sigma = np.column_stack([-weighted.slopes, np.ones(len(ground))]), weighted.effective_sigma
+    prior = _heights(np.column_stack([ground[:, :2], weighted.alt]), index, normal, sigma, 0.0)
+    common = np.zeros((len(prior.index), 3, NUM_BENDS))
+    common[:, 0] = weighted.bends[np.isfinite(weighted.alt)] * (common_sigma / sigma)
+    return replace(prior, common=common)
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
-    """Return priors that hold points to one altitude [m]: each within `sigma`, all within `common_sigma` [m]."""
+    """Return priors that constrain points to one altitude [m], with sigmas of single and of common errors [m]."""
     ground = ground_from_ecef(points[index])
     ground[:, 2] = alt
     return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), sigma, common_sigma)
 
 
 def staying(points: Array, index: IntArray) -> PointPrior:
-    """Return priors that hold points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
+    """Return priors that constrain points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
     ground = ground_from_ecef(points[index])
-    return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), _STAYS, 0.0)
+    return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), _ALTITUDE_SIGMA, 0.0)
 
 
 def _heights(
@@ -135,12 +130,12 @@ def _heights(
     common[:, 0, 0] = common_sigma / sigma
     mean = ecef_from_ground(foot)
     if len(foot):
-        common[:, 0, 1:] = _slopes(mean, mean if span is None else span) * (common_sigma / sigma)
+        common[:, 0, 1:] = _normalised(mean, mean if span is None else span) * (common_sigma / sigma)
     return PointPrior(index[known], mean, rows, common)
 
 
-def _slopes(points: Array, span: Array) -> Array:
-    """Return the positions east and north of points (n, 3) in a scene, 1 at the edges of `span` (m, 3), ECEF [m]."""
+def _normalised(points: Array, span: Array) -> Array:
+    """Return normalised positions (n, 2), east and north, of points (n, 3): +-1 at the edges of `span` (m, 3) [m]."""
     middle = span.mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))[:2]
     edge = np.abs((span - middle) @ enu.T).max(axis=0)
@@ -148,9 +143,9 @@ def _slopes(points: Array, span: Array) -> Array:
 
 
 def convergence_angles(structure: Structure, projected: Projected, points: Array) -> Array:
-    """Return the convergence angle (P,) [rad] of each point's rays: twice the largest angle to their mean."""
+    """Return the convergence angle (P,) [rad] of the rays of each point: twice the largest angle to their mean."""
     count, up = len(structure.point), np.ascontiguousarray(points.T)
-    rays, apart = np.empty((3, count)), np.empty(count)
+    rays, to_mean = np.empty((3, count)), np.empty(count)
     for part in parts(count):
         ray = cross(*projected.by_point[..., part])
         with np.errstate(all="ignore"):
@@ -159,54 +154,53 @@ def convergence_angles(structure: Structure, projected: Projected, points: Array
     mean = structure.sum_points(rays)
     mean /= np.maximum(np.linalg.norm(mean, axis=0), 1e-12)
     for part in parts(count):
-        apart[part] = np.linalg.norm(rays[:, part] - mean.take(structure.point[part], axis=1), axis=0)
+        to_mean[part] = np.linalg.norm(rays[:, part] - mean.take(structure.point[part], axis=1), axis=0)
     largest = np.zeros(structure.num_points)
-    np.maximum.at(largest, structure.point, apart)
+    np.maximum.at(largest, structure.point, to_mean)
     return 4.0 * np.arcsin(np.minimum(0.5 * largest, 1.0))
 
 
 @dataclass(frozen=True)
 class TerrainTest:
-    """Result of holding tie points to a terrain, and their heights above it."""
+    """Comparison of a DEM with the tie points, and its use as a constraint."""
 
-    held: int  # tie points that it holds
-    known: int  # tie points where it has a height
+    held: int  # tie points constrained to the DEM
+    known: int  # tie points with a DEM height
     total: int  # tie points in use
-    offset: float  # median of the adjusted altitudes minus the terrain's [m]; NaN where it has none
-    spread: float  # 1.4826 times their median absolute deviation [m]
-    bias: float  # what its heights may be wrong by together [m]
-    sigma: float = np.nan  # standard deviation of single heights, as the tie points show it [m]; NaN: as stated
-    alike: float = 1.0  # as many single heights are worth one
-    gains: tuple[float, ...] = ()  # how much of its relief is believed, scale by scale, the finest first
+    offset: float  # median of adjusted altitudes minus the DEM [m]; NaN: no DEM height
+    spread: float  # 1.4826 times the median absolute deviation of these [m]
+    bias: float  # standard deviation of its common error [m]
+    sigma: float = np.nan  # standard deviation of single heights, estimated from the tie points [m]; NaN: as stated
+    alike: float = 1.0  # number of correlated heights that weigh as one independent height
+    gains: tuple[float, ...] = ()  # weight (0 to 1) of its relief at each scale, the finest first
     relief: float = np.nan  # its relief as a multiple of the tie points'
-    shows: bool = True  # whether that may be one: else it is of another terrain, and holds nothing
-    agrees: bool = True  # whether it may be one still beside the adjusted tie points, which it holds
-    is_known: bool = True  # whether it is known what its heights count from
-    # (3,) how the tie points lie to it as delivered, level, rise to the east and to the north [m]
+    shows: bool = True  # whether that ratio may be 1; else it is of another terrain, and not used
+    agrees: bool = True  # the same with the adjusted tie points
+    is_known: bool = True  # whether its vertical datum is known
+    # (3,) offset and tilts, east and north, of the tie points above it before the adjustment [m]
     delivered: tuple[float, ...] = (np.nan,) * 3
-
-    beyond: tuple[float, ...] = (np.nan,) * 3  # times what its accuracy and the cameras' let expect of that
+    beyond: tuple[float, ...] = (np.nan,) * 3  # `delivered` over the standard deviations of DEM and cameras
 
 
 @dataclass(frozen=True)
 class PointConstraints:
-    """The priors on points: GCPs, and heights for tracks that need (or are given) them."""
+    """All priors on points: GCPs, reference, DEM, and heights of weak tracks."""
 
     control: tuple[PointPrior, ...]  # GCPs, then a reference if there is one
-    weak: BoolArray  # (P,) points whose rays meet under too small an angle
-    tracks: IntArray  # (T,) points that are tracks (GCPs are held already)
-    alt_range: tuple[float, float]  # altitudes [m] to expect where no other track tells
+    weak: BoolArray  # (P,) points with too small a convergence angle
+    tracks: IntArray  # (T,) points that are tracks
+    alt_range: tuple[float, float]  # altitudes [m] to expect if no other track determines them
     options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`
-    dem: Terrain | None  # none: weak tracks resemble the others in height, wherever these are
-    reference: Reference | None = None  # whose heights are the DEM's
-    has_control: bool = False  # whether GCPs hold the scene's place
-    relief: Relief | None = None  # the DEM beside what rays alone say of heights, where these may judge it
-    placed: PointPrior | None = None  # tracks that altimetry holds, which nothing else does then
-    # (D + 1,) largest factors on the priors of drifts and turns: those of tie points alone; None: of all observations
+    dem: Terrain | None  # None: weak tracks are constrained to the median altitude of the others
+    reference: Reference | None = None  # with heights of the DEM
+    has_control: bool = False  # whether GCPs constrain the position of the scene
+    relief: Relief | None = None  # comparison of the DEM with heights from rays alone
+    placed: PointPrior | None = None  # height priors of tracks from altimetry; these have no other prior
+    # (D + 1,) largest factors on the priors of drifts and turns, estimated from tie points alone; None: no limit
     widest: tuple[float, ...] | None = None
 
     def loose(self, sigma: float) -> PointConstraints:
-        """Return the priors with GCPs known to `sigma` [m] only."""
+        """Return the priors with the GCPs loosened to `sigma` [m]."""
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
@@ -218,7 +212,7 @@ class PointConstraints:
         return tuple(kind for kind, there in given.items() if there)
 
     def without_control(self, sigma: float) -> PointConstraints:
-        """Return the priors of tie points alone: no DEM, the points of GCPs and of a reference known to `sigma` [m]."""
+        """Return the priors without a DEM, and with GCPs and reference points loosened to `sigma` [m]."""
         control = [
             replace(one, rows=enu_basis(ground_from_ecef(one.mean)) / sigma, common=one.common[..., :0])
             for one in self.control
@@ -227,31 +221,38 @@ class PointConstraints:
 
     @property
     def is_judged(self) -> bool:
-        """Whether the tie points decide the weight of the DEM."""
+        """Whether the weight of the DEM is estimated from the tie points."""
         given = self.dem is None or self.reference is not None
         return not given and self.options.learn_priors
 
     def hold(self, problem: Problem, points: Array) -> Problem:
-        """Return the problem with priors on points that stand at `points` (P, 3), ECEF [m]."""
-        return replace(problem, point_prior=_join_priors([*self.control, self._held(points), self.placed]))
+        """Return the problem with the priors on points, computed at `points` (P, 3), ECEF [m]."""
+        return replace(problem, point_prior=_join_priors([*self.control, self._height_priors(points), self.placed]))
 
-    def _believed(self, points: Array) -> RegularisedDem | None:
+    def _weighted_dem(self, points: Array) -> RegularisedDem | None:
+        """Return the DEM weighted by its comparison with the tie points; None without such a comparison."""
         if self.relief is None:
             return None
         return believe(self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma)
 
-    def _held(self, points: Array) -> PointPrior | None:
-        weak, believed = self.weak[self.tracks], self._believed(points)
+    def _height_priors(self, points: Array) -> PointPrior | None:
+        """Return the height priors of tracks without altimetry; None: there are none.
+
+        DEM with an accuracy estimated from tie points: all tracks; if of another terrain, as without a DEM. DEM as
+        given: all tracks, sigma enlarged for correlation. DEM not compared yet: weak tracks. No DEM: weak tracks, at
+        the median altitude of the others, or the middle of the altitude range.
+        """
+        weak, weighted = self.weak[self.tracks], self._weighted_dem(points)
         free = np.ones(len(weak), dtype=bool)
         if self.placed is not None:
             free = ~np.isin(self.tracks, self.placed.index)
-        if believed is not None and believed.shows:
+        if weighted is not None and weighted.shows:
             ground = ground_from_ecef(points[self.tracks])
             assert self.relief is not None
             common = self.relief.common_sigma(self._bias)
-            held = _believed_heights(ground, self.tracks, believed, common)
-            return held.select(np.isin(held.index, self.tracks[free]))
-        dem = self.dem if believed is None else None
+            prior = _weighted_heights(ground, self.tracks, weighted, common)
+            return prior.select(np.isin(prior.index, self.tracks[free]))
+        dem = self.dem if weighted is None else None
         judged_later = self.is_judged and self.relief is None
         is_whole = dem is not None and not judged_later
         chosen = free if is_whole else free & weak
@@ -259,37 +260,37 @@ class PointConstraints:
         if not len(index):
             return None
         if dem is not None:
-            alike, span = 1.0, None
+            correlated, span = 1.0, None
             if self.reference is not None:
-                alike, span = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0), self.control[1].mean
+                correlated, span = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0), self.control[1].mean
             elif self.relief is not None:
-                alike = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0)
+                correlated = max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0)
             level = None if self.relief is None else ~weak[chosen]
-            sigma = self.options.dem_sigma * alike**0.5
+            sigma = self.options.dem_sigma * correlated**0.5
             return terrain_heights(points, index, dem, sigma, self._bias, span, level)
         others, (lowest, highest) = self.tracks[~weak], self.alt_range
         middle, sigma = 0.5 * (lowest + highest), 0.5 * (highest - lowest)
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
             sigma = high - low
-        # what they all are off by is told by the cameras, as far as they tell it: that heights of tracks just above
-        # the least angle are right is known to nobody, and of the altitudes of an RPC that they lie within its range
+        # a wide common sigma: altitudes of the other tracks may be biased, and those of an RPC only limit the range;
+        # the cameras determine it
         return flat_heights(points, index, float(middle), max(float(sigma), _FLAT_SIGMA), highest - lowest)
 
     @property
     def _bias(self) -> float:
-        """Standard deviation of an offset of a whole terrain [m]."""
+        """Standard deviation of the common error of the DEM [m]."""
         if self.reference is not None:
             return float(self.reference.bias[2])
         return self.options.dem_bias_sigma or (KNOWN_BIAS if self._is_known is True else DEM_BIAS)
 
     @property
     def _is_known(self) -> bool | None:
-        """Whether the vertical datum of a DEM is known; None of a function."""
+        """Whether the vertical datum of the DEM is known; None if the DEM is a plain function."""
         return getattr(self.dem, "known", None)
 
     def test(self, points: Array, seen: BoolArray) -> TerrainTest | None:
-        """Compare the terrain with the tracks `seen` (P,), at their adjusted places; None without a terrain."""
+        """Compare the DEM with the adjusted positions of the tracks `seen` (P,); None without a DEM."""
         if self.dem is None:
             return None
         index = self.tracks[seen[self.tracks]]
@@ -297,9 +298,9 @@ class PointConstraints:
         dem = self.dem(ground[:, 0], ground[:, 1])
         above = ground[:, 2] - dem
         known = np.isfinite(above)
-        believed = self._believed(points)
-        held, shows = self._held(points), believed is None or believed.shows
-        count = 0 if held is None or not shows else int(np.isin(index[known], held.index).sum())
+        weighted = self._weighted_dem(points)
+        prior, shows = self._height_priors(points), weighted is None or weighted.shows
+        count = 0 if prior is None or not shows else int(np.isin(index[known], prior.index).sum())
         offset = float(np.median(above[known])) if known.any() else np.nan
         spread = robust_spread(above[known], offset) if known.any() else np.nan
         found = TerrainTest(count, int(known.sum()), len(index), offset, spread, self._bias)
@@ -307,9 +308,9 @@ class PointConstraints:
         if self.relief is not None:
             delivered, beyond = self.relief.delivered, self.relief.beyond(self._bias)
             found = replace(found, delivered=tuple(map(float, delivered)), beyond=tuple(map(float, beyond)))
-        if believed is not None:
-            judged = {name: getattr(believed, name) for name in ("sigma", "alike", "relief", "shows")}
-            found = replace(found, gains=tuple(map(float, believed.gains)), **judged)
+        if weighted is not None:
+            judged = {name: getattr(weighted, name) for name in ("sigma", "alike", "relief", "shows")}
+            found = replace(found, gains=tuple(map(float, weighted.gains)), **judged)
         if self.relief is not None and shows:
             times, agrees = relief_ratio(ground[known], dem[known], self.options.dem_sigma)
             found = replace(found, relief=times, agrees=agrees)

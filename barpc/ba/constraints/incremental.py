@@ -1,9 +1,9 @@
-"""Carrying an adjusted block into the next run: its reduced normal matrix as a prior on its views.
+"""The reduced normal matrix of an adjusted block, as a prior on its views in a later run.
 
-Old tie points are not needed again: everything that they say about the old views is in the matrix. A run that adds
-images has some of the old views only, those that the new images meet: `BlockPrior.marginal` eliminates the others, and
-`BlockPrior.joined` puts what the run found back into the matrix of all views, new ones behind. So a block that grows
-image by image ends with the matrix of one that was adjusted whole, but for where it was linearised.
+It contains the information of the old tie points, which are not needed again. A run that adds images contains only
+those old views that overlap the new images: `BlockPrior.marginal` eliminates the others. `BlockPrior.joined` updates
+the matrix of all views with the result of the run, new views last. A block that grows image by image thus ends with the
+matrix of one joint adjustment, except for the points of linearisation.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ _SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
 _CSR = ("data", "indices", "indptr")  # of release 0.3
 _LEARNT = ("told", "shown", "written")
 _SCENE = ("by_unknown", "own", "radius")
-_FACTOR_BYTES = 1e8  # bytes of the factor of a whole block, which is read twice: the rest goes to a temporary file
+_FACTOR_BYTES = 1e8  # bytes of the factor of a whole block to keep in memory; the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """A block of which some views are left, the others eliminated."""
+    """The whole block of a marginal prior, and how to solve with it."""
 
-    block: BlockPrior  # the whole of it
-    index: IntArray  # (m q,) the unknowns that are left
+    block: BlockPrior  # with all views
+    index: IntArray  # (m q,) the unknowns of the views that were not eliminated
     solve: Callable[[Array], Array]  # (n q,) or (n q, k) right-hand sides -> solutions with the whole matrix
 
 
@@ -51,31 +51,31 @@ class BlockPrior:
     Parameters
     ----------
     names : tuple of str
-        Views of the block that were free, n of them.
+        The n views of the block that were not fixed.
     model, drift : str, int
         The unknowns (see `AdjustOptions`).
     params : (n, q)
         Their values.
     information : (n q, n q), array or Blocks
-        Their joint information matrix, priors included.
+        Their joint information (reduced normal matrix), priors included.
     center : (n, 3)
         Camera centres [m], ECEF.
     less : (m, n q)
-        Rows B of B^T B that is still to be taken off a sparse matrix: what heights have in common.
+        B^T B is to be subtracted from a sparse `information`: it is that of common errors of heights.
     layout : AdditionalParameters or None
-        Of the unknowns in the image; None: there are none.
+        Layout of the additional parameters in the images; None: there are none.
     radars : tuple of str
-        Views of the block whose unknowns are a radar's clocks.
+        Views of radars with corrected clocks.
     scene : EarlierScene or None
-        Scene of the block, by its cameras' unknowns; None: written by an earlier release.
+        Motions of the scene by the camera unknowns; None: file of an earlier release.
     told : (n,) or None
-        What tie points tell of each view, before what all of a view share caps it [1/px^2].
+        Information of tie points on each view, without the limit by errors common to a view [1/px^2].
     shown : (4 + drift, 2) or None
-        What the corrections of all views show of the priors given (`barpc.ba.robust.variances.Variances.shown`).
+        Sums of corrections that estimate the camera priors (`barpc.ba.robust.variances.Variances.shown`).
     rest : Rest or None
-        The block that these views are only some of.
+        The whole block, of which this is a `marginal`.
     written : (n, q) or None
-        Values of the cameras that are written; None: `params`.
+        Values that the written cameras have; None: `params`.
     """
 
     names: tuple[str, ...]
@@ -95,11 +95,11 @@ class BlockPrior:
 
     @property
     def as_written(self) -> Array:
-        """Values (n, q) of the cameras that are written."""
+        """Values (n, q) that the written cameras have."""
         return self.params if self.written is None else self.written
 
     def waves(self, names: tuple[str, ...]) -> AdditionalParameters | None:
-        """Return the unknowns in the image of the views that go on from the block; a new view has splines alone."""
+        """Return the additional parameters for views of a later run; a new view has splines alone."""
         if not self._layout.size:
             return None
         place = {name: i for i, name in enumerate(self.names)}
@@ -121,7 +121,7 @@ class BlockPrior:
             arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE}
         arrays |= {name: array for name in _LEARNT if (array := getattr(self, name)) is not None}
         with Path(path).open("wb") as file:
-            np.savez(  # random digits: a tenth is all that compression takes off them
+            np.savez(  # uncompressed: compression saves a tenth
                 file,
                 names=np.array(self.names),
                 model=self.model,
@@ -155,7 +155,7 @@ class BlockPrior:
                 by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
                 scene = EarlierScene(by_unknown, own, float(radius))
             shown = file.get("shown")
-            if shown is not None and len(shown) == 3 + known[1]:  # of release 0.3, which learnt nothing of turns
+            if shown is not None and len(shown) == 3 + known[1]:  # of release 0.3, without turns
                 shown = np.vstack([shown, np.zeros(shown.shape[1])])
             prior = cls(names, *known, layout, radars, scene, file.get("told"), shown, written=file.get("written"))
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
@@ -165,7 +165,7 @@ class BlockPrior:
         return prior
 
     def _is_whole(self) -> bool:
-        """Return whether the arrays have the shapes that the names ask for, and hold numbers that a prior can."""
+        """Return whether all arrays have consistent shapes, and valid values."""
         n, q = len(self.names), self.params.shape[-1] if self.params.ndim else 0
         shapes: dict[str, tuple[int, ...]] = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
         arrays = {name: getattr(self, name) for name in shapes}
@@ -199,7 +199,7 @@ class BlockPrior:
         return matrix if self.less is None else np.asarray(matrix - self.less.T @ self.less)
 
     def marginal(self, names: Collection[str]) -> BlockPrior:
-        """Return the marginal information on some of its views, in its order: all others are eliminated.
+        """Return the marginal prior on some of its views, in its order: the others are eliminated.
 
         Raises
         ------
@@ -236,7 +236,7 @@ class BlockPrior:
         )
 
     def _eliminated(self, views: IntArray) -> tuple[Rest, Array]:
-        """Return the block with views (m,) left, and their information (m q, m q)."""
+        """Return the whole block, and the marginal information (m q, m q) on views (m,)."""
         n, q = self.params.shape
         blocks = self.information if isinstance(self.information, Blocks) else Blocks.of(self.information, q)
         order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
@@ -251,21 +251,21 @@ class BlockPrior:
         return Rest(self, index, lambda b: cholesky.solve(b) + root @ (root.T @ b)), information
 
     def joined(self, later: BlockPrior) -> BlockPrior:
-        """Return the whole block updated by a later run: some of its views, and new ones after them.
+        """Return the prior of the whole block, updated by a later run with some of its views and new ones.
 
         Old views without new tie points move with their neighbours, as their covariance says.
 
         Parameters
         ----------
         later : BlockPrior
-            The later run's, in which what this one says of its views, those of a `marginal`, is contained.
+            Prior of the later run, which contains the information of this one, a `marginal`.
         """
         assert self.rest is not None
         whole, q = self.rest.block, self.params.shape[1]
         own = {name: i for i, name in enumerate(self.names)}
         at = np.array([own.get(name, -1) for name in later.names])
         known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
-        # what the later run has beyond what it was given
+        # information of the later run beyond its prior
         more = later.dense().copy()
         there, here = unknowns_of(known, q), unknowns_of(at[known], q)
         more[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
@@ -301,7 +301,7 @@ class BlockPrior:
 
 
 def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Blocks:
-    """Return the information of a block with `new` views behind it, and with more (m q, m q) of views `place` (m,)."""
+    """Return the information with `new` views appended, and `more` (m q, m q) on the views `place` (m,) added."""
     q, count = whole.params.shape[1], len(whole.names) + new
     blocks = whole.information if isinstance(whole.information, Blocks) else Blocks.of(whole.information, q)
     of_views = more.reshape(len(place), q, len(place), q)
@@ -317,7 +317,7 @@ def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Bloc
 
 
 def _is_scene(scene: EarlierScene, size: int) -> bool:
-    """Return whether the motions of a scene have the shapes that so many unknowns ask for."""
+    """Return whether the arrays of a scene are valid for `size` unknowns."""
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))
@@ -327,7 +327,7 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
 
 
 def _is_square_finite(array: Array) -> bool:
-    """Return whether all numbers are finite, and their squares."""
+    """Return whether the squares of all numbers are finite."""
     return bool(not array.size or (array.min() >= -MAX_NUMBER and array.max() <= MAX_NUMBER))
 
 
@@ -337,7 +337,7 @@ def _is_counted(array: Array) -> bool:
 
 
 def _read_blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
-    """Return the blocks that `save` wrote, or those of the matrix that release 0.3 wrote row by row."""
+    """Return the blocks of a file of `save`, or of the CSR matrix that release 0.3 wrote."""
     if "indptr" in file:
         return Blocks.of(_csr(file, n * q), q)
     pairs: IntArray = np.asarray(file["pair_view"])
@@ -352,7 +352,7 @@ def _read_blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
 
 def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
     data, indices, bounds = (file[name] for name in _CSR)
-    # scipy's own check takes differences, which wrap round for numbers at the ends: what it then reads is not its own
+    # checked here: the check of scipy takes differences, which overflow, and then reads beyond the arrays
     ends = bounds.shape == (size + 1,) and bounds[0] == 0 and bounds[-1] == len(indices) == len(data)
     if not (ends and _are_indices(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
         raise ValueError("the bounds of its rows do not go together")
@@ -362,7 +362,7 @@ def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
 
 
 def _are_indices(numbers: Array | IntArray, most: int) -> bool:
-    """Return whether all are whole, and from 0 to `most`."""
+    """Return whether all are integers from 0 to `most`."""
     return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
 
 
@@ -374,15 +374,14 @@ def apply_prior(
     cameras: CameraPrior,
     radars: Collection[str] = (),
 ) -> tuple[CameraPrior, JointPrior]:
-    """Return the priors of a run that goes on from an old block: a joint prior replaces those of the old
-    views.
+    """Return the priors of a run that continues an earlier block: a joint prior replaces those of the old views.
 
-    `radars` are the views whose unknowns are now those of clocks.
+    `radars` are the views of radars with corrected clocks in this run.
 
     Raises
     ------
     InputError
-        The old block's unknowns are others.
+        The earlier block has other unknowns.
     """
     if (prior.model, prior.drift) != (model, drift):
         raise InputError(f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same")

@@ -1,9 +1,9 @@
-"""The surface of the tie points, and the motion that brings it onto heights measured from elsewhere.
+"""Registration of the surface of the tie points to given heights (altimetry).
 
-Around every tie point its neighbours give a curved patch, with its covariance and what the ground scatters about it.
-Where a height is given, the patch of the nearest tie point predicts it; its slopes tell how that changes where the
-whole surface moves. Slopes are themselves uncertain: what they claim to know is taken off the normal matrix, as in
-errors-in-variables regression (Fuller, "Measurement error models", 1987).
+A quadratic patch is fitted to the neighbours of each tie point, with its covariance and the scatter of the ground about
+it. The patch of the nearest tie point predicts a given height, and its slopes give the derivative of the prediction by
+motions of the surface. Slopes are uncertain: the information of their errors is subtracted from the normal matrix
+(errors-in-variables regression: Fuller, "Measurement error models", 1987).
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from barpc.base.statistics import (
 )
 from barpc.scene import BoolArray, IntArray
 
-PATCH_POINTS = 15  # tie points of a patch: its six unknowns are checked by nine
-_MIN_RELIEF = 0.01  # m: no ground is flatter, and no motion that is smaller is any
-_SIDE = 25  # trials along each axis of the search
-_MIN_SLOPE_SHARE = 0.2  # of the information that slopes claim: below, they are their own noise
+PATCH_POINTS = 15  # tie points of a patch: six unknowns, nine redundant
+_MIN_RELIEF = 0.01  # m: least scatter of the ground; smaller motions end the iteration
+_SIDE = 25  # trial shifts along each axis of the search
+_MIN_SLOPE_SHARE = 0.2  # of the information by slopes, without that of their errors: below, a motion is not determined
 
 
 @dataclass(frozen=True)
 class TieSurface:
     """Quadratic patches around tie points, in a local frame (east, north, up) about their middle.
 
-    A patch is in lengths of its reach: height, slopes and half the curvatures times 1, u, v, u^2, u v, v^2.
+    Coefficients of a patch multiply 1, u, v, u^2, u v, v^2, with east and north u, v in units of its reach.
     """
 
     points: Array  # (P, 3) [m]
     patch: Array  # (P, 6) [m]
     covariance: Array  # (P, 6, 6) [m^2]
     scatter: Array  # (P,) standard deviation of the ground about the patch [m]
-    reach: Array  # (P,) where the patch's farthest neighbour lies [m]
-    whole: BoolArray  # (P,) whether the patch scatters as most do: edges of houses and cliffs are no patches
-    tree: Any  # of its places
+    reach: Array  # (P,) distance of the farthest neighbour of the patch [m]
+    whole: BoolArray  # (P,) whether the scatter of the patch is usual: not at edges of houses and cliffs
+    tree: Any  # of the horizontal positions
 
     @classmethod
     def of(cls, points: Array) -> TieSurface:
@@ -79,20 +79,20 @@ class TieSurface:
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Return the height (n,) at places (n, 2), the tie point (n,) of its patch, and whether that reaches there."""
+        """Return the height (n,) at positions (n, 2), the tie point (n,) of the patch, and its validity (n,) there."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
         design = _powers(self._from(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
         return (design * self.patch[nearest]).sum(axis=1), nearest, near
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
-        """Return the variance [m^2] of the ground's height at places (n, 2) about the patches."""
+        """Return the variance (n,) [m^2] of ground heights predicted by the patches at positions (n, 2)."""
         design = _powers(self._from(place, nearest))
         of_patch = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
         return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
     def slope(self, place: Array, nearest: IntArray) -> tuple[Array, Array]:
-        """Return the slopes (n, 2) to the east and north at places (n, 2), and their covariance (n, 2, 2)."""
+        """Return the slopes (n, 2) to the east and north at positions (n, 2), and their covariance (n, 2, 2)."""
         u, v = self._from(place, nearest).T
         zero, one = np.zeros_like(u), np.ones_like(u)
         rates = np.array([[zero, one, zero, 2.0 * u, v, zero], [zero, zero, one, zero, u, 2.0 * v]])
@@ -101,7 +101,7 @@ class TieSurface:
         return np.einsum("nci,ni->nc", rates, self.patch[nearest]), covariance
 
     def _from(self, place: Array, nearest: IntArray) -> Array:
-        """Return the places from a tie point, in lengths of its patch's reach."""
+        """Return the positions relative to the tie points, in units of the reach of their patches."""
         away = (place - self.points[nearest, :2]) / self.reach[nearest, None]
         return np.asarray(np.clip(away, -1.0, 1.0))
 
@@ -113,11 +113,11 @@ def _powers(away: Array) -> Array:
 
 @dataclass(frozen=True)
 class GivenHeights:
-    """Heights given from elsewhere, in the frame of a surface."""
+    """Given heights, in the frame of a surface."""
 
     place: Array  # (n, 3) east, north, up [m]
     sigma: Array  # (n,) of the height [m]
-    sigma_flat: Array  # (n,) of the place, along an axis [m]
+    sigma_flat: Array  # (n,) of the horizontal position, along each axis [m]
 
     def select(self, keep: BoolArray) -> GivenHeights:
         """Return the heights of a mask (n,)."""
@@ -126,27 +126,26 @@ class GivenHeights:
 
 @dataclass(frozen=True)
 class Registration:
-    """The motion of a surface that brings it onto the heights given, and how well these agree on it."""
+    """The motion that registers a surface to given heights, and their agreement with it."""
 
     motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.constraints.gauge.MOTIONS`
-    covariance: Array  # (7, 7) of it, what was known before left out but for a hundredth
-    near: BoolArray  # (n,) heights on patches of the surface
-    agree: BoolArray  # (n,) those of them that agree with the motion
-    residual: Array  # (n,) given minus surface, moved [m]; NaN where there is no surface
+    covariance: Array  # (7, 7) of it, with a prior wider by `TIMES` than `before` of `register`
+    near: BoolArray  # (n,) heights on valid patches of the surface
+    agree: BoolArray  # (n,) inliers among these
+    residual: Array  # (n,) given minus moved surface [m]; NaN: no surface
     sigma: Array  # (n,) its standard deviation as stated [m]
-    rivals: int  # heights that agree on another level of the surface: the most that do
+    rivals: int  # largest number of outliers that agree on another level
 
     @property
     def share(self) -> float:
-        """Share of the heights on the surface that agree, 0 to 1."""
+        """Share of inliers among the heights on the surface, 0 to 1."""
         return float(self.agree.sum() / max(self.near.sum(), 1))
 
     @property
     def is_most(self) -> bool:
-        """Whether those that agree may be most of all, and clearly outnumber any other group.
+        """Whether the inliers may be the majority, and outnumber `rivals` by two standard deviations of a count.
 
-        Clearly is two standard deviations of a count; of n heights, half of them right, as many less than a half agree
-        by chance.
+        With half of n heights right, the number of inliers may fall sqrt(n) below one half.
         """
         agree, count = int(self.agree.sum()), int(self.near.sum())
         clearly = agree - self.rivals > 2.0 * np.sqrt(agree + self.rivals)
@@ -154,7 +153,7 @@ class Registration:
 
 
 def displacement(local: Array) -> Array:
-    """Return the derivatives (n, 3, 7) of points at `local` (n, 2) radii by the seven motions of a scene."""
+    """Return the derivatives (n, 3, 7) by the seven motions, of points at `local` (n, 2) [radii of the scene]."""
     e, o = local.T
     moves = np.zeros((len(e), 3, 7))
     moves[:, (0, 1, 2), (0, 1, 2)] = 1.0
@@ -165,10 +164,10 @@ def displacement(local: Array) -> Array:
 
 
 def register(surface: TieSurface, given: GivenHeights, radius: float, before: Array) -> Registration:
-    """Find the motion of a surface onto heights, of which the larger part is right.
+    """Register a surface to heights of which the majority is right.
 
-    `before` (7,) are the standard deviations of the motions without these heights [m]: how far is looked, and where
-    the heights tell nothing, that stays open.
+    `before` (7,) [m] are the standard deviations of the motions without these heights. They limit the search, and
+    motions that the heights do not determine keep a covariance of that size.
     """
     free = np.diag((TIMES * before) ** -2)
     motion, noise = _converged_motion(surface, given, search_shift(surface, given, before), radius, free)
@@ -180,7 +179,7 @@ def register(surface: TieSurface, given: GivenHeights, radius: float, before: Ar
 def _converged_motion(
     surface: TieSurface, given: GivenHeights, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """Return the motion (7,) after reweighted steps, and the noise over its stated size, estimated if None."""
+    """Return the motion (7,) by reweighted least squares, and the noise over the stated one (estimated if None)."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
         seen = _SurfaceMisfit.of(surface, given, motion, radius)
@@ -204,11 +203,10 @@ def _converged_motion(
 def _jackknife(
     surface: TieSurface, given: GivenHeights, found: Registration, radius: float, noise: float, free: Array
 ) -> Array:
-    """Return the factors (7,) of standard deviations: how the motion changes where the heights of one part
-    are left out.
+    """Return factors (7,) on the standard deviations by the delete-a-group jackknife.
 
-    Slopes tell where heights lie on them, and steps of roofs and trees move with the place that is found: no
-    linearisation at its end has that (the delete-a-group jackknife: Shao and Tu, "The Jackknife and Bootstrap", 1995).
+    Near roofs and trees the nearest patch changes with the motion, which the linearised covariance does not contain
+    (Shao and Tu, "The Jackknife and Bootstrap", 1995).
     """
     group, wider = _scene_parts(given.place[:, :2], found.near), np.ones(len(free))
     count = int(group.max(initial=-1)) + 1
@@ -228,7 +226,7 @@ def _jackknife(
 
 
 def _scene_parts(place: Array, near: BoolArray) -> IntArray:
-    """Return the part (of some twenty squares of a scene) in which each place (n, 2) lies; -1: none is near."""
+    """Return the index (n,) of the square, of about twenty of a scene, of each position (n, 2); -1: not `near`."""
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
     size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0
@@ -242,14 +240,14 @@ def _scene_parts(place: Array, near: BoolArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _SurfaceMisfit:
-    """Heights against a surface that was moved."""
+    """Residuals of given heights against a moved surface, with derivatives."""
 
     residual: Array  # (n,) given minus predicted [m]
     sigma: Array  # (n,) [m]
-    rows: Array  # (n, 7) the prediction by the motions
-    near: BoolArray  # (n,)
-    nearest: IntArray  # (n,)
-    moves: Array  # (n, 3, 7)
+    rows: Array  # (n, 7) derivative of the prediction by the motions
+    near: BoolArray  # (n,) heights on valid patches
+    nearest: IntArray  # (n,) tie points of the patches
+    moves: Array  # (n, 3, 7) of `displacement`
     doubt: Array  # (n, 2, 2) covariance of the slopes
 
     @classmethod
@@ -267,9 +265,9 @@ class _SurfaceMisfit:
 
 
 def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Array:
-    """Return the shift (7,) [m] on which the most heights agree, east and north within four of `before` (7,) [m].
+    """Return the shift (7,) [m] with most inliers, by a grid search within four of `before` (7,) [m] east and north.
 
-    Its tilts, turn and scale are 0; all is 0 where no height lies on the surface.
+    Its tilts, turn and scale are 0; all are 0 if no height is on the surface.
     """
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
     first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
@@ -298,16 +296,16 @@ def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Arr
 def registration_at(
     surface: TieSurface, given: GivenHeights, motion: Array, radius: float, noise: float, free: Array
 ) -> Registration:
-    """Return the registration at a motion (7,) [m]: its covariance, that of an M-estimate, and which heights agree.
+    """Return the registration at a motion (7,) [m], with the covariance of an M-estimate and the inliers.
 
-    `radius` [m] of the scene; `noise`: by how much the misfit exceeds what is stated; `free` (7, 7) [1/m^2]: the prior
-    information on the motion. LinAlgError where that is not positive definite.
+    `radius` [m] is that of the scene, `noise` the observed over the stated standard deviation, `free` (7, 7) [1/m^2]
+    the prior information on the motion; LinAlgError where that is not positive definite.
     """
     seen = _SurfaceMisfit.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), SURELY)
     agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
-    # of an M-estimate (Huber, "Robust statistics", 1981, 7.6): what wrong heights among the right ones cost is in it
+    # M-estimate (Huber, "Robust statistics", 1981, 7.6), with the loss of efficiency by wrong heights
     part = np.where(seen.near, seen.residual / (BIWEIGHT * scale * seen.sigma), 1.0) ** 2
     inside = part < 1.0
     rate = np.where(inside, (1.0 - part) * (1.0 - 5.0 * part), 0.0)[inside].mean() if inside.any() else 0.0
@@ -321,16 +319,16 @@ def registration_at(
     doubt = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
     alone = forms.T @ forms
     group = _inflation(given.place[inside], forms, np.diag(alone), surface)
-    # whitened by what slopes claim: axes along which they know `told` of it
+    # eigenvectors of the corrected information in units of the uncorrected one, with eigenvalues `ratio`
     root = np.linalg.cholesky(normal + free)
     half = np.linalg.inv(root)
-    told, axes = np.linalg.eigh(half @ (normal - doubt + free) @ half.T)
-    told = np.maximum(told, 0.0)
+    ratio, axes = np.linalg.eigh(half @ (normal - doubt + free) @ half.T)
+    ratio = np.maximum(ratio, 0.0)
     axes = half.T @ axes
     meat = axes.T @ (group[:, None] * alone * group[None, :] + free) @ axes
-    known = np.where(told > _MIN_SLOPE_SHARE, 1.0 / np.maximum(told, _MIN_SLOPE_SHARE), 0.0)
+    known = np.where(ratio > _MIN_SLOPE_SHARE, 1.0 / np.maximum(ratio, _MIN_SLOPE_SHARE), 0.0)
     covariance = axes @ (known[:, None] * meat * known) @ axes.T
-    lost = axes[:, told <= _MIN_SLOPE_SHARE]
+    lost = axes[:, ratio <= _MIN_SLOPE_SHARE]
     covariance += lost @ lost.T / _MIN_SLOPE_SHARE**2 if lost.size else 0.0
     open_ = np.linalg.inv(free)
     covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
@@ -340,7 +338,7 @@ def registration_at(
 
 
 def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> int:
-    """Return the most of the heights that do not agree and lie within each other's noise."""
+    """Return the largest number of outliers with equal residuals, within the noise."""
     others = seen.near & ~agree
     off = np.sort(seen.residual[others])
     if not len(off):
@@ -350,10 +348,9 @@ def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> 
 
 
 def _inflation(place: Array, forms: Array, alone: Array, surface: TieSurface) -> Array:
-    """Return the factors (7,) of standard deviations by correlated errors: a sandwich estimate over
-    groups of growing size.
+    """Return factors (7,) on the standard deviations for correlated errors: a sandwich estimate over growing cells.
 
-    `forms` (n, 7) are the weighted residuals by the motions, `alone` (7,) the variances of their sums if each were
+    `forms` (n, 7) are the gradients of the heights by the motions, `alone` (7,) the variances of their sums if
     independent.
     """
     size, most = 2.0 * float(np.median(surface.reach)), np.ones(7)

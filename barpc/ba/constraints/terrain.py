@@ -1,11 +1,11 @@
-"""The weight of a DEM's relief: scale by scale, as far as the tie points' own heights confirm it.
+"""The weight of a DEM as a constraint: scale by scale, as far as the heights of the tie points confirm its relief.
 
-A DEM is h = t + e, terrain and errors. Where its small slopes are errors, least squares that take them for the
-terrain's find a place where the errors happen to fit, and believe it. What may pull is the best guess of the terrain
-given the DEM: the sum of gain x band over bands of scales, gain = var t / (var t + var e), for what the terrain has
-beyond it has nothing to do with its slopes. The gains are those of a regression of the tie points' heights on the
-bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu, Measurement Error in Nonlinear Models, 2006,
-chapter 4). The residuals of single heights, and their correlation, are taken from the residuals.
+A DEM is h = t + e, terrain and errors. If errors at fine scales were taken for terrain, least squares would shift the
+scene to where they happen to fit. Therefore points are constrained to the best linear estimate of the terrain: the sum
+of gain x band over bands of spatial scales, gain = var t / (var t + var e). The gains are estimated by a regression of
+the heights of the tie points on the bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu,
+Measurement Error in Nonlinear Models, 2006, chapter 4). Its residuals give the standard deviation of single heights,
+and their correlation.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from barpc.base.statistics import (
 from barpc.scene import BoolArray, IntArray
 from barpc.scene import Terrain as Terrain
 
-SLOPE_STEP = 15.0  # m: slopes of the DEM itself are taken over twice this distance
-SURFACE_DEGREE = 3  # of the surfaces of which a DEM's are taken whole, wrong by what all its heights are
+SLOPE_STEP = 15.0  # m: slopes of the DEM are differences over twice this distance
+SURFACE_DEGREE = 3  # degree of the smooth surface of common errors, which takes the smooth part of the DEM whole
 _SURFACE_POWERS = [(n - j, j) for n in range(SURFACE_DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
 NUM_BENDS = len(_SURFACE_POWERS)
-_DEM_NODES = 300  # of the grid on which a DEM is smoothed, along the scene's longer side: 30 m of 10 km
-_DEM_MARGIN = 300.0  # m around the scene at least, or as much as that: cameras may be off
-_VARIANCE_CELLS = (6, 10, 16)  # along the scene's longer side: 36 sums tell a variance to a quarter
-_WIDEST = _VARIANCE_CELLS[-1]  # the widest smoothing is as wide as the smallest of these, as a standard deviation
-_HILLS = 45.0  # slopes that are alike count as one: 49-133 of them in the scenes that hold, 33 in 250 m by SRTM
-_EDGE_TO_RMS_DISTANCE = 2.0  # the scene's edges lie at most about so many times as far out as its points' RMS distance
-_MAX_RELIEF_DIFFERENCE = 0.5  # DEMs whose relief is farther from once that of the tie points are of another terrain
+_DEM_NODES = 300  # of the grid for smoothing, along the longer side of the scene: 30 m apart for 10 km
+_DEM_MARGIN = 300.0  # m around the scene at least, also tolerance of altitudes: cameras may be wrong by it
+_VARIANCE_CELLS = (6, 10, 16)  # along the longer side of the scene: 36 sums give a variance to a quarter
+_WIDEST = _VARIANCE_CELLS[-1]  # the largest standard deviation of smoothing is the smallest of these cells
+_HILLS = 45.0  # least number of independent slopes: 49-133 in scenes with valid gains, 33 in 250 m of SRTM
+_EDGE_TO_RMS_DISTANCE = 2.0  # distance of the edges of a scene over the RMS distance of its points, at most about
+_MAX_RELIEF_DIFFERENCE = 0.5  # of the relief ratio of DEM and tie points from 1: beyond, the DEM is of another terrain
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """A DEM in bands of scales over a scene, the finest first."""
+    """A DEM over a scene, split into bands of spatial scales, the finest first."""
 
     terrain: Terrain
     origin: Array  # (2,) lon, lat of the first node [deg]
-    unit: Array  # (2,) metres a degree
+    unit: Array  # (2,) metres per degree
     step: float  # m between nodes
-    smoothed: tuple[Array, ...]  # the DEM smoothed, each twice as wide as the one before
+    smoothed: tuple[Array, ...]  # smoothed DEMs, each twice as wide as the one before
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
@@ -69,7 +69,7 @@ class Bands:
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
         least, most = np.percentile(ground[:, 2], [1, 99])
         room = most - least + _DEM_MARGIN
-        known = (heights > least - room) & (heights < most + room)  # a hole may be filled with any number
+        known = (heights > least - room) & (heights < most + room)  # holes may have any value
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _WIDEST <= max(extent, _WIDEST * step):
@@ -87,7 +87,7 @@ class Bands:
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Return the heights (K, n) [m] of the bands at ground points (n, 3), in all the DEM's; slopes (K, n, 2)."""
+        """Return heights (K, n) [m] of the bands at points (n, 3), which sum up to the DEM; and slopes (K, n, 2)."""
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -105,7 +105,7 @@ def _layer_values(layer: Array, at: Array) -> Array:
 
 
 def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
-    """Return the slopes (n, 2) of a terrain towards east and north at ground points (n, 3); NaN where it is unknown."""
+    """Return the slopes (n, 2) of a DEM towards east and north at ground points (n, 3); NaN where it has no height."""
     step = SLOPE_STEP / metres_per_unit(ground)[:, :2]
     lon, lat = ground[:, 0], ground[:, 1]
     east = terrain(lon + step[:, 0], lat) - terrain(lon - step[:, 0], lat)
@@ -114,18 +114,18 @@ def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
 
 
 def _differences(layers: Array) -> Array:
-    """Return the bands (K, ...) of layers (K, ...): each minus the next, which is smoother."""
+    """Return the bands (K, ...) of ever smoother layers (K, ...): each minus the next, the last itself."""
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
 
 
 def quadratic_basis(at: Array) -> Array:
-    """Return the level, slopes and bends (n, `NUM_BENDS`) of a surface at places (n, 2)."""
+    """Return the monomials (n, `NUM_BENDS`) of the smooth surface at positions (n, 2)."""
     x, y = at.T
     return np.column_stack([x**i * y**j for i, j in _SURFACE_POWERS])
 
 
 def _bend_slopes(at: Array) -> Array:
-    """Return the derivatives (n, `NUM_BENDS`, 2) of `quadratic_basis` by the places."""
+    """Return the derivatives (n, `NUM_BENDS`, 2) of `quadratic_basis` by the positions."""
     x, y = at.T
     by_x = [i * x ** max(i - 1, 0) * y**j for i, j in _SURFACE_POWERS]
     by_y = [j * x**i * y ** max(j - 1, 0) for i, j in _SURFACE_POWERS]
@@ -134,40 +134,40 @@ def _bend_slopes(at: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RegularisedDem:
-    """Heights and slopes of a regularised DEM at n points."""
+    """A DEM weighted by its gains, at n points."""
 
-    alt: Array  # (n,) altitudes to hold the points to [m]; NaN where the DEM has none, or they are far from it
-    slopes: Array  # (n, 2) of the terrain towards east and north
-    bends: Array  # (n, `NUM_BENDS`) at most about 1 at the scene's edges: what all heights may be wrong by
-    gains: Array  # (K,) of the bands, the finest first
+    alt: Array  # (n,) altitudes of the constraint [m]; NaN: no DEM height, or an outlier
+    slopes: Array  # (n, 2) of the surface of the constraint, east and north
+    bends: Array  # (n, `NUM_BENDS`) shapes of common errors, about 1 at the edges of the scene
+    gains: Array  # (K,) weight of each band, the finest first
     sigma: float  # standard deviation of single altitudes [m]
-    alike: float  # as many points are worth one: their errors resemble each other
+    alike: float  # number of correlated heights that weigh as one independent height
     relief: float  # the DEM's relief as a multiple of the tie points'
-    shows: bool  # whether that may be one
+    shows: bool  # whether that may be 1; else the DEM is of another terrain
 
     @property
     def effective_sigma(self) -> float:
-        """Standard deviation of single altitudes, as if their errors were independent [m]."""
+        """Standard deviation of single altitudes [m], enlarged so that their errors count as independent."""
         return float(self.sigma * self.alike**0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """A DEM beside the heights that rays alone give to tie points."""
+    """Comparison of a DEM with heights of tie points from rays alone."""
 
-    bands: Bands | None  # None where there are too few points
-    tell: BoolArray  # (P,) points whose rays tell their heights better than the DEM does
-    delivered: Array  # (3,) how they lie to the DEM as delivered: level, rise to the east, to the north [m]
-    fit: Array  # (3, P) that by the heights of the points
-    cameras: Array  # (3,) what the cameras' accuracies let expect of that [m]; NaN where they do not say
-    posts: Array | None = None  # (P, 4) numbers of the DEM's posts about the points, where it has some
+    bands: Bands | None  # None: too few points
+    tell: BoolArray  # (P,) points with heights from rays that are more accurate than the DEM
+    delivered: Array  # (3,) offset and tilts, east and north, of points above the DEM, delivered cameras [m]
+    fit: Array  # (3, P) its derivative by the heights of the points
+    cameras: Array  # (3,) standard deviation of `delivered` by the camera priors [m]; NaN: unknown
+    posts: Array | None = None  # (P, 4) indices of the grid posts of the DEM around each point, if it is a grid
 
     def beyond(self, bias: float) -> Array:
-        """Return level and slopes (3,) above the DEM as delivered, over their standard deviations."""
+        """Return `delivered` over its standard deviations (3,), with `bias` [m] that of the DEM."""
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
-        """Return the sigmas (`NUM_BENDS`,) [m] of errors in common: `bias`, or more where points contradict it."""
+        """Return the sigmas (`NUM_BENDS`,) [m] of common errors: `bias`, or more where `delivered` contradicts it."""
         sigma = np.full(NUM_BENDS, bias)
         contradicts = self.beyond(bias) > SURELY
         sigma[:3][contradicts] = _EDGE_TO_RMS_DISTANCE * np.abs(self.delivered)[contradicts]
@@ -175,11 +175,11 @@ class Relief:
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
-        """Compare a DEM with points (P, 3) by rays alone; heights of the `strong` (P,) ones are known to
-        `sharp` (P,) [m].
+        """Compare a DEM with ground points (P, 3) from rays alone.
 
-        Those tell that are known better than single heights of the DEM are, as `stated` [m] or as they lie to it.
-        Rises are measured at the RMS distance of the points from their middle.
+        The `strong` (P,) ones have heights with standard deviations `sharp` (P,) [m]. Those are used whose deviation is
+        below that of DEM heights: the larger of `stated` [m] and the observed one. Tilts are heights at the RMS
+        distance of the points from their middle.
         """
         index = np.flatnonzero(strong)
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
@@ -203,17 +203,16 @@ class Relief:
         return cls(bands, tell, delivered, fit, unknown, posts)
 
     def independent(self, points: IntArray) -> float:
-        """Return the number of independent heights that a DEM has at points (n,), at most: of its posts there."""
+        """Return an upper limit of independent DEM heights at points (n,): the number of grid posts around them."""
         return np.inf if self.posts is None else float(len(np.unique(self.posts[points])))
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> RegularisedDem | None:
-    """Estimate the accuracy of a DEM at the points `index` (n,), at (n, 3); None where too few heights
-    tell.
+    """Estimate the accuracy of a DEM at the points `index` (n,), at ground (n, 3); None with too few heights of rays.
 
-    Single altitudes are stated to be known to `stated` [m]. Points that tell are held where they are, less what a
-    motion or a bend of the scene explains of their distance: what else they have is the DEM's error, and no ray is
-    bent for it.
+    `stated` [m] is the standard deviation of single DEM heights. Points with accurate heights are constrained to their
+    own height, less the part of the difference that a motion or a bend of the scene explains. The rest is an error of
+    the DEM, and does not act on the rays.
     """
     if relief.bands is None:
         return None
@@ -253,34 +252,33 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Heights of n points against the bands of a DEM."""
+    """Regression of the heights of n points on the bands of a DEM."""
 
     gains: Array  # (K,) of the bands
-    rising: Array  # (n, 2) slopes of what is believed of them
-    part: Array  # (n,) what moving and bending the scene explains [m]
-    left: Array  # (n,) what is left [m]
-    fits: BoolArray  # (n,) points that tell, and are not far off
+    rising: Array  # (n, 2) slopes of the weighted sum of the bands
+    part: Array  # (n,) part that a motion and a bend of the scene explain [m]
+    left: Array  # (n,) residuals [m]
+    fits: BoolArray  # (n,) inliers among the points used
     unknowns: int
 
 
 def _compared(
     at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray, independent: float
 ) -> _Compared:
-    """Return the heights (n,) [m] of points that `tell` (n,) by bands (n, K) of slopes (K, n, 2), a motion
-    and a bend (n, m).
+    """Regress heights `above` (n,) [m] on bands (n, K) of slopes (K, n, 2), with a motion and a bend (n, m).
 
-    Where hills are too few to be distinguished from errors, no slope is used: as many as the slopes show,
-    and as the DEM has `independent` heights at most.
+    Only points that `tell` (n,) are used. If the number of independent slopes, at most `independent`, is too small to
+    distinguish hills from errors, the bands are not used.
     """
     from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
 
-    gains, fits, both, believes = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
+    gains, fits, both, use_bands = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(BACKFITTING):
         rising = np.einsum("k,knx->nx", gains, slopes)
         hills = fits.sum() / variance_inflation(at[fits], rising[fits] - rising[fits].mean(axis=0))
-        believes = believes and min(hills, independent) > _HILLS
+        use_bands = use_bands and min(hills, independent) > _HILLS
         moved = smooth
-        if believes:  # a shift, a turn, a growth
+        if use_bands:  # shift, turn, scale
             moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
             free = both[fits] - moved[fits] @ _least_squares_fit(moved[fits], both[fits])
             gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
@@ -295,7 +293,7 @@ def _compared(
 
 
 def _middling(values: Array) -> BoolArray:
-    """Return the mask of n values about their median."""
+    """Return the mask of n values that are no outliers about their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= OUTLIER * robust_spread(off))
 
@@ -305,9 +303,9 @@ def _least_squares_fit(design: Array, values: Array) -> Array:
 
 
 def variance_inflation(at: Array, pull: Array) -> float:
-    """Return the number of points at places (n, 2) that count as one, by their pulls (n, 2) to the east and north.
+    """Return the number of correlated points at (n, 2) that weigh as one, from their gradients `pull` (n, 2).
 
-    Squared sums over cells against those of independent pulls, at the size of cells at which they are largest.
+    The largest ratio, over sizes of cells, of squared sums over cells to those of independent gradients.
     """
     size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
     for count in _VARIANCE_CELLS:
@@ -319,10 +317,9 @@ def variance_inflation(at: Array, pull: Array) -> float:
 
 
 def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]:
-    """Return the relief of a DEM's heights (n,) as a multiple of that of ground points (n, 3); whether it may be one.
+    """Return the ratio of the relief of a DEM (n,) to that of ground points (n, 3), and whether it may be 1.
 
-    At the end, when cameras are adjusted: no more than a level and slopes are of these. Heights are known to
-    `stated` [m].
+    For adjusted points: only an offset and tilts are removed. `stated` [m] is the sigma of single DEM heights.
     """
     if len(dem) < MANY:
         return float("nan"), True
@@ -334,7 +331,7 @@ def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]
 
 
 def _relief_ratio(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
-    """Return a DEM's relief (n,) as a multiple of that of the tie points (n,) [m], and whether it may be theirs."""
+    """Return the ratio of a DEM relief (n,) to that of tie points (n,) [m], and whether it may be 1."""
     seen = above - smooth @ _least_squares_fit(smooth, above)
     size = max(float(seen @ seen), 1e-12)
     times = float(relief @ seen) / size

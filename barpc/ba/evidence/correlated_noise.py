@@ -1,8 +1,8 @@
-"""Correlated errors of neighbouring tie points: a rival of all explanations by cameras, ground and matches.
+"""Evidence for matching noise that neighbouring tie points share: the rival of every other explanation of residuals.
 
-Templates overlap, suns, shadows and seasons pull many matches the same way. The noise of ties of one cell of an image
-is then alike. A correction that follows it as a step, a sinusoid or a cloud is bent by it, so whatever explains ties
-has to gain more than noise of which a part is common to a cell.
+Templates overlap, and shadows or seasons displace neighbouring matches the same way. A step, a sinusoid or a moving
+group may fit such noise. Therefore a term must gain more evidence than noise of which a part is common to all tie
+points of a cell of the image.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import FEW
 from barpc.scene import IntArray
 
-_SIDES = 2 ** np.arange(2, 6)  # cells along each side of an image
-_CORRELATED_SHARES = np.linspace(0.0, 1.0, 21)[1:-1]  # part of the noise's variance that a cell shares
+_SIDES = 2 ** np.arange(2, 6)  # grids to try: cells along each side of an image
+_CORRELATED_SHARES = np.linspace(0.0, 1.0, 21)[1:-1]  # to try: part of the noise variance that is common to a cell
 
 
 def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Array:
-    """Return by how much noise that cells share is likelier than noise of each tie by itself (N,) [nats].
+    """Return the log-likelihood ratio (N,) [nats] of noise that cells share over independent noise, for each image.
 
     Parameters
     ----------
     view, place, off : (k,), (2, k), (2, k)
-        Views of tie points, their places [px] and residuals there, in any unit; without wrong ones.
+        Inliers: their images, image coordinates [px], and residuals in any unit.
     size : (2, N), of the images [px]
 
     Returns
     -------
-    Of the best grid of cells and the best part that is shared, the choice of them paid for; 0 at least. Both
-    coordinates count as if each was seen by itself. Compound symmetry: (1 - a) I + a 11' of the ties of a cell.
+    The ratio of the best grid and shared part, less the logarithm of the number of both; at least 0. The two
+    coordinates are independent. Covariance of a cell (compound symmetry): (1 - a) I + a 11', a the shared part.
     """
     num = size.shape[1]
     count = np.bincount(view, minlength=num)
@@ -41,11 +41,11 @@ def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Arra
         cell = (view * side + row) * side + col
         n = np.bincount(cell, minlength=num * side**2).astype(np.float64)
         between = sum(np.bincount(cell, one, len(n)) ** 2 for one in values) / np.maximum(n, 1.0)
-        all_of = np.bincount(cell, (values**2).sum(axis=0), len(n))
-        for j, alike in enumerate(_CORRELATED_SHARES.tolist()):
-            more = 1.0 + (n - 1.0) * alike  # variance of a cell's sum, over that of as many by themselves
-            rooms = (n - 1.0) * np.log(1.0 - alike) + np.log(more)
-            squares = (all_of - between) / (1.0 - alike) + between / more - all_of
-            found[k, j] = -np.where(n > 0, rooms + 0.5 * squares, 0.0).reshape(num, -1).sum(axis=1)
+        total = np.bincount(cell, (values**2).sum(axis=0), len(n))
+        for j, fraction in enumerate(_CORRELATED_SHARES.tolist()):
+            inflation = 1.0 + (n - 1.0) * fraction  # variance of the sum of a cell over that of independent noise
+            log_det = (n - 1.0) * np.log(1.0 - fraction) + np.log(inflation)
+            squares = (total - between) / (1.0 - fraction) + between / inflation - total
+            found[k, j] = -np.where(n > 0, log_det + 0.5 * squares, 0.0).reshape(num, -1).sum(axis=1)
     gain = found.max(axis=(0, 1)) - np.log(found[:, :, 0].size)
     return np.where(count >= FEW, np.maximum(gain, 0.0), 0.0)

@@ -1,4 +1,4 @@
-"""Tie points linearised at a state of a block, track by track, their ground points ready to be integrated out."""
+"""Tie points linearised at a state of a block, grouped by track so that ground points can be integrated out."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from barpc.scene import BoolArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of observations i <= j of the same tracks, sorted by their views."""
+    """Pairs of observations i <= j of the same track, sorted by their two views."""
 
-    order: IntArray  # (M,) of the pairs as they come, track by track
-    first: IntArray  # (M,) observations
-    second: IntArray
-    bounds: IntArray  # where pairs of other views begin, and the end
-    views: IntArray  # (P, 2)
+    order: IntArray  # (M,) index of each pair in the order of the tracks
+    first: IntArray  # (M,) observations i
+    second: IntArray  # (M,) observations j
+    bounds: IntArray  # (P + 1,) where the pairs of each two views begin, and the end
+    views: IntArray  # (P, 2) these two views
 
 
 @dataclass(frozen=True, eq=False)
 class TrackGroup:
-    """Tracks of n views each."""
+    """T tracks of n observations each, sorted by their views."""
 
-    rows: IntArray  # (T, n) their observations, sorted by what views they are of
-    view: IntArray  # (T, n)
-    subsets: Array  # (S, n) which may be right together: 1, else 0
-    follow: Array  # (T, 3 S, 2n) a basis of what the ground point follows of each subset; zero outside it
-    volume: Array  # (T, S) log of what the integral over the ground point leaves
-    by_unknown: Array  # (T, n, 2, q)
+    rows: IntArray  # (T, n) observations
+    view: IntArray  # (T, n) views of these
+    subsets: Array  # (S, n) observations that may be inliers together: 1, else 0
+    follow: Array  # (T, 3 S, 2n) basis of the residuals that the ground point absorbs, for each subset; 0 outside it
+    volume: Array  # (T, S) log of the ground point's posterior volume over its prior volume
+    by_unknown: Array  # (T, n, 2, q) derivatives by the unknowns of the views
 
     def all_but(self, some: IntArray, view: int) -> tuple[Array, Array]:
-        """Return weights (T, 2n, 1) of some tracks, 0 for those of a view, and the ground points' basis (T, 3, 2n).
+        """Return weights (T, 2n, 1) of the tracks `some`, 0 for those of a view, and the bases of the rest (T, 3, 2n).
 
         In tracks of two views all have weight 1.
         """
@@ -51,7 +51,7 @@ class TrackGroup:
         return counts, self.follow[some[:, None], 3 * subset[:, None] + np.arange(3)]
 
     def weight(self, weight: Array) -> Array:
-        """Return the projectors (T, 2n, 2n) off the motions of ground points, weighted over subsets (T, S)."""
+        """Return the projectors (T, 2n, 2n) off the bases of ground points, by weights of subsets (T, S)."""
         of_rows = np.repeat(weight, 3, axis=1)[..., None] * self.follow
         out: Array = -(np.swapaxes(self.follow, 1, 2) @ of_rows)
         diagonal = np.einsum("tii->ti", out)
@@ -61,18 +61,18 @@ class TrackGroup:
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """All subsets (S,) of the tracks (T,) of all groups, one after the other, and their observations (M,) likewise."""
+    """The subsets (S,) and observations (M,) of all tracks (T,), concatenated over the groups of tracks."""
 
     rows: IntArray  # (M,) observations
-    of_row: IntArray  # (M,) their tracks
-    of_subset: IntArray  # (S,) the subsets' tracks
-    members: sp.csr_array  # (S, M) 1 for observations of a subset
-    member_of: sp.csc_array  # (M, S) the same, turned
-    size: IntArray  # (S,) how many these are
-    views: IntArray  # (T,) how many a track has
-    begins: tuple[IntArray, IntArray]  # (T,) where the observations, and the subsets, of each track begin
+    of_row: IntArray  # (M,) track of each observation
+    of_subset: IntArray  # (S,) track of each subset
+    members: sp.csr_array  # (S, M) 1 for the observations of a subset
+    member_of: sp.csc_array  # (M, S) its transpose
+    size: IntArray  # (S,) number of observations of each subset
+    views: IntArray  # (T,) number of observations of each track
+    begins: tuple[IntArray, IntArray]  # (T,) first observation, and first subset, of each track
     parts: tuple[tuple[slice, slice], ...]  # observations and subsets of each group
-    volume: Array  # (S,) as of the groups
+    volume: Array  # (S,) `TrackGroup.volume`
 
     @classmethod
     def of(cls, tracks: Sequence[TrackGroup]) -> Subsets:
@@ -101,17 +101,17 @@ class Subsets:
 class Linear:
     """Tie points linearised at a state, in units of their stated standard deviations, and the cameras' priors."""
 
-    view: IntArray  # (K,)
-    residual: Array  # (2, K)
-    by_unknown: Array  # (2, q, K)
-    sigma: Array  # (K,) [px]
+    view: IntArray  # (K,) view of each observation, ascending
+    residual: Array  # (2, K) computed minus observed
+    by_unknown: Array  # (2, q, K) derivative by the unknowns of the view
+    sigma: Array  # (K,) stated standard deviations [px]
     tracks: tuple[TrackGroup, ...]
     shape: tuple[int, int]  # N views, q unknowns
-    precision: Array  # (N q,) of the priors
-    offset: Array  # (N q,) unknowns at the state, less the priors' means
-    area: float  # in which a wrong match may lie
-    image: float  # of an image
-    choices: int  # views of the block of which these were chosen
+    precision: Array  # (N q,) inverse variances of the priors
+    offset: Array  # (N q,) unknowns at the state minus the means of the priors
+    area: float  # over which wrong matches are uniformly distributed [sigma^2]
+    image: float  # area of an image [sigma^2]
+    choices: int  # number of views of the block, from which these N were chosen
 
     @property
     def views(self) -> int:
@@ -119,7 +119,7 @@ class Linear:
         return self.shape[0]
 
     def among(self, views: IntArray) -> Linear:
-        """Return the linearised ties among some views (n,) only, renumbered; observations of others are left out."""
+        """Return the observations of some views (n,), which have all tracks; views and observations are renumbered."""
         number, index = np.full(self.views, -1), np.full(len(self.view), -1)
         number[views] = np.arange(len(views))
         rows = np.flatnonzero(number[self.view] >= 0)
@@ -139,12 +139,12 @@ class Linear:
 
     @cached_property
     def subsets(self) -> Subsets:
-        """Subsets of the observations of all tracks that may be right together."""
+        """The subsets of all tracks."""
         return Subsets.of(self.tracks)
 
     @cached_property
     def pairs(self) -> Pairs:
-        """All pairs of observations of the same track, an observation with itself among them."""
+        """All pairs of observations of the same track, each observation with itself included."""
         rows = np.concatenate(
             [
                 tracks.rows[:, np.triu_indices(tracks.rows.shape[1])].transpose(1, 0, 2).reshape(2, -1)
@@ -161,7 +161,7 @@ class Linear:
 
     @cached_property
     def by_row(self) -> Array:
-        """`by_unknown` observation by observation (K, 2, q)."""
+        """`by_unknown` with observations first, (K, 2, q)."""
         return np.ascontiguousarray(self.by_unknown.transpose(2, 0, 1))
 
     @cached_property
@@ -172,33 +172,33 @@ class Linear:
 
     @property
     def taking_part(self) -> BoolArray:
-        """Observations (K,) of tracks."""
+        """Mask (K,) of the observations that belong to a track in use."""
         rows = np.zeros(len(self.view), dtype=bool)
         rows[self.subsets.rows] = True
         return rows
 
     def left(self, step: Array) -> Array:
-        """Return the residuals (2, K) after a step (N, q) of the cameras."""
+        """Return the residuals (2, K) after a step (N, q) of the camera unknowns."""
         left, by_row = self.residual.copy(), self.by_row.reshape(-1, self.shape[1])
         for v, (a, b) in enumerate(pairwise(self.bounds)):
             left[:, a:b] += (by_row[2 * a : 2 * b] @ step[v]).reshape(-1, 2).T
         return left
 
     def thinned(self, most: int) -> Linear:
-        """Return every n-th track, of about so many observations."""
+        """Return every n-th track, so that about `most` observations remain."""
         every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
         if every <= 1:
             return self
-        few = []
+        groups = []
         for tracks in self.tracks:
             view = tracks.view[::every]
             parts = (tracks.follow[::every], tracks.volume[::every], tracks.by_unknown[::every])
-            few.append(TrackGroup(tracks.rows[::every], view, tracks.subsets, *parts))
-        return replace(self, tracks=tuple(few))
+            groups.append(TrackGroup(tracks.rows[::every], view, tracks.subsets, *parts))
+        return replace(self, tracks=tuple(groups))
 
 
 def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span: float) -> Linear:
-    """Linearise the tie points in use (K,) of a problem at a state; heights span a given range [m]."""
+    """Linearise the tie points `use` (K,) of a problem at a state; `span` [m] is the range of possible heights."""
     structure = problem.structure
     projected = problem.linearise(state.params, state.points)
     residual = (projected.image - problem.xy) / sigma
@@ -208,9 +208,9 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
     point = structure.point[order]
     start = np.flatnonzero(np.diff(point, prepend=-1))
     count = np.diff(np.append(start, len(point)))
-    half, held = problem.cameras.unknowns.half, problem.point_terms(state.points)[0]
+    half, information = problem.cameras.unknowns.half, problem.point_terms(state.points)[0]
     image = float(np.median(4.0 * half[0] * half[1]) / np.median(sigma) ** 2)
-    pixels = float(np.median(np.linalg.norm(by_point[:, :, order], axis=1)))  # a metre
+    pixels = float(np.median(np.linalg.norm(by_point[:, :, order], axis=1)))  # per metre
     volume = image / pixels**2 * max(span, 1.0)
     tracks, bases = [], [np.zeros(0)]
     for n in np.unique(count[count >= 2]).tolist():
@@ -219,12 +219,12 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         view = structure.view[rows]
         ground = by_point[:, :, rows].transpose(2, 3, 0, 1).reshape(len(rows), 2 * n, 3)
         subsets = _subsets(n)
-        follow, room = _followed(ground, subsets, held[:, structure.point[rows[:, 0]]])
+        follow, log_part = _ground_bases(ground, subsets, information[:, structure.point[rows[:, 0]]])
         of_cameras = np.ascontiguousarray(by_unknown[:, :, rows].transpose(2, 3, 0, 1))
-        tracks.append(TrackGroup(rows, view, subsets.astype(np.float64), follow, room - np.log(volume), of_cameras))
+        tracks.append(TrackGroup(rows, view, subsets.astype(np.float64), follow, log_part - np.log(volume), of_cameras))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         bases.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
-    far = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    largest = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
     parallax = float(np.median(np.concatenate(bases))) * volume / image if len(order) else 0.0
     prior = problem.camera_prior
     return Linear(
@@ -236,30 +236,30 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         (structure.num_views, by_unknown.shape[1]),
         prior.loosest().ravel() ** -2.0,
         (state.params - prior.mean).ravel(),
-        2.0 * far * max(2.0 * far, parallax),
+        2.0 * largest * max(2.0 * largest, parallax),
         image,
         structure.num_views,
     )
 
 
 def array_elements(count: IntArray) -> float:
-    """Return the count of numbers that tracks of so many views each (T,) need."""
+    """Return the number of array elements that tracks of `count` (T,) observations need."""
     return float((6.0 * (count + 1.0) * count).sum())
 
 
 def _subsets(n: int) -> BoolArray:
-    """Return the subsets (S, n) of n views that may be right together: all, then all but one, two at least."""
+    """Return the subsets (S, n) of a track that may be inliers together: all n, then all but one (two at least)."""
     return np.vstack([np.ones((1, n), dtype=bool), ~np.eye(n, dtype=bool)[::-1]])[: n + 1 if n > 2 else 1]
 
 
-def _followed(ground: Array, subsets: BoolArray, held: Array) -> tuple[Array, Array]:
-    """Return L^-1 J' of each subset's rows, where L L' = J' J + held (T, 3 S, 2n), and -log det L (T, S)."""
+def _ground_bases(ground: Array, subsets: BoolArray, information: Array) -> tuple[Array, Array]:
+    """Return L^-1 J' (T, 3 S, 2n) of each subset's rows J, L L' = J' J + information (6, T), and -log det L (T, S)."""
     count, size = ground.shape[:2]
-    follow, room = np.empty((count, len(subsets), 3, size)), np.empty((count, len(subsets)))
+    follow, log_volume = np.empty((count, len(subsets), 3, size)), np.empty((count, len(subsets)))
     for k, subset in enumerate(subsets):
         part = ground * np.repeat(subset, 2).astype(np.float64)[:, None]
         matrix = np.swapaxes(part, 1, 2) @ part
-        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in TRIANGLE]) + held)
+        lower = cholesky3(np.stack([matrix[:, i, j] for i, j in TRIANGLE]) + information)
         follow[:, k] = whiten(part.transpose(1, 2, 0), lower).transpose(2, 1, 0)
-        room[:, k] = -np.log(lower[[0, 3, 5]]).sum(axis=0)
-    return follow.reshape(count, -1, size), room
+        log_volume[:, k] = -np.log(lower[[0, 3, 5]]).sum(axis=0)
+    return follow.reshape(count, -1, size), log_volume

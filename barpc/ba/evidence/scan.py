@@ -1,15 +1,15 @@
-"""Where in an image ties are wrong, or off, more than elsewhere.
+"""Parts of images in which tie points are wrong, or displaced, more than elsewhere.
 
-Of ties that took part, all intervals of rows and columns are scanned by two statistics, both about the logarithm of a
-likelihood ratio: of the share of observations that are wrong (Kulldorff 1997, "A spatial scan statistic"), and of a
-displacement that all observations of the interval have in common.
+`scan` tests all intervals of rows and columns of the adjusted tie points. Two statistics, both log-likelihood ratios:
+of the share of wrong observations (Kulldorff 1997, "A spatial scan statistic"), and of a displacement that is common to
+all observations of the interval.
 
-Of check tie points (`met_worse`: one median hides much), rows, columns and cells of each image, halved again and
-again, are tested against the rest of their image. That no place is worse than another is the one assumption, so that
-neither how much ties scatter nor how many are wrong matters. Two tests, each bounded over all places (Bonferroni): of
-how many lie far off by the same, which wrong matches do not (exact, hypergeometric), and of what the near ones have in
-common (Hotelling, then by permutation). Neighbours share errors: of a small part of an image one observation is taken,
-and what is shared and no larger than any adjustment is asked to be is let be.
+`met_worse` tests check tie points: rows, columns and cells of each image, halved repeatedly, against the rest of the
+image. The null hypothesis is only that all parts have one distribution, so neither the noise nor the share of wrong
+matches matters. Two tests, each with Bonferroni's bound: the number of outliers with the same displacement, which wrong
+matches do not have (exact, hypergeometric), and the mean of the inliers (Hotelling, then by permutation). Neighbours
+share errors. Therefore one observation is taken in each small part of an image, and a common displacement within the
+tolerance is ignored.
 """
 
 from __future__ import annotations
@@ -24,14 +24,13 @@ from barpc.base.geodesy import CHUNK, Array, parts
 from barpc.base.statistics import BANDS, CHANCE, FEWEST, OUTLIER, SURE
 from barpc.scene import BoolArray, IntArray
 
-BINS = 40  # stretches of an image's rows or columns
-_STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # all intervals of these
-_FEWEST_INSIDE = 8  # check observations of a place: fewer have no mean
-_PERMUTATIONS = 2000  # twice as many as a chance of `CHANCE` takes
-_FINEST = 32  # parts of rows or columns, and a side of the parts of which one observation is taken
-MIN_EXTENT_RATIO = (
-    0.05  # of the larger extent of residuals: a smaller one is that of epipolar lines, which turn over an image
-)
+BINS = 40  # of equal size, along the rows or columns of an image
+_STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # first and last + 1 bin of all intervals
+_FEWEST_INSIDE = 8  # check observations of a region: fewer are not tested
+_PERMUTATIONS = 2000  # twice as many as a p-value of `CHANCE` needs
+_FINEST = 32  # parts along each side of an image, at most; one observation is taken in each of their cells
+# of the larger extent of residuals: a smaller one across it comes from epipolar lines that turn over an image
+MIN_EXTENT_RATIO = 0.05
 
 
 @dataclass(frozen=True)
@@ -42,84 +41,82 @@ class Interval:
     axis: int  # 0: columns, 1: rows
     start: float  # [px]
     stop: float
-    gain: float  # nats, what the choice among all places costs taken off
-    share: float  # of its observations that are wrong
-    off: float  # what the others have in common, in the units of the residuals
-    by_share: bool  # whether the share stands out, or what they have in common
-    apart: float = 0.0  # half of those that are wrong are farther off than this, where it was measured
-    moves: bool = False  # the share is of a group that moves
-    part: float = 1.0  # of its image's rows or columns
+    gain: float  # log-likelihood ratio less the price of the choice among all intervals [nats]
+    share: float  # of wrong observations
+    off: float  # common displacement of the others, in the units of the residuals
+    by_share: bool  # whether the share is significant; else the displacement is
+    apart: float = 0.0  # median residual of the wrong observations, where it was measured
+    moves: bool = False  # whether the share is that of a moving group
+    part: float = 1.0  # length over that of the image
 
 
 def price(views: int) -> float:
-    """Return the cost of choosing among the intervals of all views, rows and columns [nats]."""
+    """Return the price of choosing among the intervals of rows and of columns of all views [nats]."""
     return float(np.log(BINS * (BINS + 1) / 2 * 2 * views))
 
 
 def scan(
-    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, told: Array, floor: float = 0.0
+    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, weight: Array, floor: float = 0.0
 ) -> list[Interval]:
-    """Find the most significant interval, by each statistic, in every view's columns and rows; the best
-    first.
+    """Find the most significant interval of the columns and of the rows of each view, by each statistic; best first.
 
     Parameters
     ----------
-    view : (K,)
-    place : (2, K), where observations are [px], in images of `size` (2, N)
+    view : (K,), of observations
+    place : (2, K), image coordinates [px], in images of `size` (2, N)
     wrong : (K,), probability that an observation is wrong
-    off : (2, K), residuals in standard deviations that they would have, of wrong ones, too
-    told : (K,), weights of these; 0 of observations that tell nothing
-    floor : float, what displacements are let be [the same]: no adjustment is asked to be better
+    off : (2, K), residuals of all observations, in standard deviations of inliers
+    weight : (K,), weights of these; 0: not used
+    floor : float, size of displacements that are tolerated [standard deviations]
     """
     views, found = size.shape[1], []
-    off, costs = np.clip(off, -OUTLIER, OUTLIER), price(views)
+    off, least = np.clip(off, -OUTLIER, OUTLIER), price(views)
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
         rows = np.array([np.ones(len(view)), wrong])
         sums = np.array([np.bincount(view * BINS + bin_, row, views * BINS) for row in rows])
         whole = sums.reshape(2, views, BINS)
         shares = share_log_ratios(whole)
-        gains, displaced = _displacements(view, bin_, off, told, views, floor)
+        gains, displaced = _displacements(view, bin_, off, weight, views, floor)
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
-            gain[BINS - 1] = 0.0  # all of an image is no interval
+            gain[BINS - 1] = 0.0  # the whole image is no interval
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
-                worth, common = float(gain[at, v]) - costs, float(displaced[at, v])
+                surplus, common = float(gain[at, v]) - least, float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
-                    i, j = (0, i) if j == BINS else (j, BINS)  # of two parts the smaller one lies off
+                    i, j = (0, i) if j == BINS else (j, BINS)  # of two parts the smaller one is taken as displaced
                 step = size[axis, v] / BINS
-                inside, wrongs = whole[:, v, i:j].sum(axis=1).tolist()
+                inside, count_wrong = whole[:, v, i:j].sum(axis=1).tolist()
                 ends = float(i * step), float(j * step)
-                told_of = worth, wrongs / max(inside, 1.0), common, by_share
-                found.append(Interval(v, axis, *ends, *told_of, part=(j - i) / BINS))
+                statistics = surplus, count_wrong / max(inside, 1.0), common, by_share
+                found.append(Interval(v, axis, *ends, *statistics, part=(j - i) / BINS))
     return sorted(found, key=lambda one: -one.gain)
 
 
 def _intervals(bins: Array) -> Array:
-    """Return the sums (intervals, ...) of all intervals of bins (..., `BINS`): rows, which are copied fast."""
+    """Return the sums (intervals, ...) of bins (..., `BINS`) over all intervals, which come first."""
     edges = np.zeros((BINS + 1, *bins.shape[:-1]))
     np.moveaxis(bins, -1, 0).cumsum(axis=0, out=edges[1:])
     return np.asarray(edges[_STOPS] - edges[_STARTS])
 
 
 def _displacements(
-    view: IntArray, bin_: IntArray, off: Array, told: Array, views: int, floor: float
+    view: IntArray, bin_: IntArray, off: Array, weight: Array, views: int, floor: float
 ) -> tuple[Array, Array]:
-    """Return the gain [nats] (N, intervals) by which a displacement of an interval explains residuals, and
-    its size.
+    """Return the gain [nats] of a common displacement of each interval, and its size (intervals, N).
 
-    The score test beside what a camera follows along an axis: a constant, a slope and a bend are taken off both. Beside
-    a step its middle is significant; the step itself explains it.
+    The score test beside the drift of a camera: a constant, a slope and a bend along the axis are projected out. Of the
+    rows of a step only the middle ones may be significant then; the term explains all of them.
     """
     at = view * BINS + bin_
-    sums = [np.bincount(at, row, views * BINS) for row in (told, *(told * off))]
+    sums = [np.bincount(at, row, views * BINS) for row in (weight, *(weight * off))]
     count, *shifts = np.array(sums, dtype=np.float64).reshape(3, views, BINS)
     smooth = np.vander(np.linspace(-1.0, 1.0, BINS), DRIFTS, increasing=True)
     weighted = count[:, :, None] * smooth
     normal = np.swapaxes(weighted, 1, 2) @ smooth + 1e-9 * np.eye(DRIFTS) * (count.sum(axis=1) + 1.0)[:, None, None]
     shift = np.stack(shifts, axis=2)  # (N, bins, 2)
     followed = smooth @ np.linalg.solve(normal, smooth.T @ shift)
-    left = (off - np.ascontiguousarray(followed.reshape(-1, 2).T).take(at, axis=1)) * np.sqrt(told)
+    left = (off - np.ascontiguousarray(followed.reshape(-1, 2).T).take(at, axis=1)) * np.sqrt(weight)
     scatter = [[np.bincount(view, a * b, views) for a in left] for b in left]
     size, axes = np.linalg.eigh(np.moveaxis(np.array(scatter), 2, 0) / (count.sum(axis=1) + 1.0)[:, None, None])
     rest = np.swapaxes((shift - count[:, :, None] * followed) @ axes, 1, 2)
@@ -128,23 +125,22 @@ def _displacements(
     gain, displaced = np.empty((2, len(_STARTS), views))
     for some in parts(views, CHUNK // BINS):
         squares = (_intervals(bins) ** 2 for bins in (*rest[some].swapaxes(0, 1), *across[some].swapaxes(0, 1)))
-        own, (one, other, *by_smooth) = _intervals(count[some]), squares
-        own = np.maximum(own - sum(by_smooth), 0.5)
-        more = own * floor**2
-        gain[:, some] = 0.5 / own * (one / (size[some, 0] + more) + other / (size[some, 1] + more))
-        displaced[:, some] = np.sqrt(one + other) / own
+        information, (one, other, *by_smooth) = _intervals(count[some]), squares
+        information = np.maximum(information - sum(by_smooth), 0.5)
+        tolerated = information * floor**2
+        gain[:, some] = 0.5 / information * (one / (size[some, 0] + tolerated) + other / (size[some, 1] + tolerated))
+        displaced[:, some] = np.sqrt(one + other) / information
     return gain, displaced
 
 
 def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) -> Array:
-    """Return the evidence (N,) [nats] that neighbouring residuals point in the same direction, the choice
-    among tests paid for.
+    """Return the evidence (N,) [nats] that residuals of neighbours have the same sign, less the price of four tests.
 
-    Of wrong matches that lie anywhere they do so in half of the cases; of what moves, bends or shakes, in more.
+    Random wrong matches have the same sign in half of the cases; moving objects, bends and jitter in more.
 
     Parameters
     ----------
-    view : (K,), place : (2, K) [px], residual : (2, K) of observations that are wrong
+    view, place, residual : (K,), (2, K), (2, K), of wrong observations [px]
     views : int, N
     """
     out = np.full(views, -np.inf)
@@ -153,7 +149,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
         if len(rows) < 2:
             continue
         axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
-        # of two views all lie along one line: what is left across it is no direction, or what large ones bend alike
+        # in pairs all residuals lie along epipolar lines: across these there is no direction, or that of their turn
         along = axes.T[size > MIN_EXTENT_RATIO * size[0]] @ residual[:, rows]
         along[1:] -= np.median(along[1:], axis=1, keepdims=True)
         for axis in (0, 1):
@@ -166,9 +162,9 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
 
 
 def share_log_ratios(bins: Array) -> Array:
-    """Return the logarithm (intervals, N) of the likelihood ratio of two shares over one, where that inside is larger.
+    """Return the log-likelihood ratios (intervals, N) of a larger wrong share inside an interval over one share.
 
-    `bins` (2, N, `BINS`) are the numbers of observations and of those that are wrong.
+    `bins` (2, N, `BINS`) are the numbers of observations and of wrong ones.
     """
 
     def log(k: Array, n: Array) -> Array:
@@ -177,12 +173,12 @@ def share_log_ratios(bins: Array) -> Array:
 
     total, all_bad = bins.sum(axis=2)
     whole, gain = log(all_bad, total), np.zeros((len(_STARTS), bins.shape[1]))
-    told = whole < -SURE  # where all that are wrong lie in one interval, the rest are certain
-    total, all_bad = total[told], all_bad[told]
-    count, bad = _intervals(bins[:, told]).swapaxes(0, 1)
+    may_differ = whole < -SURE  # else even all wrong ones in one interval are not significant
+    total, all_bad = total[may_differ], all_bad[may_differ]
+    count, bad = _intervals(bins[:, may_differ]).swapaxes(0, 1)
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count
-    gain[:, told] = np.where(more, log(bad, count) + log(bad_outside, outside) - whole[told], 0.0)
+    gain[:, may_differ] = np.where(more, log(bad, count) + log(bad_outside, outside) - whole[may_differ], 0.0)
     return gain
 
 
@@ -193,11 +189,11 @@ class ImageRegion:
     view: int
     columns: tuple[float, float] | None  # from, to [px]; None: all
     rows: tuple[float, float] | None
-    count: int  # observations of it that were looked at
-    far: float  # their share that lies far off by the same
-    off: float  # what the far ones are off by, half of them, else what the near ones have in common [px]
-    chance: float  # of as much anywhere where all places are alike, at most
-    moved: float  # mean displacement of an eighth of the rows or columns by it [px]; 0 of a cell, which is no camera's
+    count: int  # tested observations
+    far: float  # share of these that are outliers displaced by the same amount
+    off: float  # median residual of these outliers; without them the mean residual of inliers [px]
+    chance: float  # upper bound of the p-value over all regions
+    moved: float  # mean displacement of an eighth of the rows or columns by it [px]; 0 for a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,9 +201,9 @@ class Unused:
     """Held-out observations of tie points."""
 
     view: IntArray  # (K,)
-    xy: Array  # (2, K) where they are [px]
+    xy: Array  # (2, K) observed image coordinates [px]
     residual: Array  # (2, K) projected - observed, points triangulated by the cameras [px]
-    deviation: Array  # (K,) that residuals have [px]
+    deviation: Array  # (K,) standard deviation of the residuals [px]
 
     def part(self, rows: BoolArray | IntArray) -> Unused:
         """Return some of the held-out observations."""
@@ -215,28 +211,27 @@ class Unused:
 
 
 def met_worse(unused: Unused, size: Array, limit: float, least: float, share: float) -> list[ImageRegion]:
-    """Find the place of every image in which held-out tie points are met worst, where chance is unlikely to
-    explain it.
+    """Find the region of each image with significantly larger residuals of held-out tie points; most significant first.
 
     Parameters
     ----------
     unused : Unused
     size : (2, N), of the images [px]
-    limit : float, standard deviations from which on an observation is far off
+    limit : float, number of standard deviations beyond which an observation is an outlier
     least, share : float
-        Tolerances: displacement that near ones may have in common [px], share of a place that may be far off.
+        Tolerances: mean displacement of inliers [px], share of outliers in a region.
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= FEWEST]
-    tests = 2.0 * len(whole) * _PLACES.shape[1]  # of each place the far ones and the near ones
+    tests = 2.0 * len(whole) * _PLACES.shape[1]  # two tests of each region
     found = [_worst(one, size[:, one.view[0]], limit, least, share, tests) for one in whole]
     return sorted((one for one in found if one), key=lambda one: one.chance)
 
 
 def _region_bounds() -> IntArray:
-    """Return (4, P) of every place parts of the columns, and which, parts of the rows, and which; one part is all.
+    """Return (4, P) for every region: number of parts of the columns, index; the same of the rows; one part: all.
 
-    Of cells as many as of the finest lines.
+    The smallest cells are about as many as the narrowest rows or columns.
     """
     halved = [2**n for n in range(1, _FINEST.bit_length())]
     lines = [(n, k, 1, 0) for n in halved for k in range(n)]
@@ -248,7 +243,7 @@ _PLACES = _region_bounds()
 
 
 def _cells_of_regions() -> BoolArray:
-    """Return (P, C) which places hold which of the smallest parts of an image."""
+    """Return the mask (P, C) of the smallest cells of an image in each region."""
     columns, k, rows, n = _PLACES[:, :, None]
     row, col = np.divmod(np.arange(_FINEST**2), _FINEST)
     return np.asarray((col * columns // _FINEST == k) & (row * rows // _FINEST == n))
@@ -258,18 +253,18 @@ _CELLS_OF_REGIONS = _cells_of_regions()
 
 
 def _cell_indices(unused: Unused, size: Array) -> IntArray:
-    """Return (2, K) of so many columns and rows of an image, which."""
+    """Return column and row (2, K) of the smallest cell of each observation."""
     return np.clip(unused.xy / size[:, None] * _FINEST, 0, _FINEST - 1).astype(np.int64)
 
 
 def _thinned(unused: Unused, size: Array) -> Unused:
-    """Return one observation, the first, of every small part of an image."""
+    """Return the first observation of each of the smallest cells of an image."""
     col, row = _cell_indices(unused, size)
     return unused.part(np.unique(row * _FINEST + col, return_index=True)[1])
 
 
 def _worst(one: Unused, size: Array, limit: float, least: float, share: float, tests: float) -> ImageRegion | None:
-    """Return the place of one image of which chance leaves least, by so many `tests`; None without any."""
+    """Return the most significant region of one image; None: none is. `tests` is Bonferroni's number of tests."""
     col, row = _cell_indices(one, size)
     inside = _CELLS_OF_REGIONS[:, row * _FINEST + col]
     count = inside.sum(axis=1)
@@ -282,31 +277,31 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
     along = axes.T @ standard
     chances, together = np.ones((2, len(count))), np.zeros((len(count), len(near)), dtype=bool)
     for place in np.flatnonzero((inside[:, ~near]).sum(axis=1) > np.maximum(share * count, 1)):
-        # wrong matches lie anywhere, what is moved as a whole lies together: how many do so here, and elsewhere
+        # wrong matches are random, displaced parts have one residual: count the outliers near the median of the region
         of_place = inside[place] & ~near
         center = np.median(standard[:, of_place], axis=1, keepdims=True)
         alike = ~near & (np.hypot(*(standard - center)) <= limit)
         together[place] = alike & inside[place]
         found = int(together[place].sum())
-        if found > share * count[place]:  # one of them is where the others are looked for
-            sure = hypergeometric_tail(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
-            chances[0, place] = min(1.0, sure * int(of_place.sum()))
+        if found > share * count[place]:  # less one, which defines the median
+            tail = hypergeometric_tail(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
+            chances[0, place] = min(1.0, tail * int(of_place.sum()))
     of_near = (inside & near).astype(np.float64)
     here = of_near.sum(axis=1)
     mean = of_near @ along.T / np.maximum(here, 1.0)[:, None]
     common = np.hypot(*mean.T) * float(np.median(one.deviation))
     along = along - along[:, near].mean(axis=1, keepdims=True)
     rest = of_near @ along.T / np.maximum(here, 1.0)[:, None]
-    told = (count >= _FEWEST_INSIDE) & (here > 1) & (here < near.sum()) & (common > least)
-    known = spread > MIN_EXTENT_RATIO * spread.max()
+    tested = (count >= _FEWEST_INSIDE) & (here > 1) & (here < near.sum()) & (common > least)
+    determined = spread > MIN_EXTENT_RATIO * spread.max()
     variance = _variances(along * near, of_near, rest, _image_cells(near, col, row))
-    squared = (rest[told][:, known] ** 2 / variance[told][:, known]).sum(axis=1)
-    free, others = int(known.sum()), max(float(near.sum() - known.sum() - 1), 1.0)
-    chances[1, told] = fdtrc(free, others, squared / free)  # Hotelling's T^2, the variance one of so many
+    squared = (rest[tested][:, determined] ** 2 / variance[tested][:, determined]).sum(axis=1)
+    free, others = int(determined.sum()), max(float(near.sum() - determined.sum() - 1), 1.0)
+    chances[1, tested] = fdtrc(free, others, squared / free)  # Hotelling's T^2 by an F distribution
     chances *= tests
     if (chances[1] < CHANCE).any():
-        permuted = _by_permutation(along[:, near][known], of_near[told][:, near])
-        chances[1, told] = np.where(permuted < CHANCE, chances[1, told], 1.0)
+        permuted = _by_permutation(along[:, near][determined], of_near[tested][:, near])
+        chances[1, tested] = np.where(permuted < CHANCE, chances[1, tested], 1.0)
     if not (chances < CHANCE).any():
         return None
     test, worst = divmod(int(chances.argmin()), len(count))
@@ -321,10 +316,10 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
 
 
 def _by_permutation(along: Array, of_near: Array) -> Array:
-    """Return the chance (P,) of as large a mean in some place, by permutations of the residuals among all places.
+    """Return the p-value (P,) of each region's mean against the largest mean of permuted residuals.
 
-    Residuals are neither normal nor of one spread: their own values tell what a mean by chance is. `along` (d, k) are
-    the residuals along their axes, `of_near` (P, k) tells the places.
+    Residuals are neither normal nor of equal variance, so their own values are permuted. `along` (d, k) are residuals
+    along their principal axes, `of_near` (P, k) is 1 for those in each region.
     """
     rng, here, count = np.random.default_rng(0), of_near.sum(axis=1), along.shape[1]
     along = along - along.mean(axis=1, keepdims=True)
@@ -338,23 +333,23 @@ def _by_permutation(along: Array, of_near: Array) -> Array:
     return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 
-def hypergeometric_tail(found: int, count: int, alike: int, whole: int) -> float:
-    """Return the probability of `found` or more alike among `count` that are drawn, where `alike` of `whole` are.
+def hypergeometric_tail(found: int, count: int, marked: int, whole: int) -> float:
+    """Return the probability of `found` or more marked items among `count` drawn from `whole` items, `marked` of them.
 
     The tail of the hypergeometric distribution, by logarithms of factorials; 0 where so many cannot be drawn.
     """
-    k = np.arange(found, min(count, alike) + 1)
+    k = np.arange(found, min(count, marked) + 1)
 
     def ways(n: int, m: IntArray | int) -> Array:
         return np.asarray(gammaln(n + 1.0) - gammaln(m + 1.0) - gammaln(n - m + 1.0))
 
-    return float(np.exp(ways(alike, k) + ways(whole - alike, count - k) - ways(whole, count)).sum())
+    return float(np.exp(ways(marked, k) + ways(whole - marked, count - k) - ways(whole, count)).sum())
 
 
 def principal_axes(standard: Array) -> tuple[Array, Array]:
-    """Return the axes (2, 2) along which residuals (2, K) about their mean scatter most and least, as columns.
+    """Return the principal axes (2, 2) of residuals (2, K) as columns, the larger first.
 
-    And their standard deviations (2,), in the unit of the residuals.
+    And the standard deviations (2,) along them, in the unit of the residuals.
     """
     off = standard - standard.mean(axis=1, keepdims=True)
     variance, axes = np.linalg.eigh(off @ off.T / standard.shape[1])
@@ -362,16 +357,16 @@ def principal_axes(standard: Array) -> tuple[Array, Array]:
 
 
 def _image_cells(near: BoolArray, col: IntArray, row: IntArray) -> Array:
-    """Return the part of the image in which each near observation lies (K, C), 1 or 0."""
+    """Return the indicators (K, C) of the cells of an image with about `FEWEST` inliers each."""
     parts = max(int(np.sqrt(near.sum() / FEWEST)), 1)
     cell = row * parts // _FINEST * parts + col * parts // _FINEST
     return np.asarray((cell[:, None] == np.arange(parts**2)) * near[:, None].astype(np.float64))
 
 
 def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array:
-    """Return the variance (P, 2) of the mean of each place about zero, its own part taken off.
+    """Return the variance (P, 2) of the mean of each region, about the mean of the image.
 
-    By how much observations scatter in each part of the image, where that is more than in the whole.
+    From the variance in each cell of the image, or that of the whole image where it is larger.
     """
     count, in_place = cells.sum(axis=0), of_near @ cells
     here = np.maximum(of_near.sum(axis=1), 1.0)

@@ -1,9 +1,9 @@
 """Additional parameters in the images: splines over the rows, steps between detectors, displaced parts, sinusoids.
 
-All are displacements in the image, of where a point is seen: linear unknowns of a view beside its others. What the
-drift can do is not theirs, so that their prior does not loosen it: splines are orthogonal to its polynomials of the
-row, steps to a shift and a scale of the columns. A part of the rows or columns is displaced as a whole, and all rows of
-an image with a known period. How large all of them are in a view is learnt (`barpc.ba.robust.variances`).
+All are displacements of image points, linear unknowns of a view beside those of its camera. Splines are orthogonal to
+the polynomials of the drift in the row, and steps to a shift and a scale of the columns, so that their priors do not
+loosen those of the camera. A displaced part is an interval of rows or columns. A sinusoid displaces all rows with a
+known period. The prior variances of all of them are estimated (`barpc.ba.robust.variances`).
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from barpc.base.statistics import SAMPLE
 from barpc.scene import IntArray
 from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_and_cosine
 
-MIN_SPLINES = 7  # splines
-FIRST_SIGMA = 1.0  # px: a prior's standard deviation before anything is known
-OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row a view: shapes of empty rows
-DRIFTS = 3  # polynomials of the row that are the drift's, a constant, a slope and a bend: splines are apart from them
+MIN_SPLINES = 7  # fewest splines of an image
+FIRST_SIGMA = 1.0  # px: prior standard deviation before variances are estimated
+OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row for each view: shapes of empty rows
+DRIFTS = 3  # polynomials of the row of the drift (constant, slope, bend), to which splines are orthogonal
 
 
 @dataclass(frozen=True, eq=False)
 class AdditionalParameters:
-    """Layout of a view's unknowns in the image [px]: (col, row) of splines, then of steps, parts and sinusoids."""
+    """Layout of the unknowns of a view [px]: for splines, then steps, parts, sinusoids, those of col, then of row."""
 
     count: int  # B-splines over the rows of an image; 0: none
-    # (N, C) columns where another detector begins [px], ascending; infinite where a view has fewer
+    # (N, C) first columns of further detectors [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # (N, M, 5) strips that lie off, as `RowSpline` has them; infinite where a view has fewer
+    # (N, M, 5) displaced parts, as `RowSpline.strips`; infinite where a view has fewer
     strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
-    # (N, M) periods of the rows' swings [px]; infinite where a view has fewer
+    # (N, M) periods of the sinusoids over the rows [px]; infinite where a view has fewer
     periods: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
@@ -45,29 +45,29 @@ class AdditionalParameters:
 
     @property
     def of_views(self) -> dict[str, Array]:
-        """The arrays with a row (N, ...) a view, by their name."""
+        """Name -> array (N, ...) with a row for each view."""
         return {name: getattr(self, name) for name in OF_VIEWS}
 
     @property
     def alike(self) -> IntArray:
-        """Numbers of the displaced parts that all images have at the same columns: there they are one displacement."""
+        """Indices of displaced parts with the same columns in all images: they share one displacement."""
         places = self.strips
         same = np.isfinite(places).all(axis=(0, 2)) & (places == places[:1]).all(axis=(0, 2)) & (len(places) > 1)
         return np.flatnonzero(same & (places[:1, :, 0] == 0.0).all(axis=0))
 
     def select(self, views: IntArray) -> AdditionalParameters:
-        """Return the layout of some views (n,); -1: of a new one, which has splines alone."""
+        """Return the layout of some views (n,); -1: a new view, with splines alone."""
         rows = {name: np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)]) for name, x in self.of_views.items()}
         return AdditionalParameters(self.count, **{name: one[views] for name, one in rows.items()})
 
     def joined(self, others: AdditionalParameters) -> AdditionalParameters:
-        """Return the layout of these views and, behind them, of others."""
+        """Return the layout of these views followed by others."""
         both = self.of_views.items(), others.of_views.values()
         rows = {name: np.concatenate([x, y]) for (name, x), y in zip(*both, strict=True)}
         return AdditionalParameters(self.count, **rows)
 
     def is_whole(self, views: int, size: int) -> bool:
-        """Return whether its arrays are those of so many views, of `size` unknowns each."""
+        """Return whether its arrays are valid, for a number of views of `size` unknowns each."""
         own = self.of_views.values()
         return (
             [one.ndim for one in own] == [2, 3, 2]
@@ -79,7 +79,7 @@ class AdditionalParameters:
 
     @cached_property
     def _of_splines(self) -> Array:
-        """(M, m) orthonormal coefficients of the complement of the polynomials, the slowest first."""
+        """B-spline coefficients (M, m), orthonormal and in the complement of the polynomials, the smoothest first."""
         if not self.count:
             return np.zeros((0, 0))
         u = np.linspace(-1.0, 1.0, SAMPLE, dtype=np.float64)
@@ -95,7 +95,7 @@ class AdditionalParameters:
 
     @cached_property
     def _of_steps(self) -> Array:
-        """(C + 1, s) the same of detectors, against a shift and, of three and more, a scale."""
+        """Orthonormal displacements (C + 1, s) of detectors, without a shift and, from three on, a scale."""
         num = self.edges.shape[1] + 1
         return _complement(np.vander(np.linspace(-1, 1, num), min(num - 1, 2))) if num > 1 else np.zeros((0, 0))
 
@@ -126,7 +126,7 @@ class AdditionalParameters:
 
     @cached_property
     def bands(self) -> Array:
-        """Groups of unknowns (size,) of about the same size: half an octave of waves, steps, parts, sinusoids."""
+        """Group (size,) of each unknown for a common variance: splines by half octaves, steps, parts, sinusoids."""
         m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + float(DRIFTS))
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
@@ -137,21 +137,19 @@ class AdditionalParameters:
         return np.concatenate(found)
 
     def stretches(self, rows: float) -> float:
-        """Return the number of parts of an image of so many rows over which an error shared by neighbours
-        counts anew.
+        """Return the number of parts of an image of `rows` rows over which these unknowns average correlated noise.
 
-        A sinusoid takes the mean of one in each half of its waves, and of each coordinate.
+        One for each unknown; for a sinusoid one for each half period and coordinate.
         """
         known = np.isfinite(self.periods)
         waves = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
-        of_swings = 2 * self.parts[3]
-        return self.size - of_swings + max(4.0 * float(waves.max(initial=0.0)), of_swings)
+        of_sinusoids = 2 * self.parts[3]
+        return self.size - of_sinusoids + max(4.0 * float(waves.max(initial=0.0)), of_sinusoids)
 
     def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
-        """Return the displacement (m, n) of points seen at (2, n) [px] by one unit of each unknown of a
-        coordinate, kind by kind.
+        """Return for each kind the displacement (m, n) of points seen at (2, n) [px] by a unit of each unknown.
 
-        Their rows (n,) normalised are given, too.
+        `row` (n,) are their normalised rows, `index` (n,) their views. Unknowns are those of one coordinate.
         """
         found = [self.splines(row)] if self.count else []
         if self.edges.shape[1]:
@@ -165,9 +163,7 @@ class AdditionalParameters:
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
-        """Return the displacement (2, n) [px] of observations of views `index` (n,) whose unknowns are
-        `params` (N, size).
-        """
+        """Return the displacement (2, n) [px] of observations of views `index` (n,) by unknowns `params` (N, size)."""
         out = np.zeros((2, len(index)))
         for part, one in zip(self._filled, basis, strict=True):
             of_views = params[:, part].reshape(len(params), 2, -1)
@@ -177,31 +173,31 @@ class AdditionalParameters:
         return out
 
     def stack(self, out: Array, basis: list[Array]) -> None:
-        """Write the derivatives by the unknowns into (2, size, n)."""
+        """Write the derivatives of displacements by the unknowns into `out` (2, size, n)."""
         out[...] = 0.0
         for part, one in zip(self._filled, basis, strict=True):
             middle = (part.start + part.stop) // 2
             out[0, part.start : middle] = out[1, middle : part.stop] = one
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
-        """Return the correction of a view with the unknowns (size,)."""
-        splines, steps, moved, swung = (params[part].reshape(2, -1).T for part in self.kinds)
+        """Return the image correction of a view by its unknowns (size,); rows are normalised by offset and scale."""
+        splines, steps, moved, amplitudes = (params[part].reshape(2, -1).T for part in self.kinds)
         edges, strips, periods = (one[view] for one in self.of_views.values())
-        begins, lies_off, swings = np.isfinite(edges), np.isfinite(strips[:, 1]), np.isfinite(periods)
+        in_edges, in_part, in_period = np.isfinite(edges), np.isfinite(strips[:, 1]), np.isfinite(periods)
         return RowSpline(
             self._of_splines @ splines,
             row_offset,
             row_scale,
-            edges[begins],
-            (self._of_steps @ steps)[: begins.sum() + begins.any()],
-            strips[lies_off],
-            moved[lies_off],
-            periods[swings],
-            swung.reshape(2, -1, 2).swapaxes(0, 1)[swings],  # sinusoid, cosine or sine, coordinate
+            edges[in_edges],
+            (self._of_steps @ steps)[: in_edges.sum() + in_edges.any()],
+            strips[in_part],
+            moved[in_part],
+            periods[in_period],
+            amplitudes.reshape(2, -1, 2).swapaxes(0, 1)[in_period],  # sinusoid, cosine or sine, coordinate
         )
 
     def carried(self, params: Array, known: AdditionalParameters) -> Array:
-        """Return unknowns (N, size) started from those of another layout (N, known.size), where kinds agree."""
+        """Return start values (N, size) from the unknowns (N, known.size) of another layout, where kinds agree."""
         out = np.zeros((len(params), self.size))
         same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
         for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):

@@ -1,7 +1,6 @@
-"""Priors on cameras and points, as whitened residual blocks.
+"""Priors on cameras and points, as residuals over standard deviations, linear in the unknowns.
 
-Every block gives residuals and their derivative, divided by sigma. All of them are linear in the unknowns; the tie
-observations, which are not, are in `problem`.
+Tie-point observations, which are not linear, are in `barpc.ba.solving.problem`.
 """
 
 from __future__ import annotations
@@ -18,29 +17,27 @@ from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.sensor.timing import Clocked
 
-DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the harsh end of what is delivered
-DRIFT_SIGMA = 0.2  # m, at a view's first and last row: 0.3 microradian from 700 km, as good platforms have it
-USABLE_ACCURACY = 0.1  # m: less is stated in pixels of a fit (as Airbus does), not in metres of geolocation
-ALIKE_SIGMA = 0.01  # px: of one edge between images of a pass: 0.1 micrometres of a focal plane
-IMAGE_MODEL_SIGMA = 20.0  # px, at the edge of the image: of every coefficient of models in the image
-
+DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the less accurate of delivered RPCs
+DRIFT_SIGMA = 0.2  # m, at the first and last row of a view: 0.3 microradian from 700 km, as of good platforms
+USABLE_ACCURACY = 0.1  # m: a smaller value is the error of an RPC fit (as of Airbus), not of geolocation
+ALIKE_SIGMA = 0.01  # px: sigma of the differences of an edge between images of a pass: 0.1 micrometres of a focal plane
+IMAGE_MODEL_SIGMA = 20.0  # px, at the edge of the image: prior of each coefficient of image models
 
 NOISE_FLOOR = AdjustOptions().noise_floor
-"""Pixels: what all ties of a view share the error of; no camera is known better, and less is let be."""
+"""Pixels: error that all tie points of a view share; no camera is known better, and smaller residuals are tolerated."""
 
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Independent priors (p - mean) / sigma; those of turns about the lines of sight are wider.
+    """Independent normal priors on camera unknowns, with a larger sigma for turns about the lines of sight.
 
-    An accuracy is stated of the place that a camera sees. A turn about its line of sight moves all of the image but its
-    middle.
+    A stated accuracy is that of the middle of the image, which such a turn does not move.
     """
 
-    mean: Array  # (N, q) of every view's unknowns
-    sigma: Array  # (N, q)
+    mean: Array  # (N, q) of the unknowns of each view
+    sigma: Array  # (N, q) standard deviations
     sight: Array | None = None  # (N, q) unit vectors of a turn about the line of sight; zeros: none
-    wider: Array | float = 1.0  # (N, 1) by how much its standard deviation is
+    wider: Array | float = 1.0  # (N, 1) factor on the standard deviation of that turn
 
     @property
     def turn(self) -> Array:
@@ -48,7 +45,7 @@ class CameraPrior:
         return np.zeros_like(self.sigma) if self.sight is None else self.sight
 
     def residual(self, params: Array) -> Array:
-        """Return the whitened residuals (N, q) of unknowns (N, q)."""
+        """Return the residuals (N, q) of unknowns (N, q), over their standard deviations."""
         return self.whitened(params - self.mean)
 
     def whitened(self, values: Array) -> Array:
@@ -59,7 +56,7 @@ class CameraPrior:
         return flat.reshape(values.shape)
 
     def loosest(self) -> Array:
-        """Return standard deviations (N, q) of independent unknowns that hold them in no direction more than these."""
+        """Return standard deviations (N, q) of a prior without correlations, in no direction tighter than this one."""
         return np.where(self.turn != 0.0, self.wider, 1.0) * self.sigma
 
     def precision(self) -> Array:
@@ -70,37 +67,34 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class EarlierScene:
-    """The scene of an earlier block: its motions (`barpc.ba.constraints.gauge.MOTIONS`) by the unknowns of its
-    cameras.
-    """
+    """Motions (`barpc.ba.constraints.gauge.MOTIONS`) of the scene of an earlier block, linear in its cameras."""
 
-    by_unknown: Array  # (10, n)
-    own: Array  # (10, 10) covariance of the motions where the cameras are known [m^2]
-    radius: float  # where tilts, turn and scale are measured [m]
+    by_unknown: Array  # (10, n) their derivative by the camera unknowns
+    own: Array  # (10, 10) their covariance with the cameras fixed [m^2]
+    radius: float  # distance at which tilts, turn and scale are measured [m]
 
 
 @dataclass(frozen=True)
 class JointPrior:
-    """A prior on several views together, with all of their correlations: d^T information d + 2 slope d, d = p - mean.
+    """A joint prior on unknowns of several views, with correlations: d' information d + 2 slope d, d = p - mean.
 
-    Observations that it was learnt from, and that are adjusted again with others of their tie points, are taken off it:
-    alone it need not be positive.
+    The information of observations that are adjusted again is subtracted, so it need not be positive definite.
     """
 
-    index: IntArray  # (n,) places of the unknowns in the raveled (N, q) array
+    index: IntArray  # (n,) indices of the unknowns in the raveled (N, q) array
     mean: Array  # (n,) their prior mean
     information: Array  # (n, n)
-    scene: EarlierScene | None = None  # that these views knew; None: not known
-    told: Array | float = 0.0  # (N,) what tie points told of each view [1/px^2]
-    shown: Array | None = None  # what its corrections show of the priors given
-    slope: Array | float = 0.0  # (n,) half the derivative of its cost at the mean
+    scene: EarlierScene | None = None  # of the earlier block; None: unknown
+    told: Array | float = 0.0  # (N,) information of earlier tie points on each view [1/px^2]
+    shown: Array | None = None  # sums of earlier corrections that estimate the camera priors (`Variances.shown`)
+    slope: Array | float = 0.0  # (n,) half the gradient of the cost at the mean
     earlier: bool = True  # whether it is of an earlier block
 
     @classmethod
     def of_alike(cls, waves: AdditionalParameters, views: int, size: int) -> JointPrior | None:
-        """Return the prior that displaced parts of all images alike differ by `ALIKE_SIGMA`; None where there are none.
+        """Return the prior that a displaced part common to all images differs by `ALIKE_SIGMA`; None without any.
 
-        Of so many views and unknowns a view, of which those of `waves` are the last.
+        There are `views` views of `size` unknowns, of which those of `waves` are the last.
         """
         if not len(waves.alike):
             return None
@@ -113,13 +107,13 @@ class JointPrior:
 
     @classmethod
     def of_values(cls, index: IntArray, values: Array, shape: tuple[int, ...]) -> JointPrior:
-        """Return the prior that unknowns at places `index` (m,) of the raveled (N, q) array have values (m,)."""
+        """Return the prior `values` (m,) of unknowns `index` (m,) of the raveled (N, q) array, sigma `ALIKE_SIGMA`."""
         size, own = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
         own[0, index], own[1, index] = values, ALIKE_SIGMA**-2.0
         return cls(np.arange(size), own[0], np.diag(own[1]), earlier=False)
 
     def gradient(self, params: Array) -> Array:
-        """Return half the derivative (n,) of the cost by the unknowns `index` at unknowns (N, q)."""
+        """Return half the gradient (n,) of the cost by the unknowns `index`, at unknowns (N, q)."""
         return self.information @ (params.ravel()[self.index] - self.mean) + self.slope
 
     def cost(self, params: Array) -> float:
@@ -127,23 +121,22 @@ class JointPrior:
         return float((params.ravel()[self.index] - self.mean) @ (self.gradient(params) + self.slope))
 
     def without(self, information: Array, gradient: Array, params: Array) -> JointPrior:
-        """Return the information (n, n), and gradient (n,) at params, without some observations."""
+        """Return the prior less the information (n, n), and gradient (n,) at `params`, of some observations."""
         slope = information @ (params.ravel()[self.index] - self.mean) - gradient
         return replace(self, information=self.information - information, slope=self.slope + slope)
 
 
 @dataclass(frozen=True)
 class PointPrior:
-    """Priors on points with errors in common: rows (X - mean) - common b, and b itself is standard normal.
+    """Priors on points with common errors b: residuals rows (X - mean) - common b, with b standard normal.
 
-    b is never a state of its own: residuals are those that the best b for the points leaves.
+    b is no unknown of the adjustment: it is eliminated, its estimate is `offset`.
     """
 
-    index: IntArray  # (Q,) which points; none twice
+    index: IntArray  # (Q,) distinct points
     mean: Array  # (Q, 3) ECEF [m]
-    rows: Array  # (Q, 3, 3) whitening rows [1/m]; rows of zeros say nothing
-    # (Q, 3, m) what one standard deviation of each of m common errors adds to the whitened residuals
-    common: Array
+    rows: Array  # (Q, 3, 3) whitening matrices [1/m]; rows of zeros: no constraint
+    common: Array  # (Q, 3, m) effect of one standard deviation of each of m common errors on whitened residuals
 
     def offset(self, points: Array) -> Array:
         """Estimate the common errors (m,) of points (P, 3) [m], in their standard deviations."""
@@ -151,15 +144,15 @@ class PointPrior:
         return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
 
     def residual(self, points: Array) -> Array:
-        """Return the whitened residuals (Q, 3) of points (P, 3) [m], the common errors taken away."""
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], without the estimated common errors."""
         return self.apart(points) - self.common @ self.offset(points)
 
     def cost(self, points: Array) -> float:
-        """Return the sum of the squared residuals, with the common errors' own."""
+        """Return the sum of squared residuals, and of squared common errors."""
         return float((self.residual(points) ** 2).sum() + (self.offset(points) ** 2).sum())
 
     def information(self) -> Array:
-        """Return the information (m, m) on the common errors where the points are known."""
+        """Return the information (m, m) on the common errors, with the points fixed."""
         information: Array = np.einsum("qim,qin->mn", self.common, self.common)
         information += np.eye(len(information))
         return information
@@ -169,7 +162,7 @@ class PointPrior:
         return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
-        """Return the whitened offsets (Q, 3) of points (P, 3) [m] with the common errors still in them."""
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], common errors included."""
         return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
 
     def jacobian(self) -> Array:
@@ -190,16 +183,14 @@ def states_accuracy(view: View) -> bool:
 
 
 def is_stated(view: View, options: AdjustOptions) -> bool:
-    """Return whether a person, a file or a radar's metadata state the accuracy of a view; else it is the default."""
+    """Return whether options, a file or radar metadata state the accuracy of a view; else it is the default."""
     given = options.sigma_attitude is not None or options.sigma_position is not None
     of_model = isinstance(view.sensor, Pushbroom | Clocked) and view.sensor.accuracy is not None
     return given or of_model or states_accuracy(view)
 
 
 def _stated_accuracy(view: View) -> tuple[float, float]:
-    """Return the stated accuracies of a view's attitude (metres on the ground) and position, or of its two
-    clocks [m].
-    """
+    """Return the stated accuracies [m] of a view's attitude (on the ground) and position, or of its two clocks."""
     sensor = view.sensor
     if isinstance(sensor, Pushbroom | Clocked) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy
@@ -212,7 +203,7 @@ def prior_sigmas(
 ) -> Array:
     """Return the prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
 
-    A view that is known to be `off` (N,) [m] by more than it states is not held to that.
+    `off` (N,) [m] are measured offsets of the views: where larger than the stated accuracy, they replace it.
     """
     stated = np.array([_stated_accuracy(view) for view in views])
     if off is not None:

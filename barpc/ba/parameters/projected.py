@@ -1,8 +1,7 @@
-"""All views at once: corrected image points and their derivatives, observation by observation.
+"""Projection of all observations of a block through their corrected cameras, with derivatives.
 
-Arrays here are component-major, (..., K), observations sorted by view: whole components are contiguous,
-and what differs between views is one small matrix product a view. A correction's unknowns are a row of
-metres (see `Unknowns`), so that all of them weigh about the same.
+Arrays are component-major, (..., K), with observations sorted by view: components are contiguous, and each view takes
+one small matrix product. The unknowns of a correction are scaled to metres (see `Unknowns`).
 """
 
 from __future__ import annotations
@@ -33,9 +32,10 @@ class Projected:
 
 
 class Cameras:
-    """The views of a block behind their corrections.
+    """The cameras of a block with corrections.
 
-    A drift asks when each point was seen, and splines where: `seen` (2, K), as observed [px], sorted by view.
+    `seen` (2, K) [px] are the observed image points, sorted by view: drift depends on their rows, and additional
+    parameters on both coordinates.
     """
 
     def __init__(self, views: Sequence[View], unknowns: Unknowns, seen: Array | None = None) -> None:
@@ -46,7 +46,7 @@ class Cameras:
         self.is_rpc = self._stack.is_rpc
 
     def seeing(self, seen: Array) -> Cameras:
-        """Return the views with other observations, at image points (2, K) [px]."""
+        """Return the cameras with other observations, at image points (2, K) [px]."""
         cameras = copy(self)
         cameras.seen = seen
         return cameras
@@ -59,12 +59,11 @@ class Cameras:
         wanted: Wanted = "unknowns",
         out: Projected | None = None,
     ) -> Projected:
-        """Project the block's points: corrected image points with derivatives, written into `out` where it is
-        given.
+        """Return the corrected image points of all observations with derivatives, written into `out` if given.
 
-        Of unknowns (N, q) and every observation's point (3, K) [m]; observations of view v are bounds[v] :
-        bounds[v + 1]. `wanted` are no derivatives ("image"), those by the "points", or by the "unknowns" too; what
-        is not wanted has no rows.
+        `params` (N, q) are the unknowns, `ecef` (3, K) [m] the point of each observation; those of view v are
+        bounds[v] : bounds[v + 1]. `wanted`: no derivatives ("image"), those by "points", or also by "unknowns"; arrays
+        not wanted have no rows.
         """
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
@@ -102,7 +101,7 @@ class Cameras:
     def _moved(
         self, params: Array, ecef: Array, views: slice, bounds: IntArray, seen: Array | None, out: Projected
     ) -> None:
-        """Project points through cameras with some unknowns, turned and shifted."""
+        """Project points through rotated and translated cameras."""
         unknowns, image_only, all_wanted = self.unknowns, not out.by_point.shape[1], bool(out.by_unknown.shape[1])
         as_delivered = not params.any()
         if as_delivered and not all_wanted:
@@ -130,7 +129,7 @@ class Cameras:
             unknowns.stack(*motion.by_turns(by_moved), out.by_point, inverse, row, out.by_unknown)
 
     def _timed(self, params: Array, ecef: Array, view: int, out: Projected) -> None:
-        """Project points into a radar whose clocks are corrected."""
+        """Project points into a radar image with corrected clocks."""
         unknowns = self.unknowns
         model = unknowns.radars[view].timed(unknowns.timing(params, view))
         ground, by_ecef = ground_rows_from_ecef(ecef)
@@ -143,7 +142,7 @@ class Cameras:
             out.by_unknown[:] = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
-        """Return the uncorrected image points (2, n) without a derivative."""
+        """Return the image points (2, n) of the delivered cameras."""
         ground = ground_from_ecef(ecef.T)
         if self.is_rpc[views.start]:
             return self._stack.image(ground.T, views, bounds)
@@ -151,13 +150,13 @@ class Cameras:
         return image
 
     def _by_ecef(self, ecef: Array, views: slice, bounds: IntArray) -> tuple[Array, Array]:
-        """Return the uncorrected image points (2, n) and their derivative by ECEF (2, 3, n)."""
+        """Return the image points (2, n) of the delivered cameras, and their derivatives by ECEF (2, 3, n)."""
         ground, by_ecef = ground_rows_from_ecef(ecef)
         if self.is_rpc[views.start]:
             image, by_ground = self._stack.project(ground, views, bounds)
         else:
             points, jacobian = self.sensors[views.start].project_jacobian(ground.T)
-            image = points.T  # components laid out anew: products of strided ones take twice as long
+            image = points.T  # copied: products of strided arrays take twice as long
             by_ground = np.ascontiguousarray(np.moveaxis(jacobian, 0, -1))
         return image, _matrix_products(by_ground, by_ecef)
 

@@ -1,9 +1,9 @@
-"""The unknowns of a view: a row of numbers in metres (or pixels), and the correction that it stands for.
+"""The unknowns of each view in metres (or pixels), and the camera correction that they parametrise.
 
-Geometric models count a rotation in metres on the ground (angle x distance of the scene), so that every
-unknown moves the image by about one pixel a pixel's size. Image models count pixels at the image's edge. A radar whose
-clocks can be corrected has the first two unknowns of the constants and of every degree of the drift: range and place
-along the flight (azimuth time x speed). The others are nothing to it.
+Geometric models scale rotations to metres on the ground (angle x distance to the scene), so that all unknowns have a
+similar effect. Image models have pixels at the edge of the image. A radar with correctable clocks uses only the first
+two unknowns of the constants and of each degree of the drift: range, and position along the flight (azimuth time x
+speed).
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from barpc.sensor.rpc import localize_stack
 from barpc.sensor.timing import Clocked, Timed, Timing
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
-"""Image models: which of the terms 1, col, row each coordinate's correction has."""
+"""Image models -> which of the terms 1, col, row the correction of each coordinate has."""
 
 
 @dataclass(frozen=True)
 class Unknowns:
     """Layout of the unknowns of N views."""
 
-    model: str  # A name of `AdjustOptions.model`
-    drift: int  # degree of the rotation in the image row
+    model: str  # a name of `AdjustOptions.model`
+    drift: int  # degree of the polynomial of the rotation in the image row
     center: Array  # (N, 3) camera centres [m], ECEF
     distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
-    middle: Array  # (2, N) of every image, col and row [px]
+    middle: Array  # (2, N) middle of each image, col and row [px]
     half: Array  # (2, N) its half width and height [px]
-    # (N, 2) where its scene stands, east and north of the middle of all [m]
+    # (N, 2) position of its scene, east and north of the mean of all [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    waves: AdditionalParameters | None = None  # what is left in the image
-    radars: Mapping[int, Clocked] = field(default_factory=dict)  # views whose unknowns are those of clocks
-    direction: Array | None = None  # (N, 3) of the line of sight of every image's middle, ECEF
+    waves: AdditionalParameters | None = None  # additional parameters in the images
+    radars: Mapping[int, Clocked] = field(default_factory=dict)  # views with corrected clocks
+    direction: Array | None = None  # (N, 3) line of sight of the middle of each image, ECEF
 
     @property
     def geometric(self) -> bool:
-        """Whether the unknowns act in space (else in the image)."""
+        """Whether the correction is one of the camera in space; else it is in the image."""
         return self.model not in _IMAGE_TERMS
 
     @property
@@ -55,22 +55,22 @@ class Unknowns:
 
     @property
     def _of_model(self) -> int:
-        """Number of unknowns of a view that are the model's; additional parameters follow."""
+        """Number of unknowns of a view without additional parameters, which follow them."""
         return self.constants + 3 * self.drift if self.geometric else 2 * len(_IMAGE_TERMS[self.model])
 
     @property
     def constants(self) -> int:
-        """Number of unknowns of a view before those of the drift."""
+        """Number of unknowns of rotation and translation of a view; those of the drift follow."""
         return 3 * (self.rotates + self.translates)
 
     @property
     def in_waves(self) -> slice:
-        """Slice of a view's unknowns that are additional parameters in the image."""
+        """Slice of the additional parameters among the unknowns of a view."""
         return slice(self._of_model, self.size)
 
     @property
     def sight(self) -> Array | None:
-        """Unit vectors (N, q) of a turn about the line of sight; zeros for radars, None where there is none."""
+        """Unit vectors (N, q) of a turn about the line of sight; zeros for radars. None without rotations."""
         if self.direction is None or not self.geometric or not self.rotates:
             return None
         out = np.zeros((len(self.direction), self.size))
@@ -80,16 +80,16 @@ class Unknowns:
 
     @property
     def rotates(self) -> bool:
-        """Whether views rotate."""
+        """Whether the model has rotations."""
         return "rotation" in self.model
 
     @property
     def translates(self) -> bool:
-        """Whether views translate."""
+        """Whether the model has translations."""
         return "translation" in self.model
 
     def rotation(self, params: Array, views: slice = slice(None)) -> Array:
-        """Return the rotation vectors (n, 3) [rad] at the middle row, of the views whose unknowns (n, q) are given."""
+        """Return the rotation vectors (n, 3) [rad] at the middle row, for unknowns (n, q) of the views."""
         if not self.rotates:
             return np.zeros((len(params), 3))
         return params[:, :3] / self.distance[views, None]
@@ -102,7 +102,7 @@ class Unknowns:
         return params[:, start : start + 3]
 
     def drift_vectors(self, params: Array, views: slice = slice(None)) -> Array:
-        """Return the rotation vectors (n, D, 3) [rad] that the powers of the normalised row add."""
+        """Return the rotation vectors (n, D, 3) [rad] that multiply the powers 1 to D of the normalised row."""
         vectors = params[:, self.constants : self._of_model].reshape(len(params), self.drift, 3)
         return vectors / self.distance[views, None, None]
 
@@ -114,8 +114,9 @@ class Unknowns:
         return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
 
     def stack_timing(self, by_timing: Array, along: Array, view: int) -> Array:
-        """Return derivatives (2, q, n) by a radar's unknowns from those (2, 2, n) by range [px/m] and azimuth
-        time [px/s].
+        """Return derivatives (2, q, n) by the unknowns of a radar.
+
+        `by_timing` (2, 2, n) are those by range [px/m] and azimuth time [px/s]; `along` (n,) is the azimuth [px].
         """
         radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
         u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
@@ -130,7 +131,7 @@ class Unknowns:
         return (image - self.middle[:, index]) / self.half[:, index]
 
     def drift_rotation(self, params: Array, views: slice, count: IntArray, row: Array) -> Array:
-        """Return the rotation (3, n) [rad] that the drift adds at normalised rows (n,), `count` of each view."""
+        """Return the rotation (3, n) [rad] by the drift at normalised rows (n,), of which each view has `count`."""
         vectors = np.repeat(self.drift_vectors(params, views).transpose(1, 2, 0), count, axis=2)  # (D, 3, n)
         added: Array = vectors[-1] * row
         for degree in range(self.drift - 2, -1, -1):
@@ -140,9 +141,9 @@ class Unknowns:
     def stack(
         self, by_rotation: Array, by_drift: Array, by_point: Array, inverse: Array, row: Array | None, out: Array
     ) -> None:
-        """Write derivatives (2, q, n) by unknowns, of those (2, 3, n) by rotations [px/rad] and point.
+        """Write derivatives by the unknowns into `out` (2, q, n), from those (2, 3, n) by rotation [px/rad] and point.
 
-        `inverse` (n,) are their views' distances, inverted.
+        `inverse` (n,) are the inverse distances of the views [1/m].
         """
         at = 0
         if self.rotates:
@@ -159,9 +160,7 @@ class Unknowns:
             at += 3
 
     def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
-        """Add the displacements by splines and steps to image points (2, n) seen at (2, n) [px], and to their
-        derivatives.
-        """
+        """Add the displacements by additional parameters at observed points `seen` (2, n) [px], with derivatives."""
         assert self.waves is not None
         row = (seen[1] - self.middle[1, index]) / self.half[1, index]
         basis = self.waves.basis(row, seen, index)
@@ -170,7 +169,7 @@ class Unknowns:
             self.waves.stack(by_unknown[:, self.in_waves], basis)
 
     def in_image(self, params: Array, index: IntArray, image: Array, by_point: Array) -> tuple[Array, Array, Array]:
-        """Apply the models in the image: corrected image points (2, n), and the derivatives by point and by unknown."""
+        """Apply the image model: return corrected image points (2, n), and derivatives by point and by unknown."""
         basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
@@ -184,7 +183,7 @@ class Unknowns:
         return moved, by_moved, by_unknown
 
     def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
-        """Return every view's sensor behind the correction that its unknowns (N, q) stand for."""
+        """Return the sensor of each view with its correction by the unknowns (N, q)."""
         found = self._moved(params, views) if self.geometric else self._in_images(params, views)
         if self.waves is not None:
             for i, one in enumerate(params[:, self.in_waves]):
@@ -193,7 +192,7 @@ class Unknowns:
         return tuple(found)
 
     def _moved(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
-        """Return every view's sensor behind its correction in space, or of its clocks."""
+        """Return the sensor of each view with its correction in space, or of its clocks."""
         vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
         rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
         corrections = [
@@ -205,7 +204,7 @@ class Unknowns:
         return found
 
     def _in_images(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
-        """Return every view's sensor behind the model in its image."""
+        """Return the sensor of each view with its correction in the image."""
         normalized = np.zeros((len(params), 2, 3))
         normalized[..., list(_IMAGE_TERMS[self.model])] = params[:, : self._of_model].reshape(len(params), 2, -1)
         slope = normalized[..., 1:] / self.half.T[:, None]
@@ -220,7 +219,7 @@ def make_unknowns(
     centers: Array | None = None,
     waves: AdditionalParameters | None = None,
 ) -> Unknowns:
-    """Return the layout for N views; `centers` (N, 3), ECEF [m], are regressed from the sensors where None."""
+    """Return the layout for N views; `centers` (N, 3), ECEF [m], are estimated from the sensors if None."""
     size = np.array([view.size for view in views], dtype=np.float64).reshape(-1, 2)
     if model in _IMAGE_TERMS:
         centers = np.zeros((len(views), 3))

@@ -21,10 +21,9 @@ from barpc.scene import BoolArray, IntArray
 
 
 def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Find the intervals of images in which more ties were cut, or are displaced, than elsewhere and chance
-    allow.
+    """Find the intervals of images with significantly more rejected tie points, or a displacement above `floor` [px].
 
-    A mean below `floor` [px] is none.
+    The result is cached in the outcome.
     """
     if floor not in outcome.standing_out:
         outcome.standing_out[floor] = _standing_out(outcome, block, floor)
@@ -33,21 +32,19 @@ def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]
 
 def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
-    right = outcome.inlier[rows].astype(np.float64)  # of few ties some that were cut make a mean by chance
+    right = outcome.inlier[rows].astype(np.float64)  # inliers only: a few rejected ones would make a mean by chance
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
     found = scan(block.view[rows], block.xy[:, rows], image_sizes(block), 1.0 - right, off, right, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
 def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return the significant intervals at the end, with the residuals of the rejected tie points there.
+    """Return the significant intervals of the result, with the median residual of rejected tie points in each.
 
-    As their tracks see it that are triangulated with all that may be seen, where all of one was cut.
+    Tracks of which all observations were rejected are triangulated again from all of these.
     """
     found = standing_out(outcome, block, floor)
-    if not all(
-        one.by_share for one in found
-    ):  # noise that neighbours share makes means of them, and is none of an image's part
+    if not all(one.by_share for one in found):  # correlated noise has means, too, and is no fault of an interval
         by_neighbours = correlated_noise_gain(outcome, block)
         found = [one for one in found if one.by_share or one.gain > by_neighbours]
     if not any(one.by_share for one in found):
@@ -67,7 +64,7 @@ def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
 
 
 def periods_of(outcome: Outcome, block: Block) -> list[Period]:
-    """Find significant periods of the rows of images, at most one an image."""
+    """Find significant periods of the residuals along rows, at most one for each image."""
     rows, off = _whitened(outcome, block)
     return find_periods(
         block.view[rows], block.xy[1, rows], image_sizes(block), _confirmed_observations(outcome, block)[rows], off
@@ -85,9 +82,9 @@ def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
 def correlated_log_ratio(
     view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray
 ) -> float:
-    """Return the evidence for correlated noise [nats] in residuals (2, k) of tie points, in standard deviations.
+    """Return the evidence for correlated noise [nats] in residuals `off` (2, k) [standard deviations] of tie points.
 
-    A track of n views leaves 2 n - 3 of its 2 n residuals free.
+    The inliers are `right` (k,). It is scaled by degrees of freedom: 2 n - 3 of 2 n residuals in a track of n views.
     """
     right = right & (np.hypot(*off) < OUTLIER)
     free = 1.0 - 1.5 * len(np.unique(track[right])) / max(int(right.sum()), 1)
@@ -95,13 +92,13 @@ def correlated_log_ratio(
 
 
 def _confirmed_observations(outcome: Outcome, block: Block) -> Array:
-    """Return 1 for observations (K,) of points with two inliers, rejected ones among them; else 0."""
+    """Return 1 for all observations (K,) of points with two inliers, rejected ones included; else 0."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
 
 def _whitened(outcome: Outcome, block: Block) -> tuple[BoolArray, Array]:
-    """Return the observations of tracks (K,), and residuals (2, k) of these in standard deviations."""
+    """Return the mask (K,) of tie points in use, and their residuals (2, k) in standard deviations."""
     is_tie = (block.point < block.num_tracks) & block.use
     freedom = Observations(outcome.problem, block.sigma, 0.0, is_tie).freedom(outcome.inlier.astype(np.float64))
     spread = block.sigma * outcome.noise * np.sqrt(0.5 * freedom)

@@ -1,7 +1,7 @@
-"""A beam search for the terms of a block: the term of most evidence is taken, then the next, beside its rivals.
+"""A beam search for the terms of a block: each step adds the term of most evidence to a combination of terms.
 
-Evidence is the gain of the marginal likelihood of all observations [nats] less the price of the choice. Up to `RIVALS`
-combinations are searched side by side; correlated noise, which needs no term, is the rival of all.
+Evidence is the gain of the log marginal likelihood of all observations [nats], less the price of the choice. Up to
+`RIVALS` combinations are kept. Correlated noise, which needs no term, competes with all of them.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_LEAST_FLOORS = 2.5  # floors: least amplitude of sinusoids and motions; sound crops show 1.8, by correlated noise
+_LEAST_FLOORS = 2.5  # least amplitude of sinusoids and motions, in noise floors; images without faults show 1.8
 _Candidate = tuple[Term, MixtureFit, float]
-"""A term, the fit with it, and the evidence that it gains [nats]."""
+"""A term, the fit that includes it, and its gain of evidence [nats]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The terms taken, and the cameras and observations with them."""
+    """The selected terms, with the cameras and inliers beside them."""
 
     findings: tuple[Finding, ...] = ()
-    step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) of the cameras' unknowns
-    right: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability that an observation is right
+    step: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (N, q) change of the camera unknowns
+    right: Array = field(default_factory=lambda: np.zeros(0))  # (K,) probability of being an inlier
 
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
     term: Term
-    gain: float
-    gap: float
-    runner_up: str
-    or_of: tuple[int, ...]
-    before: Residuals
+    gain: float  # evidence over the state before [nats]
+    gap: float  # evidence over the runner-up [nats]
+    runner_up: str  # kind of it
+    or_of: tuple[int, ...]  # other views with a similar gain
+    before: Residuals  # without the term
 
     @property
     def name(self) -> tuple[str, int]:
@@ -59,9 +59,9 @@ class _Taken:
 class _SearchState:
     """A combination of terms."""
 
-    seen: Residuals
-    taken: tuple[_Taken, ...] = ()
-    ended: bool = False  # nothing may be taken beside them
+    seen: Residuals  # beside these terms
+    taken: tuple[_Taken, ...] = ()  # in the order of selection
+    ended: bool = False  # no further term is tried
 
     @property
     def gain(self) -> float:
@@ -70,41 +70,41 @@ class _SearchState:
 
     @property
     def followed(self) -> MixtureFit:
-        """The fit with the terms that are estimated with the cameras: all, or all but the last."""
+        """The fit with those terms that are estimated with the cameras: all, or all but the last."""
         last = self.taken[-1]
         return self.seen.base if last.term.FOLLOWED else last.before.base
 
     @property
     def moves(self) -> bool:
-        """Whether moving ground is the last term."""
+        """Whether the last term is a moving group."""
         return bool(self.taken) and self.taken[-1].term.group is not None
 
     @property
     def gain_beside_motion(self) -> float:
-        """Evidence gained by the terms before moving ground; by all where there is none."""
+        """Evidence gained by all terms but a moving group."""
         return self.gain - (self.taken[-1].gain if self.moves else 0.0)
 
     def may_pass(self, best: _SearchState) -> bool:
-        """Return whether further terms, none gaining more than the last, may pass another that ended."""
+        """Return whether further terms, each gaining at most as much as the last, may reach more than `best`."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def may_exceed(self, noise: float) -> bool:
-        """Return whether further terms, none gaining more than the best taken, may gain more than correlated noise."""
+        """Return whether further terms, each gaining at most as much as the best, may exceed correlated `noise`."""
         return self.gain + (TRIED - len(self.taken)) * max(row.gain for row in self.taken) > noise
 
     def adds_to(self, best: _SearchState, beside: list[_Candidate]) -> bool:
-        """Return whether its last term gains as much beside the best: it is no rival then."""
+        """Return whether its last term gains as much together with the best state: then it is no rival of that."""
         last, one = self.taken[-1], self.taken[-1].term
         same = [row.name for row in self.taken[:-1]] == [row.name for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].NAME == one.NAME and not row[0].differs(one)]
         return same and max(gains, default=0.0) > last.gain - SURE
 
     def added(self, tried: list[_Candidate]) -> _SearchState:
-        """Return the state with the best of the terms tried, of nearly equal parts of an image the smaller."""
+        """Return the state with the best candidate; of complementary parts of an image with like gains the smaller."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
-        one, made, gain = min(same, key=lambda row: row[0].share(self.seen))  # of two as good, the smaller part
+        one, made, gain = min(same, key=lambda row: row[0].share(self.seen))
         others = [row for row in tried if row[0] is not one and row[0].differs(one)]
         other = max(
             ((row[0].NAME, _least_gain(row, one, gain)) for row in others), default=("", 0.0), key=itemgetter(1)
@@ -118,28 +118,28 @@ class _SearchState:
         return _SearchState(seen, taken, not one.FOLLOWED or len(taken) == TRIED)
 
     def without_noise(self) -> _SearchState:
-        """Return the state with the first terms alone, where correlated noise explains as much as all after them.
+        """Return the state without the last terms where correlated noise explains as much as these.
 
-        With it they must explain more than it alone, and more than it still does beside them: where neighbours share
-        errors, a term gains by each of them as if it were another.
+        They must gain more than the evidence for correlated noise falls by them, and more than that which is still. A
+        term counts correlated errors as independent ones, so its gain is too large.
         """
-        left = _noise_evidence(self.seen) if self.taken else 0.0
+        still = _noise_evidence(self.seen) if self.taken else 0.0
         for n, row in enumerate(self.taken):
             gain = sum(one.gain for one in self.taken[n:])
-            if gain <= max(left, _noise_evidence(row.before) + SURE - left):
+            if gain <= max(still, _noise_evidence(row.before) + SURE - still):
                 return _SearchState(row.before, self.taken[:n])
         return self
 
     def replaces(self, best: _SearchState) -> bool:
-        """Return whether it explains as much as another with fewer terms, but for correlated noise, or with as many."""
+        """Return whether it gains as much as `best` with as many terms, or with fewer and correlated noise."""
         more = len(best.taken) - len(self.taken)
-        followed = all(row.term.FOLLOWED for row in self.taken)  # others leave their image as it is
+        followed = all(row.term.FOLLOWED for row in self.taken)  # others do not correct their image
         if not followed or best.moves or more < 0:
             return False
         return best.gain - self.gain <= (_noise_evidence(self.seen) if more else 0.0)
 
     def other_views(self, states: list[_SearchState]) -> list[tuple[int, ...]]:
-        """Return the other views that each term may be of: in states that explain as much, alike but for it."""
+        """Return for each term its alternative views: those in states that differ by it alone and gain as much."""
         found: list[set[int]] = [set(row.or_of) for row in self.taken]
         for state in states:
             differ = [n for n, (a, b) in enumerate(zip(self.taken, state.taken, strict=False)) if a.name != b.name]
@@ -149,7 +149,7 @@ class _SearchState:
         return [tuple(sorted(views)) for views in found]
 
     def simplified(self) -> _SearchState:
-        """Return the state with simpler terms where these explain as much beside all others."""
+        """Return the state with each term replaced by a simpler one where that has more evidence."""
         state = self
         for n, row in enumerate(self.taken):
             seen, plain = state.seen, row.term.simpler(state.seen)
@@ -165,12 +165,12 @@ class _SearchState:
         return state
 
     def findings(self, margin: float, or_of: list[tuple[int, ...]]) -> Iterator[Finding]:
-        """Yield the records of the terms; `margin` is by how much the combination gains over its rival."""
+        """Yield the records of the terms; `margin` [nats] is the gain of the combination over its runner-up."""
         stop = 0
         for row, views in zip(self.taken, or_of, strict=True):
             start, stop = stop, stop + len(row.term.sigma)
             unknowns = self.seen.base.extra[start:stop]
-            # a term that was not the best by itself is beside the others: by what these gain together
+            # a term that was not the best of its step won together with the others: by the margin of these
             gap = row.gap if row.gap > 0.0 else margin
             yield from row.term.findings(
                 self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=views
@@ -178,23 +178,23 @@ class _SearchState:
 
 
 def _contains(one: Term, other: Term) -> bool:
-    """Return whether a term is another at its limit: an endless decay is a step to an end of its image, or the rest."""
+    """Return whether `other` is a limit of a term: an infinitely long decay is a step, or the complement of one."""
     if not _of_one_image(one, other) or one.price <= other.price:
         return False
     assert one.where is not None
     assert other.where is not None
     (axis, start, stop, _, rate), (axis2, *ends) = one.where, other.where[:3]
-    size = 0.5 * stop if rate > 0.0 else -start  # as `open_ended` has it, which a decay is
+    size = 0.5 * stop if rate > 0.0 else -start  # an open end as of `open_ended`
     return axis == axis2 and (ends[0] == -size or ends[1] == 2.0 * size)
 
 
 def _least_gain(row: _Candidate, best: Term, gain: float) -> float:
-    """Return the gain of a candidate, refined or not: one that contains the best gains as much, but for its price."""
+    """Return the least gain of a candidate once refined: one that contains the best gains as much, less its price."""
     return max(row[2], gain + best.price - row[0].price) if _contains(row[0], best) else row[2]
 
 
 def _of_one_image(one: Term, other: Term) -> bool:
-    """Return whether two terms may be a part of an image and its complement."""
+    """Return whether two terms displace parts of the same image, perhaps one the complement of the other."""
     return one is other or (one.view == other.view and one.LOCAL and other.LOCAL)
 
 
@@ -204,7 +204,7 @@ def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
 
 
 def _noise_evidence(seen: Residuals) -> float:
-    """Return the evidence for noise that neighbours share where nothing moves, beside the terms taken [nats]."""
+    """Return the evidence for correlated noise beside the terms taken [nats], without moving tracks."""
     found, linear = seen.base, seen.linear
     off, _ = off_from_right(linear, _residuals(found, linear, seen.extra), found.right)
     track = np.full(len(linear.view), -1)
@@ -213,34 +213,34 @@ def _noise_evidence(seen: Residuals) -> float:
     right = (track >= 0) & (found.right > 0.5)
     if len(found.moving):
         right &= found.moving < 0.5
-    # what exceeds the stated errors of matchers is no noise of theirs
+    # residuals beyond the outlier limit are no matching noise, and do not count
     return correlated_log_ratio(linear.view, seen.place, seen.size, off, right, track)
 
 
 class TermSearch:
-    """A search for terms at the residuals of a block.
+    """The search for the terms of a block.
 
     Parameters
     ----------
     seen : Residuals
     first : list of Interval
         Significant intervals before the first term.
-    floor, sigma : float, least displacement that is looked for and standard deviation of observations [px]
+    floor, sigma : float, least displacement to find, and standard deviation of observations [px]
     """
 
     def __init__(self, seen: Residuals, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma
         self.seen, self.taken = seen, tuple[_Taken, ...]()
-        self.group: list[Term] = []  # searched for once
+        self.group: list[Term] = []  # moving groups, searched for once
 
     def run(self) -> Selection:
-        """Return all terms that are taken."""
+        """Return the selected terms."""
         first, ended = self._grown([_SearchState(self.start)])
         states, noise = first, _noise_evidence(self.start)
         while not ended and any(state.may_exceed(noise) for state in states):
             states, ended = self._grown(states)
         if first[0].moves and states[0].gain_beside_motion < first[0].gain:
-            # the terms beside moving ground explain less than it does alone: all compete again without it
+            # the terms beside the moving group gain less than it did alone: it is taken alone
             states = first[:1]
         margin = states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
         reduced = [state.without_noise() for state in states]
@@ -255,7 +255,7 @@ class TermSearch:
         return Selection(tuple(best.findings(margin, or_of)), best.followed.step, best.followed.right)
 
     def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
-        """Return the best combinations with one more term, and whether they are the last."""
+        """Return the best combinations with one more term, and whether the search ends with them."""
         best, grown, beside = states[0], list[_SearchState](), list[_Candidate]()
         for state in states:
             if state.ended or (best.ended and not state.may_pass(best)):
@@ -265,7 +265,7 @@ class TermSearch:
                 continue
             self.seen, self.taken = state.seen, state.taken
             tried = [row for row in self._tried() if row[2] > SURE]
-            if not tried and state is best:  # it explains all
+            if not tried and state is best:  # no residuals are significant
                 return states, True
             beside = tried if state is best else beside
             for n in [0, *_rivals(tried)] if tried else []:
@@ -279,15 +279,15 @@ class TermSearch:
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
     def _tried(self) -> list[_Candidate]:
-        """Return the candidates beside the terms taken, with their gains, the best first; some may gain nothing."""
+        """Return the candidates for the next term, the best first; gains may be negative."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
-        # in a pair more wrong matches at an end explain those cut there as well, and nothing stands out beside them
+        # in pairs a fit with more wrong matches may hide an interval: those of the rejected observations are used then
         out = out or ([] if self.taken else self.first)
-        made = self._with([], self._worth_more(list(proposed(seen, out, periods))))
-        made = self._refined(self._with(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
+        made = self._added([], self._most_promising(list(proposed(seen, out, periods))))
+        made = self._refined(self._added(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
-        if moves and not self._leaves_nothing(made):
+        if moves and not self._explains_all(made):
             made = self._sorted([row[:2] for row in (*made, *self._moving())])
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
@@ -297,65 +297,65 @@ class TermSearch:
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
-        all_off, known = off_from_right(linear, _residuals(found, linear, extra), found.right)
-        off, told = all_off[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
+        all_residuals, known = off_from_right(linear, _residuals(found, linear, extra), found.right)
+        off, weight = all_residuals[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
-        out = [one for one in scan(view, place, seen.size, wrong, off, told, floor) if one.gain > SURE]
-        return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, told, off)[:RIVALS]
+        out = [one for one in scan(view, place, seen.size, wrong, off, weight, floor) if one.gain > SURE]
+        return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, weight, off)[:RIVALS]
 
-    def _leaves_nothing(self, made: list[_Candidate]) -> bool:
-        """Return whether no residuals are significant beside the best term: it needs no rival then."""
+    def _explains_all(self, made: list[_Candidate]) -> bool:
+        """Return whether no residuals are significant beside the best candidate: it needs no rival then."""
         if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
             return False
         one, found, _ = made[0]
         return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
 
     def _moving(self) -> list[_Candidate]:
-        """Return moving-group candidates, searched for once, and parts of images that contain the same observations."""
+        """Return moving groups, searched for once, and displaced parts of images with the same observations."""
         self.group = self.group or list[Term](MovingObjects.of(self.seen))
-        found = self._with([], self.group)
+        found = self._added([], self.group)
         rows = self.seen.linear.taking_part
         members = [(one, row[1]) for row in found if row[2] > SURE for one in self._members(row[1], rows)]
-        fits = [(one, self._fit(one, base=still)) for one, still in members]  # from the cameras of what stands still
+        fits = [(one, self._fit(one, base=still)) for one, still in members]  # cameras of the still tracks
         return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
 
     def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
-        """Return the terms, best first, with ends, periods and lengths refined where these may gain most.
+        """Return the candidates, best first, with ends, periods and lengths refined where these may gain most.
 
-        Where nothing is left beside the best, what contains it says the same at a higher price.
+        Where no residuals are significant beside the best, terms that contain it are not refined.
         """
         kinds = [kind for kind in TERMS.values() if kind.LOCAL]
         local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
-        # where one is sure already, one that is not waits for the next round
+        # candidates that gain much less than the best wait for the next step
         least = max(SURE, made[0][2] / RIVALS) if made and made[0][2] > SURE else -np.inf
         out, enough = list[tuple[Term, MixtureFit]](), False
         for one, found, gain in made:
             asked = gain > least and (one in local or not (one.LOCAL or one.group))
             same = enough and _contains(one, made[0][0])
             out.append(self._refine(one, found) if asked and not same else (one, found))
-            enough = self._leaves_nothing(self._sorted(out)) if len(out) == 1 else enough
+            enough = self._explains_all(self._sorted(out)) if len(out) == 1 else enough
         return self._sorted(out)
 
-    def _worth_more(self, offered: list[Term]) -> list[Term]:
-        """Return the terms that, by a sample of tracks, may gain most, alone or as the largest of several."""
+    def _most_promising(self, offered: list[Term]) -> list[Term]:
+        """Return the terms whose gain, by a sample of tracks, is at least a `RIVALS`-th of the best."""
         few, linear = self.seen.few, self.seen.linear
         if 2 * np.count_nonzero(few.taking_part) > np.count_nonzero(linear.taking_part) or len(offered) < 3:
-            return offered  # half of them are tried with all tracks then
+            return offered  # the sample saves too little
         base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
         gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]
         least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
     def _members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
-        """Yield the parts of images that hold a moving group: displaced rows move on the ground, too."""
+        """Yield displaced parts of images that contain a moving group: they may be its cause."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
         return proposed(seen, intervals, [], (LowFrequency,))
 
-    def _with(self, made: list[_Candidate], more: list[Term]) -> list[_Candidate]:
-        """Return the terms tried so far and more, the best first."""
+    def _added(self, made: list[_Candidate], more: list[Term]) -> list[_Candidate]:
+        """Return the candidates `made` and the fitted terms `more`, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 
     def _sorted(self, made: Iterable[tuple[Term, MixtureFit]]) -> list[_Candidate]:
@@ -368,7 +368,7 @@ class TermSearch:
             better, made = found, one
             for shape in one.shapes(self.seen, self._fit):
                 again = shape.refined(self.seen, found, others)
-                if not _unchanged(again, one):  # a term that stays as it was gains nothing
+                if not _unchanged(again, one):
                     fitted = self._fit(again, base=found)
                     better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
@@ -384,12 +384,12 @@ class TermSearch:
 
 
 def _unchanged(one: Term, before: Term) -> bool:
-    """Return whether a term is where it was, with a prior about as wide."""
+    """Return whether a term has the place of `before`, and nearly the same prior."""
     return one.where == before.where and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
 
 
 def _rivals(tried: list[_Candidate]) -> list[int]:
-    """Return the best terms of other kinds or views that are followed, and may win with some beside."""
+    """Return the indices of the best candidates of other kinds or views, which may win with further terms."""
     found: dict[tuple[str, int], int] = {}
     for n, (one, _, gain) in enumerate(tried):
         if one.FOLLOWED and one.differs(tried[0][0]) and gain > tried[0][2] / RIVALS:
@@ -398,15 +398,15 @@ def _rivals(tried: list[_Candidate]) -> list[int]:
 
 
 def _uncovered(intervals: list[Interval]) -> list[Interval]:
-    """Return the intervals without those that a better one covers."""
+    """Return the intervals, the best first, without those that mostly overlap a better one."""
     out: list[Interval] = []
     for one in intervals:
-        if not any(_same(one, other) for other in out):
+        if not any(_overlap(one, other) for other in out):
             out.append(one)
     return out
 
 
-def _same(one: Interval, other: Interval) -> bool:
+def _overlap(one: Interval, other: Interval) -> bool:
     common = min(one.stop, other.stop) - max(one.start, other.start)
     either = max(one.stop, other.stop) - min(one.start, other.start)
     return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either

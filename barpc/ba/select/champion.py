@@ -1,7 +1,7 @@
 """The comparison of a selected model with the plain one, on all verified matches.
 
-A model that excludes what it does not explain agrees with the rest. So two models are compared by all matches, those
-that one of them excludes or that a robust step cut among them: by the median epipolar offset of each pair of images,
+A model that excludes observations fits the rest, whether it is right or not. Therefore two models are compared on all
+matches, including those that one of them excluded or rejected: by the median epipolar offset of each pair of images,
 and of each eighth of their rows and columns.
 """
 
@@ -19,9 +19,9 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import BANDS, LEVEL, MAD, OUTLIER, SURELY
 from barpc.scene import IntArray
 
-_LEAST = 12  # offsets of a band: fewer have no median
-_MEDIAN = 1.2533  # standard error of a median over that of a mean, normal errors
-_APART = 2  # observations of a track are paired with the next so many
+_LEAST = 12  # offsets of a band: fewer give no reliable median
+_MEDIAN = 1.2533  # standard error of a median over that of a mean, for normal errors
+_APART = 2  # each observation of a track is paired with so many that follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +29,15 @@ class Bands:
     """Epipolar offsets of pairs of a block's tie points, by pair of images and by eighths of their rows and columns.
 
     An offset is the distance [px] of an observation from the epipolar line of another of its track, in its own image.
-    It does not depend on where the point is taken to be: it is the product of both residuals with the left
-    null vector of both derivatives by the point.
+    It does not depend on the ground point: it is the product of both residuals with the left null vector of their
+    derivatives by the point.
     """
 
     ties: Block
     first: IntArray  # (M,) observations of pairs of the same point
     second: IntArray  # (M,)
-    group: IntArray  # (5 M,) band of each offset: of both images by columns and rows, and of the pair
-    count: IntArray  # (B,) offsets of every band
+    group: IntArray  # (5 M,) bands of each offset: columns and rows of both images, and the whole pair
+    count: IntArray  # (B,) number of offsets of each band
 
     @classmethod
     def of(cls, ties: Block) -> Bands:
@@ -62,9 +62,9 @@ class Bands:
         ray = np.cross(by_point[:, 0], by_point[:, 1])
         normal = np.cross(ray[self.first], ray[self.second])
         across = [_in_image(by_point[rows], normal) for rows in (self.first, self.second)]
-        apart = [(one * residual[:, rows].T).sum(axis=1) for one, rows in zip(across, self.both, strict=True)]
+        products = [(one * residual[:, rows].T).sum(axis=1) for one, rows in zip(across, self.both, strict=True)]
         with np.errstate(invalid="ignore", divide="ignore"):
-            one, other = ((apart[0] - apart[1]) / np.linalg.norm(part, axis=1) for part in across)
+            one, other = ((products[0] - products[1]) / np.linalg.norm(part, axis=1) for part in across)
         return np.concatenate([one, one, other, other, other])
 
     @property
@@ -96,13 +96,13 @@ def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
 
 
 def _in_image(by_point: Array, normal: Array) -> Array:
-    """Return the vectors (M, 2) whose product with derivatives by the point (M, 2, 3) are normals (M, 3)."""
+    """Return vectors a (M, 2) with a by_point = normal, of derivatives by the point (M, 2, 3) and normals (M, 3)."""
     square = by_point @ np.swapaxes(by_point, 1, 2)
     return np.asarray(np.linalg.solve(square, by_point @ normal[..., None])[..., 0])
 
 
 def _band(place: Array, pair: IntArray) -> IntArray:
-    """Return the number (M,) of the band of each place in its pair's extent."""
+    """Return the index (M,) of each coordinate's band: equal parts of the extent of its pair."""
     _, index = np.unique(pair, return_inverse=True)
     low, high = np.full((2, index.max(initial=0) + 1), np.inf)
     np.minimum.at(low, index, place)
@@ -112,10 +112,10 @@ def _band(place: Array, pair: IntArray) -> IntArray:
 
 
 def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
-    """Return whether a model surely meets more of all tie points of a block closely than the plain one does.
+    """Return whether a model has significantly smaller residuals at all tie points of a block than the plain one.
 
-    The distance of a match counts up to one standard deviation of the matches that the model keeps, whichever model
-    cut or excluded it: of two solutions that share the matches the one that fits its own no better is none.
+    Losses are robust (Geman-McClure), with the smaller noise of the two solutions as scale, and include matches that
+    either model rejected or excluded. So a model gains nothing by fitting another subset of the matches as well.
     """
     noise = min(tried.outcome.noise, plain.outcome.noise)
     far = [(measure(one.problem, one.final.params, ties).residual ** 2).sum(axis=0) for one in (tried, plain)]
@@ -129,14 +129,14 @@ def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
 class Comparison:
     """A model beside the plain one, by the bands of tie points."""
 
-    worse: bool  # whether it meets some band surely worse, and by more than the plain one meets any other worse
-    changed: float  # by how much it moves images against each other, the largest median of a band [px]
+    worse: bool  # whether it raises the median of a band significantly, and more than it lowers any other
+    changed: float  # largest median change of the offsets of a band [px]
 
 
 def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
     """Compare a model with the plain one on the tie points of a block.
 
-    A median counts up to `OUTLIER` standard deviations of tie points: a match that both cut is of neither.
+    A median counts up to `OUTLIER` standard deviations of tie points: beyond, both models reject the matches.
     """
     bands = Bands.of(ties)
     if not len(bands.first):
@@ -151,7 +151,7 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
 
 
 def largest_offset(found: Solution, ties: Block) -> float:
-    """Return the largest epipolar offset [px] of tie points of a block, but for one in twenty; 0 without a pair."""
+    """Return the 95 % quantile of the absolute epipolar offsets [px] of a block; 0 without a pair."""
     bands = Bands.of(ties)
     offsets = np.abs(bands.offsets(found)) if len(bands.first) else np.zeros(0)
     offsets = offsets[np.isfinite(offsets)]

@@ -1,14 +1,14 @@
-"""Foreign cameras: a view whose RPC does not match the image.
+"""Foreign cameras: a view whose RPC does not match the image, found by leaving each view out.
 
-Such a view is found by leaving views out, then placed by what the others see.
+The RPC may be of another date or tile, have its axes swapped, or refer to another height surface. It deforms the whole
+block: the other views fit to the noise without it, and do not with it. Therefore a block that does not fit is solved
+without each of its views. Where the others then fit, the left-out view is resected by their ground points
+(`barpc.ba.resection`), with one of three results:
 
-A camera of another date, with its axes swapped, cut from another tile or above another height surface bends the whole
-block. Its mark: without it the others agree to the noise, with it they do not. So where a block does not agree it is
-solved without each of its views; where the others agree then, the one left out is placed alone against their points
-(`barpc.ba.resection`). If more than half of its tie points contradict them wherever its camera is, it is the camera of
-another image and stays as delivered. If they agree, though the block had to let go of them, or though the priors
-leave no doubt that it is this view, it keeps the place found alone and bends the others no more. Where more
-than half agree and the rest does not, parts of its image are displaced (`barpc.ba.select.search`).
+1. More than half of its tie points are outliers for any camera: the image is another one. Its RPC stays as delivered.
+2. Its tie points fit, but the block had rejected them, or only its correction exceeds the prior: the resected camera
+   is kept, and its observations do not act on the other cameras.
+3. More than half fit, the rest does not: parts of its image are displaced (`barpc.ba.select.search`).
 """
 
 from __future__ import annotations
@@ -32,30 +32,25 @@ from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, OUTLIER, SMALL,
 
 logger = logging.getLogger(__name__)
 
-FOREIGN_CAMERA = "foreign_camera"
-_TELLING = 3  # views: without one a pair is left, which agrees about much; so each of three is left out
+FOREIGN_CAMERA = "foreign_camera"  # kind of this anomaly in `summary.json`
+_EACH_LEFT_OUT = 3  # views: without one a pair remains, which may fit by chance, so each is left out
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]
-"""What is solved, what measures it, and how -> the block solved."""
+"""(block to solve, block of check observations, options) -> solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForeignCamera:
-    """A view that the others contradict, or several of which one may be.
+    """A view whose RPC contradicts the other views, or several candidates between which tie points do not decide."""
 
-    `gain` is by how many nats its share of contradicted tie points is likelier as its own than as that of the others
-    (Kulldorff 1997; NaN where its prior told), `gap` the evidence over the runner-up, the view without which the
-    others agree next best.
-    """
-
-    views: tuple[int, ...]  # the likeliest first; of more than one the ties do not tell, and nothing is done
-    gain: float
-    gap: float
+    views: tuple[int, ...]  # candidates, the likeliest first; with more than one no camera is changed
+    gain: float  # log-likelihood ratio [nats] of its own outlier rate over the usual one; NaN: found by its prior
+    gap: float  # evidence [nats] over the runner-up, the view whose removal explains the tie points second best
     runner_up: int | None
-    contradicted: float  # share of its tie points that contradict the others', wherever its camera is; NaN: unknown
-    look: RpcDiagnosis
-    placed: Placed | None  # where it was found alone; None: it is left as delivered
-    scale: float = 1.0  # by how much its prior had to be widened, where that told
+    contradicted: float  # outlier rate of its tie points after resection; NaN: unknown
+    look: RpcDiagnosis  # its result: swapped axes, an offset, ...
+    placed: Placed | None  # its resected camera; None: it stays as delivered
+    scale: float = 1.0  # factor by which its prior had to be widened, if it was found by its prior
 
     @property
     def view(self) -> int:
@@ -64,14 +59,14 @@ class ForeignCamera:
 
     @property
     def clear(self) -> bool:
-        """Whether it can only be this view."""
+        """Whether there is only one candidate."""
         return len(self.views) == 1
 
     @property
-    def may_be_its_own(self) -> bool:
-        """Whether it shows the scene and was not corrected: terms of its rows and columns may explain it.
+    def may_be_distorted(self) -> bool:
+        """Whether terms of its rows and columns may explain it: the image shows the scene, but was not resected.
 
-        Not by few tie points, which splines would follow anywhere.
+        False where few tie points identified the view: splines would fit these anywhere.
         """
         return (
             self.clear
@@ -81,42 +76,43 @@ class ForeignCamera:
         )
 
     def is_view(self, view: int) -> bool:
-        """Return whether a view is clearly the one that the others contradict."""
+        """Return whether a view is the only candidate."""
         return self.views == (view,)
 
 
 @dataclass(frozen=True, eq=False)
 class LeaveOneOut:
-    """A block whose views agree without one."""
+    """A view without which the others fit."""
 
     view: int
-    block: Block
-    found: Solution
-    placed: Placed
-    contradicted: float
-    coherent: bool  # whether what contradicts is off as its neighbours are
+    block: Block  # without it
+    found: Solution  # of that block
+    placed: Placed  # the resected view
+    contradicted: float  # outlier rate of its tie points after resection
+    coherent: bool  # whether its outliers have residuals like those of their neighbours
 
     @property
     def usual(self) -> float:
-        """The share of their tie points that the others lose."""
+        """Median share of rejected tie points of the other views."""
         return float(np.median(np.delete(lost_shares(self.found, self.block), self.view)))
 
     @property
     def strange(self) -> bool:
-        """Whether fewer than half of the view's tie points agree, of those that would in another view.
+        """Whether `disagrees`, with spatially coherent outliers.
 
-        If the others lie anywhere, it is the matches that are wrong, and they are cut.
+        Incoherent outliers are wrong matches, which rejection removes.
         """
         return self.coherent and self.disagrees
 
     @property
     def disagrees(self) -> bool:
-        """Whether that holds wherever the others lie."""
+        """Whether its inlier rate is less than half of the usual one."""
         return 1.0 - self.contradicted < 0.5 * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
-        """Return the log-likelihood gain [nats] of the view's own lost share over that of the others; the
-        choice among views is paid for.
+        """Return the log-likelihood ratio [nats] of an own outlier rate over the usual one (Kulldorff 1997).
+
+        The own rate is the larger of `lost` and `contradicted`; the log of the number of views is subtracted.
         """
         rates = np.clip([max(lost, self.contradicted), self.usual], 1e-3, 1.0 - 1e-3)
         own, usual = np.array([rates, 1.0 - rates]).T
@@ -127,78 +123,79 @@ class LeaveOneOut:
 def find_foreign_camera(
     first: Solution | None, block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> tuple[ForeignCamera | None, Solution | None]:
-    """Find the view whose RPC does not match its image, where there is one, and the block solved without it.
+    """Find the view whose RPC does not match its image, if there is one, and solve the block without it.
 
-    `first` is the block solved with all views; None: it has no solution. Nothing is tried where it agrees and no prior
-    tells of one view. Measured on the observations of `outer`.
+    `first` is the solution with all views; None: there is none. If it fits to the noise, only views that lost most tie
+    points are left out in turn, or the one view whose correction exceeds its prior. Not tried with fewer than three
+    views, too many unknowns, or options that restrict the model. `outer` has the check observations.
     """
-    num, odd = len(block.views), None
+    num, beyond_prior = len(block.views), None
     unknowns = num if first is None else first.problem.free.size  # at least
     asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
     if num < 3 or unknowns > LARGEST or asked_for_less:
         return None, None
     lost = np.ones(num) if first is None else lost_shares(first, block)
-    gone = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))
-    asked = np.argsort(-lost, kind="stable")
+    gone = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))  # views that lost most of their tie points
+    candidates = np.argsort(-lost, kind="stable")
     if first is not None:
-        asked = asked[:TRIED]
+        candidates = candidates[:TRIED]
         if agrees(first):
-            odd = _odd(first, block) if num > _TELLING else None
-            asked = asked[gone[asked]] if odd is None else np.array([odd])
+            beyond_prior = _beyond_prior(first, block) if num > _EACH_LEFT_OUT else None
+            candidates = candidates[gone[candidates]] if beyond_prior is None else np.array([beyond_prior])
         if unknowns > SMALL:
-            asked = asked[gone[asked]]
-    views = [v for v in asked.tolist() if block.names[v] not in options.fixed]
+            candidates = candidates[gone[candidates]]
+    views = [v for v in candidates.tolist() if block.names[v] not in options.fixed]
     left: list[LeaveOneOut] = []
-    too_few: list[tuple[int, Solution]] = []  # views of which the others' points are too few to find them by
+    too_few: list[tuple[int, Solution]] = []  # views with too few points for a resection
     for v, others, found in _leave_one_view_out(views, block, outer, options, solve):
         placed = resect(found, others, block, v)
         if placed is None:
             too_few.append((v, found))
             continue
         left.append(LeaveOneOut(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
-        if num > _TELLING:  # those that agree without it contradict it, as far as it is wrong, in any block with it
+        if num > _EACH_LEFT_OUT:  # the others fit without it: no second view needs to be tried
             break
-    if odd is not None and first is not None:
-        return _by_prior(left, float(first.outcome.prior.scale[odd]), block)
+    if beyond_prior is not None and first is not None:
+        return _by_prior(left, float(first.outcome.prior.scale[beyond_prior]), block)
     chosen = [
         one for one in left if one.strange or (one.placed.meets and gone[one.view]) or (first is None and one.disagrees)
-    ]  # with matches that no cut copes with the block has no solution, and without them it has
+    ]  # so many wrong matches in one view may be why there is no first solution
     chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
     if chosen:
         return _likeliest(chosen, left, lost, block)
-    # a camera that drifts more than it is let makes ties scatter by some of their sigmas: no ground to leave it out
-    asks = first is None or (len(too_few) == 1 and first.outcome.noise >= OUTLIER)
-    return _of_few(too_few) if asks and too_few else (None, None)
+    # unmodelled drift raises residuals to a few sigma, which is no reason to leave a view out
+    may_be_few = first is None or (len(too_few) == 1 and first.outcome.noise >= OUTLIER)
+    return _without_resection(too_few) if may_be_few and too_few else (None, None)
 
 
-def _of_few(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
-    """Return the views without which a block agrees and with which it does not, and the solution without the only."""
-    told = contradicted_view(*(v for v, _ in without))
-    return told, without[0][1] if told.clear else None
+def _without_resection(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
+    """Return the candidates with too few points for a resection; of one only, also the solution without it."""
+    foreign = contradicted_view(*(v for v, _ in without))
+    return foreign, without[0][1] if foreign.clear else None
 
 
 def contradicted_view(*views: int) -> ForeignCamera:
-    """Return the diagnosis of a view, or of one of several, of which nothing but its contradiction is known."""
+    """Return a foreign camera, or candidates for one, without gain, resection and diagnosis."""
     return ForeignCamera(views, np.nan, np.inf, None, np.nan, RpcDiagnosis(as_stated=True), None)
 
 
 def agrees(found: Solution) -> bool:
-    """Return whether the views of a block agree to the noise of their ties."""
+    """Return whether a solution fits to the noise, without systematic residuals."""
     return found.outcome.noise < MUCH_NOISE and not found.has_trend and not found.is_skew
 
 
-def _odd(found: Solution, block: Block) -> int | None:
-    """Return the one view whose correction exceeds its prior, without control points in it; else None."""
-    odd = np.flatnonzero(found.outcome.prior.odd)
-    if len(odd) != 1 or (block.view[block.point >= block.num_tracks] == odd[0]).any():
+def _beyond_prior(found: Solution, block: Block) -> int | None:
+    """Return the only view whose correction exceeds its prior, if it has no control points; else None."""
+    views = np.flatnonzero(found.outcome.prior.odd)
+    if len(views) != 1 or (block.view[block.point >= block.num_tracks] == views[0]).any():
         return None
-    return int(odd[0])
+    return int(views[0])
 
 
 def _leave_one_view_out(
     views: Sequence[int], block: Block, outer: Block, options: AdjustOptions, solve: Solver
 ) -> Iterator[tuple[int, Block, Solution]]:
-    """Yield the block without one view after the other, where the rest is tied together and agrees."""
+    """Yield each view, the block without it and its solution, where the rest is connected and fits."""
     for v in views:
         others = block.without(block.view == v)
         groups = others.groups(others.use & (others.point < others.num_tracks))
@@ -209,25 +206,25 @@ def _leave_one_view_out(
         except (AdjustError, np.linalg.LinAlgError) as error:
             logger.info("without %s: %s", block.names[v], error)
             continue
-        # the few left of many agree by choice
+        # if most tie points were rejected, the rest fits by selection
         if np.delete(lost_shares(found, others), v).max() < 0.5 and agrees(found):
             yield v, others, found
 
 
 def _by_prior(left: list[LeaveOneOut], scale: float, block: Block) -> tuple[ForeignCamera | None, Solution | None]:
-    """Return the view that its prior tells of, if it meets the others' points where it is found alone."""
+    """Return the view whose correction exceeds its prior by `scale`, if its resection fits."""
     if not left or not left[0].placed.meets:
         return None, None
     (one,) = left
-    said = diagnose_rpc(one.found, block, one.placed, one.view)
-    told = ForeignCamera((one.view,), np.nan, np.inf, None, one.contradicted, said, one.placed, scale)
-    return told, one.found
+    diagnosis = diagnose_rpc(one.found, block, one.placed, one.view)
+    foreign = ForeignCamera((one.view,), np.nan, np.inf, None, one.contradicted, diagnosis, one.placed, scale)
+    return foreign, one.found
 
 
 def _likeliest(
     chosen: list[LeaveOneOut], left: list[LeaveOneOut], lost: Array, block: Block
 ) -> tuple[ForeignCamera | None, Solution | None]:
-    """Return the likeliest of the views `chosen`; `left` are those without which the rest agrees."""
+    """Return the likeliest of the views `chosen`; `left` are all views without which the rest fits."""
     evidence = {one.view: _tie_evidence(one, block) for one in left} if len(left) > 1 else {chosen[0].view: 0.0}
     chosen = sorted(chosen, key=lambda one: -evidence[one.view])
     best = chosen[0]
@@ -235,18 +232,18 @@ def _likeliest(
     rest = sorted(((e, v) for v, e in evidence.items() if v not in views), reverse=True)
     gain = best.gain(lost[best.view])
     gap, runner_up = (evidence[best.view] - rest[0][0], rest[0][1]) if rest else (gain, None)
-    said, placed = diagnose_rpc(best.found, block, best.placed, best.view), best.placed if best.placed.meets else None
-    told = ForeignCamera(views, gain, gap, runner_up, best.contradicted, said, placed)
+    placed = best.placed if best.placed.meets else None
+    diagnosis = diagnose_rpc(best.found, block, best.placed, best.view)
+    foreign = ForeignCamera(views, gain, gap, runner_up, best.contradicted, diagnosis, placed)
     logger.info("%s against the others: %.0f nats", ", ".join(block.names[v] for v in views), gain)
-    return told, best.found if told.clear else None
+    return foreign, best.found if foreign.clear else None
 
 
 def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
-    """Return the logarithm of the evidence of all ties of a block, of which those without one view are
-    explained.
+    """Return the log evidence of all tie points of a block, solved without one view.
 
-    Others lie anywhere in their images, as wrong ones do here: how far off a strange camera sees is not known. A
-    part that is too large to be judged explains nothing.
+    Those of the other views follow the mixture. Those of the left-out view are uniformly distributed over the image,
+    as wrong matches are: the error of a wrong RPC is not known. All are uniform if the block is too large to linearise.
     """
     ties = int((block.use & (block.point < block.num_tracks)).sum())
     size = np.array([view.size for view in block.views], dtype=np.float64)

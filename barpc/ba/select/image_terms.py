@@ -1,4 +1,4 @@
-"""Models with additional parameters in the images: terms that a search found, splines over the rows, detector steps."""
+"""Models with additional parameters in the images: selected terms, B-splines over the rows (jitter), detector steps."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
 from barpc.base.statistics import CRITICAL, FEW, LARGEST, SURE
 
-_SPACING = 2000.0  # rows between knots at first: satellites swing once in some seconds
-_DENSER = 1.5  # times as many splines a try: 7, 10, 15, 22, 33
-_WHOLE = 0.1  # lines: a number is whole to this; lost lines were 2.95 to 5.07 of 3 and 5, of any slip two in ten are
-_TWICE = 2  # times that detectors are searched for, and that denser splines may be no better
+_SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
+_DENSER = 1.5  # factor on the number of splines of each further try: 7, 10, 15, 22, 33
+_WHOLE = 0.1  # lines: tolerance of a whole number; lost lines gave 2.95 of 3, 5.07 of 5; two in ten slips meet it
+_TWICE = 2  # searches for detector steps; successive numbers of splines that may be no better
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
-    """Additional parameters, with estimates to start from."""
+    """Additional parameters to solve with."""
 
-    waves: AdditionalParameters
-    start: Array | None = None  # (N, waves.size) estimates to start from
-    drift: int | None = None  # degree of the drift beside them; None: as before
+    waves: AdditionalParameters  # splines, steps, displaced parts, sinusoids
+    start: Array | None = None  # (N, waves.size) start values
+    drift: int | None = None  # degree of the drift; None: unchanged
 
 
 def with_terms(found: Solution, selected: Selection, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with the terms in images that a search selected.
+    """Solve the block with the terms in images that the search selected.
 
-    Refused where residuals of check tie points grow, or are no smaller than with splines and detectors. A further
-    degree of the drift that was solved before is tested again beside the terms.
+    The result is kept only if check residuals do not grow, and are smaller than with splines and detector steps. If
+    the drift was raised by a degree before, the lower degree is tried again beside the terms.
     """
     terms = [one for one in selected.findings if TERMS[one.kind].FOLLOWED]
     if not terms or options.jitter == OFF or options.is_plain:
@@ -57,44 +57,46 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     without = replace(found, findings=tuple(one for one in found.findings if one.moved is not None))
     if not is_admitted(tried.after, found.after, outer, sum(one.gain for one in terms)):
         return without
-    # rows of one image that wander have competed with these already; what all images have in common has not: detectors,
-    # or a platform that shakes
-    shaken = len({one.view for one in terms}) == len(parts.inner.views)
-    # of sinusoids the last image may be what the others are seen against
-    waves = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
-    if not (shaken or waves) and not any(one.where is not None and one.where[0] == 0 for one in terms):
+    # the search compared terms with row-wise errors of single images, but not with errors that all images have in
+    # common: detector steps and platform jitter
+    in_all = len({one.view for one in terms}) == len(parts.inner.views)
+    # one image may be the datum of the others: sinusoids then appear in all but one
+    in_most = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
+    if not (in_all or in_most) and not any(one.where is not None and one.where[0] == 0 for one in terms):
         return tried
     smooth = with_splines(found, parts, options)
     left = [
         sum(one.gain for one in standing_out(of.outcome, parts.inner, options.noise_floor)) for of in (smooth, tried)
     ]
-    calm = smooth is not found and left[0] <= left[1]
-    # of parts of few images the fewer unknowns stay, where the others are not surely better
-    first, second = (tried, smooth) if shaken else (smooth, tried)
-    if not calm or is_better(first.after, second.after, outer) == shaken:
+    fits = smooth is not found and left[0] <= left[1]
+    # the model with fewer unknowns is kept unless the other is significantly better
+    first, second = (tried, smooth) if in_all else (smooth, tried)
+    if not fits or is_better(first.after, second.after, outer) == in_all:
         return tried
-    return without if shaken or waves else found
+    return without if in_all or in_most else found
 
 
 def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with jumps of rows that are whole numbers of lines held to these.
+    """Solve the block with steps of rows constrained to whole numbers of lost lines, if they are nearly whole.
 
-    No platform turns by pixels between two lines: where all rows behind a place jump, lines or time are missing, and
-    the jump is along the axis of the rows. Where two images see but its part across their epipolar lines, the part
-    along them follows; it is held where the number is whole to `_WHOLE`.
+    No platform turns by pixels between two lines. Where all rows behind a place are displaced, lines are missing, and
+    the step is along the rows' axis. In pairs only its part across epipolar lines is observed; the part along them
+    follows. The constraint is set where the number of lines is whole to `_WHOLE`.
     """
-    waves, problem = found.problem.cameras.unknowns.waves, found.problem
-    if waves is None or problem.joint_prior is not None:
+    findings = list(found.findings)
+    steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, parts.inner)]
+    if not steps or found.problem.joint_prior is not None:
         return found
-    first, findings = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start, list(found.findings)
+    problem, waves = found.problem, found.problem.cameras.unknowns.waves
+    assert waves is not None
+    first = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start
     covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
-    for at, one in enumerate(findings):
-        if one.kind != Step.NAME or not _ends_with_its_image(one, parts.inner.views[one.view].size[1]):
-            continue
+    for at in steps:
+        one = findings[at]
         n = int((waves.strips[one.view] == one.where).all(axis=1).argmax())
         own = first + np.array([n, waves.strips.shape[1] + n])
         known = np.linalg.inv(covariance.view(one.view)[np.ix_(own, own)])
-        pull = known @ found.final.params[one.view, own]  # of the ties: the prior's mean is zero
+        pull = known @ found.final.params[one.view, own]  # of tie points alone: the prior has mean zero
         known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
         lines = float(pull[1] / known[1, 1])
         misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
@@ -109,16 +111,18 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     return found if is_better(found.after, held.after, parts.outer) else held
 
 
-def _ends_with_its_image(one: Finding, rows: int) -> bool:
-    """Return whether a step is of all rows from a place on to an end of its image."""
-    return one.where is not None and one.where[0] == 1 and (one.where[1] <= 0.0 or one.where[2] >= rows)
+def _ends_with_its_image(one: Finding, block: Block) -> bool:
+    """Return whether a finding is a step of all rows from a place on to an end of its image."""
+    if one.kind != Step.NAME or one.where is None or one.where[0] != 1:
+        return False
+    return one.where[1] <= 0.0 or one.where[2] >= block.views[one.view].size[1]
 
 
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with splines over the rows and detector steps, where options or residuals ask for them.
+    """Solve the block with splines over the rows and detector steps, if options or correlated residuals request them.
 
-    Knots are set twice as dense until no correlated residuals are left, the observations are too few, or check tracks
-    are met no better.
+    The number of splines grows until no correlated residuals are left, observations are too few, or check residuals
+    did not fall for `_TWICE` numbers in succession.
     """
     block = parts.inner
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
@@ -139,16 +143,16 @@ def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solut
 
 
 def _explains(tried: Solution, found: Solution, block: Block) -> bool:
-    """Return whether additional parameters explain most of the correlation of neighbours, or much is gained.
+    """Return whether splines remove half of the noise correlation, or check residuals fall by `MUCH_BETTER`.
 
-    The errors of check tracks are correlated with those of their neighbours: they do not tell cameras from noise.
+    Check tie points share matching errors with their neighbours, so a smaller fall may be a fit to noise.
     """
     left, before = (correlated_noise_gain(one.outcome, block) for one in (tried, found))
     return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
 
 
 def _at_selection(found: Solution, selected: Selection, block: Block) -> Solution:
-    """Return the block at a search's end: its cameras, and the observations that are right with them."""
+    """Return the solution with the cameras and inliers of the search (probability above 0.5)."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
     inlier = np.where(is_tie, block.use & (selected.right > 0.5), outcome.inlier)
     moved = replace(outcome.state, params=outcome.state.params + selected.step)
@@ -156,7 +160,7 @@ def _at_selection(found: Solution, selected: Selection, block: Block) -> Solutio
 
 
 def _layout_of(terms: list[Finding], views: int) -> _Layout:
-    """Return the additional parameters of terms: parts of images, and periods, a view; started from their estimates."""
+    """Return the additional parameters of terms, padded arrays of parts and periods of each view, with estimates."""
     own = [
         [[one for one in terms if one.view == v and (one.period is None) == of_parts] for v in range(views)]
         for of_parts in (True, False)
@@ -176,9 +180,9 @@ def _layout_of(terms: list[Finding], views: int) -> _Layout:
 
 
 def _with_edges(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Return the block, of which one pass was solved with splines, with detector steps where residuals show them.
+    """Solve a block, of which one round was solved with splines, with the detector steps of its residuals.
 
-    The steps found show others: they are searched for again.
+    Correcting large steps reveals smaller ones, so the search is repeated.
     """
     waves, block = found.problem.cameras.unknowns.waves, parts.inner
     assert waves is not None
@@ -198,11 +202,11 @@ def _given_edges(block: Block, options: AdjustOptions) -> Array:
 
 
 def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
-    """Return the numbers of splines of an image to try, the fewest first; empty: none.
+    """Return the numbers of splines for each image to try, ascending (0: detector steps alone; empty: nothing).
 
-    Those of `options.jitter` (rows [px] between knots), or of `_SPACING` rows, halved where the residuals of the
-    cameras alone vary with rows (`has_waves`); 0 are steps alone. An image of `block` has `FEW` observations in use a
-    spline, by the median of the images, and all have `LARGEST` unknowns together.
+    With `options.spacing` [rows between knots] that one number. Else, only if residuals are correlated along rows
+    (`has_waves`), that of a spacing of `_SPACING` rows and its multiples by `_DENSER`. At most one spline for `FEW`
+    observations (median of the images), and `LARGEST` unknowns in all images.
     """
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
@@ -227,13 +231,13 @@ def _solve_with(
     once: bool = False,
     held: JointPrior | None = None,
 ) -> Solution:
-    """Return the block solved with additional parameters from where it ended; every observation may come back.
+    """Solve the block with additional parameters, from the last state; rejected observations are tested again.
 
-    `held` is a prior on some of its unknowns.
+    `held` is a joint prior on some of the unknowns. With `once` one round only.
     """
     block, waves, start = parts.inner, layout.waves, layout.start
     outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
-    if unknowns.waves is not None:  # terms that were found stay
+    if unknowns.waves is not None:  # selected terms stay
         waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
     bent = make_problem(block, options, unknowns.center, None, drift, waves)
@@ -245,7 +249,7 @@ def _solve_with(
     elif unknowns.waves is not None:
         params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
     weight, known = block.use / block.sigma, outcome.inlier
-    if start is not None:  # the cameras have moved: every point is seen anew, where any are right by these
+    if start is not None:  # the cameras have moved: all points are triangulated again
         count = np.bincount(block.point[known], minlength=bent.structure.num_points)
         weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
     there, _ = retriangulate_rejected(bent, replace(ended, params=params), outcome.residual, known, weight)

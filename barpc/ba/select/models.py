@@ -1,8 +1,8 @@
-"""The model of a block: the simplest, unless the data choose another.
+"""Model selection for a block: the plain model, unless the data support another.
 
 Hypotheses in their order: an RPC of another image; moving ground; terms in the images; splines and detector steps; an
-affine in every image. Evidence is that of all observations; check tracks, drawn before, have a veto, and decide alone
-where no evidence is at hand (`is_admitted`).
+affine in every image. Evidence is computed from all observations. Check tie points, drawn before, have a veto, and
+decide alone where there is no evidence (`is_admitted`).
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from barpc.base.errors import AdjustError
 from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
 
-MIN_MOTION = 0.2  # px between images of one pass
-MOST_BENT = 0.06  # px by which a view that contradicts the others may move these
-_FEWEST_VIEWS = 3  # of which any might be the wrong one
+MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
+MOST_BENT = 0.06  # px: change of the other images by a view with mostly rejected tie points, at most
+_FEWEST_VIEWS = 3  # with three, any might be the wrong one
 
 
 @dataclass(frozen=True, eq=False)
 class SelectedModel:
-    """A block solved by the model that the data choose."""
+    """A block solved with the selected model."""
 
     found: Solution
     parts: Parts
-    in_space_rms: float | None = None  # [px] of check tracks with the model in space, where an affine was chosen
-    foreign: ForeignCamera | None = None  # the view that was left out (one), or that may be wrong (several)
-    changed: float = 0.0  # [px] by how much it moves images beside the plain model, in some eighth of them
+    in_space_rms: float | None = None  # check RMS [px] of the geometric model, where an affine was selected
+    foreign: ForeignCamera | None = None  # the view that was left out, or several candidates
+    changed: float = 0.0  # largest median change of epipolar offsets from the plain model [px] (`Comparison`)
 
 
 def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the block by the model that the data choose.
+    """Solve the block with the model that the data select.
 
     Raises
     ------
@@ -52,8 +52,8 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
         There is no solution.
     """
     first, foreign, without = _first(parts, options, solve)
-    if foreign is not None and foreign.may_be_its_own and first is not None:
-        # terms in its rows and columns may explain it: then it is no other image's
+    if foreign is not None and foreign.may_be_distorted and first is not None:
+        # terms in its rows and columns may explain it: then the RPC is not of another image
         chosen = _select_beside(first, parts, options, solve)
         if chosen.parts.keeps(chosen.found, foreign.view):
             return chosen
@@ -66,10 +66,9 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
 
 
 def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the block without a view most of whose tie points were cut, where the others' cameras depend on it.
+    """Return the block without a view most of whose tie points were rejected, if it changes the other cameras.
 
-    Before three images are said to be adjusted, they are adjusted alone: what they agree to without the fourth is
-    handed over, if it is another result by more than `MOST_BENT`.
+    The others are adjusted alone; that result is returned if it differs by more than `MOST_BENT`.
     """
     found, parts = selected.found, selected.parts
     lost = lost_shares(found, parts.inner)
@@ -90,9 +89,9 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
 def _first(
     parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
-    """Return the block by the first model, and without a foreign camera where there is one; one of the two at least.
+    """Return the first solution, a foreign camera, and the solution without it; at least one of the two solutions.
 
-    A block that goes on from an earlier one is not searched for foreign cameras.
+    A block that continues an earlier run is not searched for foreign cameras.
     """
     block, first, failed = parts.inner, None, None
     try:
@@ -114,9 +113,9 @@ def _first(
 
 
 def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the model that meets all tie points best, once foreign cameras are decided: the plain one, or a larger.
+    """Return the searched model, or the plain one if that fits all tie points better; foreign cameras are decided.
 
-    Splines and detector steps that were given as options stay.
+    Splines and detector steps that were requested as options stay.
     """
     if options.terms != AUTO:
         return SelectedModel(first, parts)
@@ -131,14 +130,14 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 
 
 def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the model that a search among the other hypotheses ends with."""
+    """Return the model of a search among the other hypotheses."""
     geometric = first.problem.cameras.unknowns.geometric and not first.goes_on
     given = not geometric or options.model != AUTO or options.drift is not None
     searched = None if given else _beside_affine(first, parts, options, solve)
     if searched is not None:
         found, in_images, less = searched
         better = _is_much_better(in_images, found)
-        if _is_calm(in_images if better else found, less, options.noise_floor):
+        if _explains_all(in_images if better else found, less, options.noise_floor):
             return SelectedModel(in_images, less, found.after.whole_rms) if better else SelectedModel(found, less)
     found = first
     if geometric:
@@ -156,14 +155,14 @@ def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
 def _beside_affine(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Solution, Parts] | None:
-    """Solve the block with the terms of a search beside an affine in every image: in space, and with the affines.
+    """Search terms beside an affine in every image, and solve with them: the geometric model, and the affines.
 
-    Residuals that an affine explains look like many steps beside a model in space. None where the affine is not much
-    better than that.
+    Residuals that an affine explains would look like many steps beside the geometric model. None where the affine is
+    not much better than that.
     """
     in_images = replace(options, model="affine")
     affine = _with_image_affine(found, parts, options, solve)
-    if affine is None or _is_calm(affine, parts, options.noise_floor):
+    if affine is None or _explains_all(affine, parts, options.noise_floor):
         return None if affine is None else (found, affine, parts)
     affine, less, selected = _without_moving_ground(affine, parts, in_images, solve)
     in_space = found if less is parts else solve(less.inner, less.outer, options)
@@ -173,7 +172,7 @@ def _beside_affine(
 
 
 def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
-    """Solve the block with an affine in every image, where residuals are systematic and it is much better."""
+    """Solve the block with an affine in every image; None if no residuals are systematic or it is not much better."""
     if not (found.is_skew or found.has_trend):
         return None
     try:
@@ -184,23 +183,23 @@ def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, so
 
 
 def _is_much_better(affine: Solution, found: Solution) -> bool:
-    """Return whether an affine in every image is much better than a model in space; clearly, where that is skew."""
+    """Return whether an affine in every image is much better than the geometric model; `CLEARLY`, if that is skew."""
     better = affine.after.error < (CLEARLY if found.is_skew else MUCH_BETTER) * found.after.error
-    # it leaves the tilts of the scene open: not for less than an adjustment is asked for
+    # affines do not determine the tilts of the scene: the gain must exceed the noise floor
     return better and affine.after.whole_rms < found.after.whole_rms - NOISE_FLOOR
 
 
-def _is_calm(found: Solution, parts: Parts, floor: float) -> bool:
-    """Return whether no residuals are left that terms of an image, or moving ground, might explain."""
+def _explains_all(found: Solution, parts: Parts, floor: float) -> bool:
+    """Return whether no residuals are significant that terms of an image, or moving ground, might explain."""
     return not (found.has_trend or found.has_waves or standing_out(found.outcome, parts.inner, floor))
 
 
 def _at_lower_degree(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection] | None:
-    """Return the block without moving ground at one degree of the drift less; None where it is not clearly better.
+    """Search moving ground at a lower degree of the drift; None if check residuals are not significantly smaller.
 
-    Ground that moves may be what the further degree follows: then no group is found beside it.
+    The last degree may have fitted the motion of the ground, which is then not found beside it.
     """
     less = replace(options, drift=found.problem.cameras.unknowns.drift - 1)
     plain = _without_moving_ground(solve(parts.inner, parts.outer, less), parts, less, solve)
@@ -209,21 +208,21 @@ def _at_lower_degree(
 
 
 def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts) -> bool:
-    """Return whether a group moves as ground does, by the block solved without it and with it.
+    """Return whether the motion of a group is plausible for ground, from solutions without and with the group.
 
-    Errors of matches, which neighbours share, are as large as a small motion: seconds apart no ground moves by less
-    than `MIN_MOTION`, and between dates the block without the group must meet more of ALL tie points closely. Images
-    without a date count as of one pass.
+    Correlated matching errors are as large as small motions. Within a pass the motion must be at least `MIN_MOTION`.
+    Between dates a smaller one is accepted if the solution without the group fits all tie points better. Images without
+    a date count as of one pass.
     """
     first, second = (parts.block.views[v].date for v in one.between)
     return parts.pixels(one) >= MIN_MOTION or (first != second and is_closer(without, found, parts.ties()))
 
 
 def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
-    """Return the block by that of two groups which is likelier the ground: by its share of the ties and its cameras.
+    """Return the solution with the likelier ground of two groups: by the share of tie points and the camera priors.
 
-    A deck of clouds may cover more than half of the ground, in one block of twenty (`LEVEL`); then the cameras that
-    follow it lie farther from their priors, as these were given. Control has told before.
+    Clouds may cover more than half of the ground, in one block of twenty (`LEVEL`). Cameras that fit the clouds then
+    lie farther from their stated priors. With control the question is decided before.
     """
     exchanged = parts.exchanged()
     if found.heights.has_control or not exchanged.is_tied():
@@ -239,11 +238,11 @@ def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Sol
 def _without_moving_ground(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection]:
-    """Solve the block without groups of tie points that move, and search the terms beside.
+    """Exclude moving groups of tie points, one after the other, and search terms beside them.
 
-    `Solution.findings` has both.
+    `Solution.findings` has groups and terms.
     """
-    # least squares has no observation that may be wrong; a model too small bends all images
+    # without a robust loss no observation is wrong; a model with too few unknowns has residuals in all images
     noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
     too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
     if options.loss == "linear" or too_small:
@@ -255,7 +254,7 @@ def _without_moving_ground(
         if last is None or last.moved is None:
             findings = list(selected.findings)
             break
-        # what moves may be an error that the model does not follow, or the little that is left of one that it will
+        # an apparent motion may be an error that the plain model has no term for, or the remainder of a larger term
         if options.is_plain or any(row.gain > last.gain for row in findings):
             break
         less = parts.less(found, last.moved)

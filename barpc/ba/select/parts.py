@@ -1,4 +1,4 @@
-"""The observations of a block, each in one part: solved, kept out to check the result, or of a group that moves."""
+"""The observations of a block in three parts: solved, held out for checks, or of a moving group."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
-_ACROSS = 0.8  # of the statistic's 1: a tenth of either lies on the other side
+_ACROSS = 0.8  # Kolmogorov-Smirnov statistic of two groups with a tenth of each on the other side
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Observations (K,) of a block: solved, held out, or of a group that moves."""
+    """Observations (K,) of a block: solved, held out, or of a moving group."""
 
     block: Block
-    kept_out: BoolArray  # (K,)
-    group: IntArray  # (K,) number of the group that moved from 1 on, 0: of none
+    kept_out: BoolArray  # (K,) check observations
+    group: IntArray  # (K,) number of the moving group, from 1; 0: none
 
     @cached_property
     def inner(self) -> Block:
-        """Observations that are solved."""
+        """The block of observations that are solved."""
         return self.block.without(self.kept_out | (self.group > 0))
 
     @cached_property
     def outer(self) -> Block:
-        """Observations that measure the result."""
+        """The block of check observations."""
         return self.block.without(~self.kept_out | (self.group > 0))
 
     @cached_property
     def apart(self) -> Block:
-        """Observations that move."""
+        """The block of observations of moving groups."""
         return self.block.without(self.group == 0)
 
     def ties(self, *, moving: bool = True) -> Block:
-        """Return all tie points in use, kept out or solved; those of groups that move where they are asked for."""
+        """Return all tie points in use, solved or held out; with `moving` those of moving groups, too."""
         block = self.block
         return block.without((block.point >= block.num_tracks) | ~block.use | (not moving) & (self.group > 0))
 
@@ -53,23 +53,23 @@ class Parts:
         return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
 
     def less(self, found: Solution, one: MovingGroup) -> Parts:
-        """Return the parts with one more group taken out."""
+        """Return the parts with one more moving group."""
         number, group, block = self.group.max(initial=0) + 1, self.group.copy(), self.block
         still = group == 0
         group[still & ~self.kept_out] = number * one.member
-        # held-out tracks, and control points on it, whose place is none of both dates
+        # held-out tracks, and control points on moving ground, which have no one position
         of_gcps = (block.point >= block.num_tracks) & (block.point < block.num_known)
         for rows in (still & self.kept_out, still & of_gcps):
             group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
         return replace(self, group=group)
 
     def pixels(self, one: MovingGroup) -> float:
-        """Return by how much a group moves in pixels of the coarser of the two images between which it moves most."""
+        """Return the largest motion of a group between two images, in pixels of the coarser one."""
         view = self.inner.view
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
 
     def lies_across(self) -> bool:
-        """Return whether a row of every image parts the last group from the ground, but for a tenth of either."""
+        """Return whether in every image one row separates the last group from the rest, except for a tenth of each."""
         number = self.group.max(initial=0)
         ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
         for v in range(len(self.block.views)):
@@ -81,28 +81,28 @@ class Parts:
         return True
 
     def exchanged(self) -> Parts:
-        """Return the parts with the last group taken for the ground, and the ground for a group that moves."""
+        """Return the parts with the last moving group and the ground exchanged."""
         number = self.group.max(initial=0)
         moves = np.where(self.group == 0, number, np.where(self.group == number, 0, self.group))
         return replace(self, group=moves)
 
     def is_tied(self) -> bool:
-        """Return whether every view keeps enough observations and the views stay connected as they were."""
+        """Return whether the solved observations suffice in every view and connect the views as all do."""
         block, inner = self.block, self.inner
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and len(inner.groups(inner.use)) == len(block.groups(block.use))
 
     def keeps(self, found: Solution, view: int) -> bool:
-        """Return whether a solution keeps half as many of a view's tie points as of another's, and no group moves.
+        """Return whether the inlier rate of a view is at least half of the usual one, and no group moves.
 
-        Where ties move it may be those of the view that do.
+        Observations of the view might be such a group.
         """
         kept = 1.0 - lost_shares(found, self.inner)
         return not self.group.any() and bool(kept[view] >= 0.5 * np.median(np.delete(kept, view)))
 
     def mostly_moving(self, inlier: BoolArray) -> list[Interval]:
-        """Return the rows of images, of the kept (K,) of `inner`, of which more ties move than stand."""
+        """Return the intervals of rows with more moving tie points than inliers (K,) of `inner`."""
         block, gone = self.block, self.group > 0
         if not gone.any():
             return []
@@ -115,7 +115,7 @@ class Parts:
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: MovingGroup, points: Array) -> Motion:
-        """Return the motion of a group, of the points (P, 3) [m] of all tracks."""
+        """Return the record of the motion of a group, from the points (P, 3) [m] of all tracks."""
         placed = self.block.point[self.block.point < self.block.num_tracks]
         placed = placed[np.isfinite(points[placed, 0])]
         every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])
@@ -124,7 +124,7 @@ class Parts:
         center = float(all_of[0, 0])
         place, whole = (np.column_stack([wrap_longitude(g[:, 0], center), g[:, 1]]) for g in (ground, all_of))
         low, high = np.quantile(place, (LEVEL, 1.0 - LEVEL), axis=0)
-        middle = np.quantile(whole, (LEVEL, 1.0 - LEVEL), axis=0).mean(axis=0)  # a wrong match may lie anywhere
+        middle = np.quantile(whole, (LEVEL, 1.0 - LEVEL), axis=0).mean(axis=0)  # without wrong matches far off
         sides = [
             names[0] if high[axis] < middle[axis] else names[1] if low[axis] > middle[axis] else ""
             for axis, names in enumerate(_COMPASS_SIDES)
@@ -140,7 +140,7 @@ class Parts:
 
 
 def lost_shares(found: Solution, block: Block) -> Array:
-    """Return the share (N,) of each view's tie points that were cut; of a view without any all."""
+    """Return the share (N,) of rejected tie points of each view; 1 for a view without any."""
     ties = block.use & (block.point < block.num_tracks)
     had, kept = (
         np.bincount(block.view[rows], minlength=len(block.views)) for rows in (ties, ties & found.outcome.inlier)

@@ -1,4 +1,4 @@
-"""Terms that explain the residuals of a solved block, found among all of its observations, those that were cut too."""
+"""Search for terms that explain the residuals of a solved block, rejected observations included."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ logger = logging.getLogger(__name__)
 
 MAX_OBSERVATIONS = KEPT
 """Observations of the largest block that is searched."""
-_NEAREST = 12  # views that are searched together
+_NEAREST = 12  # views of a large block that are searched together
 
 
 def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
-    """Find the terms of a block beside its cameras, the first taken first; none where no residuals are significant.
+    """Find the terms of a block beside its cameras, in order of selection; none if no residuals are significant.
 
-    In a block of more unknowns than `SMALL` each image with significant residuals is searched among those with
-    which it shares most tracks: moving objects compete there, and are not taken.
+    In a block of more unknowns than `SMALL` each image with significant residuals is searched together with those
+    that share most tracks with it. Moving objects are a hypothesis there, but are not selected.
     """
     size, views = outcome.problem.free.size, np.arange(len(block.views))
     if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:
         return Selection()
-    asks = [one.view for one in standing_out(outcome, block, floor)]
-    if not asks or size > SMALL:
-        asks += [one.view for one in periods_of(outcome, block)]
+    suspects = [one.view for one in standing_out(outcome, block, floor)]
+    if not suspects or size > SMALL:
+        suspects += [one.view for one in periods_of(outcome, block)]
     if size <= SMALL:
-        # ground that moves need not end at a row or a column
+        # moving ground need not be bounded by a row or a column
         systematic = outcome.smooth.found(floor).any()
-        return _searched_among(outcome, block, floor, views) if asks or systematic else Selection()
+        return _searched_among(outcome, block, floor, views) if suspects or systematic else Selection()
     found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
-    for view in dict.fromkeys(asks):
+    for view in dict.fromkeys(suspects):
         if view not in done:
             views = _neighbour_views(block, view)
             done.update(views.tolist())
@@ -55,7 +55,7 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
 
 
 def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
-    """Search the tie points that some views have in common; views and observations are renumbered."""
+    """Search the tie points of some views; in the result views and observations are numbered among these."""
     found = linearised_among(outcome, block, views)
     if found is None:
         return Selection()
@@ -70,16 +70,16 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
-    except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
+    except np.linalg.LinAlgError as error:  # priors so wide that rounding dominates the weakest mode
         logger.warning("the residuals of the tie points are not explained: %s", error)
         return Selection()
 
 
 def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
-    """Return the solution as a mixture of the observations at `rows` (K,), none noisier than those it kept.
+    """Return the mixture fit at the solution, of observations at `rows` (K,), with at most the noise of its inliers.
 
-    Where many observations are displaced more noise for all may explain more, but hides which. Its evidence is what
-    the terms have to gain over.
+    Where many observations are displaced a larger noise explains more, but hides which. Therefore the evidence is the
+    larger of a fit with that limit and one without it: terms must exceed it.
     """
     right, count = outcome.inlier[rows].astype(np.float64), np.bincount(linear.view, minlength=linear.views)
     wrong = np.bincount(linear.view, 1.0 - right, linear.views) / np.maximum(count, 1)
@@ -90,7 +90,7 @@ def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
 
 
 def _neighbour_views(block: Block, view: int) -> IntArray:
-    """Return a view and those that share most tracks with it, in their order."""
+    """Return a view and those that share most tracks with it, ascending."""
     ties = block.use & (block.point < block.num_tracks)
     of_view = np.zeros(block.num_points, dtype=bool)
     of_view[block.point[ties & (block.view == view)]] = True
@@ -101,7 +101,7 @@ def _neighbour_views(block: Block, view: int) -> IntArray:
 
 
 def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: IntArray) -> Selection:
-    """Return a selection with that among some views added, for observations at `rows`."""
+    """Return a selection extended by that among some views, with observations at `rows`."""
     step, right = all_of.step.copy(), all_of.right.copy()
     new = ~step[views].any(axis=1)
     step[views[new]] = one.step[new]
@@ -113,7 +113,7 @@ def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: Int
 
 
 def linearised_among(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """Linearise the tie points among some views of a block at its solution; None of none, or of too many."""
+    """Linearise the tie points of some views at the solution of a block; None if there are none, or too many."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)

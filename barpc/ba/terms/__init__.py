@@ -1,4 +1,4 @@
-"""Terms beside the cameras that explain residuals: one a file, with its columns, prior, price, refinement and words."""
+"""Terms that explain residuals beside the cameras, one a module: columns, prior, price, refinement, report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["TERMS", "CommonEdge", "LinesLost", "LowFrequency", "MovingObjects", 
 TERMS: dict[str, type[Term]] = {
     term.NAME: term for term in (Step, LinesLost, Decay, Transient, CommonEdge, LowFrequency, Sinusoid, MovingObjects)
 }
-"""Name -> term, in the order in which they are proposed."""
+"""Name -> class of the term, in the order of proposals."""
 
 
 def proposed(
@@ -29,7 +29,7 @@ def proposed(
     periods: list[Period],
     without: Sequence[type[Term]] = (),
 ) -> Iterator[Term]:
-    """Yield the terms that intervals and periods propose; those of a whole image, or of the block, once."""
+    """Yield the terms for significant intervals and periods; a kind for a whole image, or the block, only once."""
     for period in periods:
         yield Sinusoid.of(residuals, period)
     kinds = [kind for kind in TERMS.values() if kind not in without]

@@ -1,7 +1,7 @@
-"""A common edge: all images of one line of detectors step at the same column, by the same displacement.
+"""A common edge: in all images of one line of detectors, columns from one on have the same displacement.
 
-Where all images see a piece of ground beyond the edge, its point follows the displacement. What shows the step is the
-ground that some images see before the edge and others beyond it.
+A ground point that all images see beyond the edge absorbs the displacement. Only points that some images see before the
+edge and others beyond it determine it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from barpc.base.geodesy import Array
 
 
 class CommonEdge(Term):
-    """Columns from one on are displaced as a whole, in all images alike."""
+    """Columns from one on have the same displacement in all images."""
 
     NAME: ClassVar[str] = "common_edge"
     NOUN: ClassVar[str] = "a step at the same column of all images"
@@ -34,7 +34,7 @@ class CommonEdge(Term):
 
     @classmethod
     def may_be(cls, residuals: Residuals, intervals: list[Interval]) -> bool:
-        """Return whether the images are equally wide, as of one line of detectors, and columns are significant."""
+        """Return whether the images are equally wide, as of one line of detectors, and some columns are significant."""
         widths = residuals.size[0]
         return bool((widths == widths[0]).all()) and any(one.axis == 0 for one in intervals)
 
@@ -46,7 +46,7 @@ class CommonEdge(Term):
 
     @classmethod
     def at(cls, residuals: Residuals, col: float, sigma: float = FIRST_SIGMA) -> Self:
-        """Return the edge at a column [px], with a prior standard deviation of its displacement [px]."""
+        """Return the edge at a column [px], with the prior standard deviation of its displacement [px]."""
         width = float(residuals.size[0, 0])
         where = (0, *open_ended(col, width, width), 0.0, 0.0)
         parts = tuple(Step.at(residuals, v, where, sigma) for v in range(residuals.size.shape[1]))
@@ -57,19 +57,19 @@ class CommonEdge(Term):
         """Return the edge with a prior as wide as its size."""
         return self.at(residuals, self.where[1], self.prior_width(found))  # type: ignore[index]
 
-    def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
-        """Yield a record a view."""
+    def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
+        """Yield a record for each view."""
         for part in self.parts:
-            for one in part.findings(residuals, unknowns, **said):
+            for one in part.findings(residuals, unknowns, **fields):
                 yield replace(one, kind=self.NAME)
 
 
 def score(residuals: Residuals) -> tuple[Array, Array]:
-    """Return the places (m,) [px] between the columns of observations, and the gain (m,) of an edge at each.
+    """Return the positions (m,) [px] midway between columns of observations, and the gain (m,) [nats] of an edge there.
 
-    The score test of one displacement of all observations beyond, ground points settled: S' M^-1 S / 2 with S the sum
-    of their residuals and M its information, which changes from place to place by the tracks that are seen there. A
-    track counts by the inverse of what it is off by, so that the sum of distances is lowered, not of their squares.
+    The score test S' M^-1 S / 2 of one displacement of all observations beyond the edge, ground points eliminated: S is
+    the sum of their residuals, M its information. Tracks are weighted by the inverse of their residual norm, as for
+    the L1 norm.
     """
     linear, base = residuals.linear, residuals.base
     left = linear.left(base.step) + np.einsum("cek,e->ck", residuals.extra, base.extra) / linear.sigma
@@ -84,7 +84,7 @@ def score(residuals: Residuals) -> tuple[Array, Array]:
         off = off - np.einsum("tcni,tc->tni", basis, np.einsum("tcni,tni->tc", basis, off))
         weight = 1.0 / np.sqrt((off**2).sum(axis=(1, 2)) + base.noise**2)
         off, basis = off[np.arange(count)[:, None], order], np.take_along_axis(basis, order[:, None, :, None], axis=2)
-        # of the observations from each on to the last: what they and their ground point have in common
+        # sums over the observations beyond each edge: information, less the part that the ground point absorbs
         followed = (basis * scale[:, None, :, None])[:, :, ::-1].cumsum(axis=2)[:, :, ::-1]
         own = (scale**2)[:, ::-1].cumsum(axis=1)[:, ::-1, None, None] * np.eye(2)
         matrix = (own - np.einsum("tcni,tcnj->tnij", followed, followed)) * weight[:, None, None, None]

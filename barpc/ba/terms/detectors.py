@@ -1,9 +1,9 @@
-"""Steps between the detectors of a focal plane: columns from which on all rows of an image are displaced.
+"""Steps between the detectors of a focal plane: change points of the residuals over the columns of images.
 
-Change points of the residuals over the columns, the largest of all views first. A step in one view is seen, smaller, in
-the residuals of all that share its points; so what the steps found explain is taken out of all residuals, the points
-following, before the next. Images that are equally wide may come from one focal plane: then the changes of all are
-added up. Of the two the one that explains more is returned.
+The largest change of all views is found first. A step in one view appears, smaller, in the residuals of all views that
+share its points. Therefore the effect of the steps found is removed from all residuals, with the points re-estimated,
+before the next is searched. Equally wide images may be from one focal plane, with steps at the same columns: the search
+is repeated with the gains of all images summed, and the set that explains more is returned.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import BACKFITTING, FEW, ITERATIONS
 from barpc.scene import BoolArray
 
-_MIN_LOG_RATIO = 40.0  # twice a log likelihood ratio: of 10,000 places by chance once in 100,000 views
-_A_VIEW = 4.0  # and so much more for every other view of a focal plane
-_AS_LARGE = 0.5  # of the largest change: not what another view's step leaves here, a quarter of it with three views
+_MIN_LOG_RATIO = 40.0  # least doubled log-likelihood ratio: among 10,000 columns reached by noise once in 100,000 views
+_A_VIEW = 4.0  # added to it for every further view of a focal plane
+_AS_LARGE = 0.5  # of the largest gain, at least: a step of another view has a quarter of it with three views
 
-Edges = list[list[float]]  # of every group of views, ascending
+Edges = list[list[float]]  # columns of the steps of each group of views, ascending
 
 
 class _Columns:
-    """The observations in use of groups of views, which have their detectors in common, in the order of columns."""
+    """Observations in use, sorted by column, of groups of views that share their detectors."""
 
     def __init__(self, problem: Problem, use: BoolArray, sigma: Array, groups: list[list[int]]) -> None:
         bounds, col = problem.structure.bounds, problem.xy[0]
@@ -40,7 +40,7 @@ class _Columns:
         self.places = [0.5 * (one[1:] + one[:-1]) for one in every]
 
     def means(self, residual: Array, edges: Edges) -> Array:
-        """Return every detector's mean (2, K) of residuals (2, K) at its observations in use; zero elsewhere."""
+        """Return for each observation in use the mean residual (2, K) of its detector; zero for others."""
         out = np.zeros_like(residual)
         for group, of_group in zip(self.groups, edges, strict=True):
             for v in group if of_group else ():
@@ -50,7 +50,7 @@ class _Columns:
         return out
 
     def split(self, g: int, low: float, high: float, residual: Array) -> tuple[float, float]:
-        """Return the largest change between two columns of a group: its gain beyond chance, and its place."""
+        """Return the largest change between two columns of a group: its gain less the price of views, and column."""
         places = self.places[g][np.searchsorted(self.places[g], low) : np.searchsorted(self.places[g], high)]
         if not len(places):
             return 0.0, low
@@ -65,19 +65,19 @@ class _Columns:
         sums = np.cumsum(residual[:, self.order[v][a:b]] * weight, axis=1)
         sums = np.hstack([np.zeros((2, 1)), sums])
         left, right = np.maximum(total[at], 1e-30), np.maximum(total[-1] - total[at], 1e-30)
-        apart = sums[:, at] / left - (sums[:, -1:] - sums[:, at]) / right
-        gain = (apart**2).sum(axis=0) * left * right / max(total[-1], 1e-30)
+        change = sums[:, at] / left - (sums[:, -1:] - sums[:, at]) / right
+        gain = (change**2).sum(axis=0) * left * right / max(total[-1], 1e-30)
         return np.where((at >= FEW) & (b - a - at >= FEW), gain, 0.0)
 
 
 def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, sigma: Array) -> Array:
-    """Find the columns (N, C) [px] at which residuals (2, K) [px] step; infinite where a view has fewer."""
+    """Find the columns (N, C) [px] of steps of the residuals (2, K) [px]; infinite where a view has fewer."""
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
-    settled = problem.projected_off_points(problem.project_points(state.params, state.points), weight)
-    residual, views = settled(_without_steps(problem, state, residual)), list(range(len(widths)))
-    edges, cost = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, settled, weight)
+    project = problem.projected_off_points(problem.project_points(state.params, state.points), weight)
+    residual, views = project(_without_steps(problem, state, residual)), list(range(len(widths)))
+    edges, cost = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, project, weight)
     if any(edges) and len(views) > 1 and (widths == widths[0]).all():
-        common, in_common = _grown(_Columns(problem, use, sigma, [views]), residual, settled, weight)
+        common, in_common = _grown(_Columns(problem, use, sigma, [views]), residual, project, weight)
         edges = common * len(views) if in_common < cost else edges
     out = np.full((len(edges), max(map(len, edges))), np.inf)
     for v, of_view in enumerate(edges):
@@ -86,7 +86,7 @@ def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, 
 
 
 def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
-    """Return the residuals (2, K) [px] of cameras without the steps that were found before."""
+    """Return the residuals (2, K) [px] of the cameras without steps found earlier."""
     unknowns, steps = problem.cameras.unknowns, np.zeros_like(residual)
     if unknowns.waves is not None and unknowns.waves.edges.size:
         params = state.params.copy()
@@ -96,12 +96,12 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
     return residual - steps
 
 
-def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
-    """Return the edges of every group, the largest first and then placed, and the cost of the residuals."""
+def _grown(columns: _Columns, residual: Array, project: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
+    """Return the edges of each group, found one after the other and refined; and the cost of residuals and edges."""
     edges: Edges = [[] for _ in columns.groups]
-    part = np.zeros_like(residual)
+    explained = np.zeros_like(residual)
     for _ in range(ITERATIONS):
-        left = settled(residual - part)
+        left = project(residual - explained)
         found = [
             (g, *columns.split(g, *stretch, left))
             for g, of_group in enumerate(edges)
@@ -114,18 +114,18 @@ def _grown(columns: _Columns, residual: Array, settled: Callable[[Array], Array]
             if gain >= max(_MIN_LOG_RATIO, _AS_LARGE * largest):
                 edges[g] = sorted([*edges[g], col])
         for _ in range(BACKFITTING):
-            part += columns.means(settled(residual - part), edges)
-    left = settled(residual - part)
+            explained += columns.means(project(residual - explained), edges)
+    left = project(residual - explained)
     cost = float(((left * weight) ** 2).sum())
     cost += sum(
         len(one) * (_MIN_LOG_RATIO + _A_VIEW * (len(group) - 1))
         for one, group in zip(edges, columns.groups, strict=True)
     )
-    return [_edge_positions(columns, g, of_group, part + left) for g, of_group in enumerate(edges)], cost
+    return [_edge_positions(columns, g, of_group, explained + left) for g, of_group in enumerate(edges)], cost
 
 
 def _edge_positions(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
-    """Return the edges of a group, each where it is best between its neighbours, that explain enough."""
+    """Return the significant edges of a group, each at its best column between its neighbours."""
     found: list[float] = []
     for at in range(len(edges)):
         low = found[-1] if found else -np.inf

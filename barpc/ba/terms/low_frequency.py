@@ -1,4 +1,4 @@
-"""A low-frequency displacement of the rows of one image, beyond the polynomial drift of a platform."""
+"""A low-frequency displacement of the rows of one image, beyond the polynomial drift."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LowFrequency(Term):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the splines of an image, as many as its observations hold."""
+        """Return the splines of an image; their number is limited by its observations."""
         view, linear = interval.view, residuals.linear
         rows = np.flatnonzero(linear.view == view)
         u = 2.0 * residuals.place[1, rows] / residuals.size[1, view] - 1.0
@@ -37,7 +37,7 @@ class LowFrequency(Term):
         return [cls(view, in_both_coordinates(residuals, rows, basis), sigma, cost)]
 
     def alternatives(self, residuals: Residuals, found: MixtureFit) -> list[Term]:
-        """Return the step and the decay that the curve of a fit resembles most, drift aside."""
+        """Return the step and the decay that the fitted curve resembles most, without the drift."""
         size = float(residuals.size[1, self.view])
         rows = (np.arange(BINS) + 0.5) / BINS * size
         splines = AdditionalParameters(len(self.sigma) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)
@@ -52,11 +52,11 @@ class LowFrequency(Term):
             (Step, (*ends, nothing, nothing)),
             (Decay, (start, stop, origin, sign / length)),
         )
-        told: list[Term] = []
+        terms: list[Term] = []
         for kind, shapes in kinds:
             parts = profile(rows[:, None], *shapes)
             parts -= drift @ (drift.T @ parts)
             explained = ((curve @ parts) ** 2).sum(axis=0) / np.maximum((parts**2).sum(axis=0), 0.1)
             first, last, *rest = (float(shape[int(explained.argmax())]) for shape in shapes)
-            told.append(kind.at(residuals, self.view, (1, *open_ended(first, last, size), rest[0], rest[1])))
-        return told
+            terms.append(kind.at(residuals, self.view, (1, *open_ended(first, last, size), rest[0], rest[1])))
+        return terms

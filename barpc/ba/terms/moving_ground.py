@@ -1,9 +1,8 @@
-"""Ties that move together on the ground while the views are taken: a cloud, water, shadows.
+"""Tie points that move together on the ground between the views: clouds, water, shadows.
 
-Such a group is as good a block as what stands still, so that a cut may keep both, or the wrong one. It is taken for the
-smaller part of the ties and for local: its share is free in each of `GROUND_CELLS` x `GROUND_CELLS` cells of the
-ground. Where it lies is looked for from several starts, with few tracks: what was cut moves, or each of some cells
-does, with what is far from it standing still.
+Such a group fits a block as well as the still ground does, so outlier rejection may keep both, or the wrong one. The
+smaller group is taken as moving. Its share is free in each of `GROUND_CELLS` x `GROUND_CELLS` cells of the ground. The
+fit starts from several hypotheses, on a sample of tracks: the rejected observations move, or those of a region do.
 """
 
 from __future__ import annotations
@@ -25,23 +24,23 @@ from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.statistics import LEVEL, SAMPLE, SURE, TIMES
 from barpc.scene import BoolArray, IntArray
 
-GROUND_CELLS = 6  # a side of the ground: the group's share is free in each
-_STARTS = 8  # regions of which more than a score is looked at
+GROUND_CELLS = 6  # cells along each side of the ground
+_STARTS = 8  # regions to start a fit from, those of the best score
 
 
 @dataclass(frozen=True, eq=False)
 class GroundMotion:
-    """Ground points of a block's tracks in a local frame, and how their motion moves images."""
+    """Ground points of the tracks of a block in a local frame, and the derivative of observations by their motion."""
 
     center: Array  # (3,) [m], ECEF
-    low: Array  # (2,) least east and north of its points [m]
-    high: Array  # (2,)
-    place: Array  # (2, K) east and north of every observation's point [m]
-    by_ground: Array  # (2, 3, K) how a metre east, north and up moves observations [px]
+    low: Array  # (2,) least east and north of the points [m]
+    high: Array  # (2,) largest
+    place: Array  # (2, K) east and north of the point of each observation [m]
+    by_ground: Array  # (2, 3, K) derivative of observations by a motion east, north and up [px/m]
 
     @classmethod
     def of(cls, problem: Problem, state: State, like: GroundMotion | None = None) -> GroundMotion:
-        """Return the ground of a problem's points, in the frame of another one where it is given."""
+        """Return the ground of the points of a problem, in the frame of `like` if given."""
         points = state.points[problem.structure.point]
         center = np.nanmedian(points, axis=0) if like is None else like.center
         basis = enu_basis(ground_from_ecef(center))
@@ -53,26 +52,26 @@ class GroundMotion:
         return cls(center, like.low, like.high, place, by_ground)
 
     def part(self, rows: IntArray) -> GroundMotion:
-        """Return the ground of some observations."""
+        """Return the ground of the observations `rows`."""
         return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
 
     @cached_property
     def pixel(self) -> float:
-        """A pixel on the ground [m]."""
+        """Ground sample distance [m], median of all observations."""
         return self.pixel_of(np.arange(self.by_ground.shape[2]))
 
     def pixel_of(self, rows: IntArray) -> float:
-        """Return the pixel on the ground [m] of some observations."""
+        """Return the ground sample distance [m], median of the observations `rows`."""
         return float(1.0 / np.nanmedian(np.sqrt((self.by_ground[:, :2, rows] ** 2).sum(axis=(0, 1)) / 2.0)))
 
     def cells(self, number: int) -> IntArray:
-        """Return the cell (K,) of `number` x `number` on the ground in which each observation's point lies."""
+        """Return the cell (K,) of the point of each observation, of `number` x `number` cells of the ground."""
         part = (self.place - self.low[:, None]) / np.maximum(self.high - self.low, 1e-9)[:, None]
         row, col = np.nan_to_num(part * number).astype(np.int64).clip(0, number - 1)
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """Return the displacements (2, 2 N - 2, K) [px] by a pixel's move east and north in all views but the first."""
+        """Return the displacements (2, 2 N - 2, K) [px] by motions of `pixel` east and north, views from the second."""
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)
@@ -82,33 +81,33 @@ class GroundMotion:
 
 @dataclass(frozen=True)
 class Motion:
-    """Share, place and size of the motion of a group of ties."""
+    """The record of a moving group for the report."""
 
-    metres: float  # by how much, from one of two views to the other, beside what may be its height
-    between: tuple[int, int]
+    metres: float  # largest motion between two views, without the part that a height would explain [m]
+    between: tuple[int, int]  # these views
     share: float  # of the tracks
-    box: tuple[float, float, float, float]  # west, south, east, north [deg], of nine in ten of its tracks each way
-    side: str  # of the middle of the block on which they lie, as "north-west"; "" where on both
+    box: tuple[float, float, float, float]  # west, south, east, north [deg]: 5 % and 95 % quantiles of its tracks
+    side: str  # of the block on which it lies, as "north-west"; "": on no one side
     gcps: tuple[str, ...] = ()  # names of control points among them
-    dates: tuple[str, str] = ("", "")  # of the two views; empty where nobody says
+    dates: tuple[str, str] = ("", "")  # of the two views; empty: unknown
 
 
 @dataclass(frozen=True, eq=False)
 class MovingGroup:
-    """A group of ties that moves, as the judge found it."""
+    """A fitted moving group of tie points."""
 
     metres: float  # as in `Motion`
     between: tuple[int, int]
     member: BoolArray  # (K,) observations of its tracks
-    shares: Array  # (CELLS^2,) of the ground's cells
+    shares: Array  # (GROUND_CELLS^2,) share of moving tracks in each cell
     ground: GroundMotion
-    fit: MixtureFit
+    fit: MixtureFit  # with the group
 
 
 def shows(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> bool:
-    """Return whether a region of the ground may move: whether its score, by a sample of tracks, may pay for a group.
+    """Return whether a region of the ground may move: whether its score, by a sample of tracks, exceeds the price.
 
-    Chance leaves the best of R regions half of what a chi-square of as many degrees as unknowns exceeds once in R.
+    The expected largest score of R still regions is subtracted: half the chi-square quantile of probability 1 / R.
     """
     few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
     if not few.tracks:
@@ -120,37 +119,37 @@ def shows(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, 
 
 
 def _any_group(linear: Linear, ground: GroundMotion) -> Group:
-    """Return a group that any track may be of, with its unknowns' prior."""
+    """Return a group to which any track belongs with probability 0.5, with the prior of its unknowns."""
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
     return Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
 
 
 def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
-    """Return the moving group to start with, beside other explanations, with its unknowns' prior."""
+    """Return the most likely moving group beside a fit `base` with terms `extra`, as a start; None without tracks."""
     few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
     cell, rows = group.cell, few.taking_part
     if not rows.any():
         return None
     starts = [replace(group, share=share) for share in _first_shares(linear, group, base, extra, sigma)]
-    # what a few iterations show does not tell which start ends best
+    # iterated to the end: a few iterations do not show which start ends best
     ended = [(Mixture(few, extra, sigma, base, one).run(cooled=COOLED**2), one) for one in starts]
     found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _cell_shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
-    if np.mean(member[rows] > 0.5) > 0.5:  # of two groups the larger stands
+    if np.mean(member[rows] > 0.5) > 0.5:  # the larger group stands still
         member = 1.0 - member
     return replace(group, share=member.clip(LEVEL, 1.0 - LEVEL))
 
 
 def price_of_group(linear: Linear, cell: IntArray) -> float:
-    """Return the cost of the shares of the cells [nats]: half the logarithm of the number of tracks of each."""
+    """Return the price of the shares of the cells [nats]: half the log of the number of tracks in each."""
     first = np.concatenate([tracks.rows[:, 0] for tracks in linear.tracks])
     count = np.bincount(cell[first])
     return float(0.5 * np.log(count[count > 0]).sum())
 
 
 def _first_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Iterator[Array]:
-    """Yield the probabilities (K,) that tracks move, to start from: those that were cut, and the likeliest regions."""
+    """Yield start values (K,) of the probability that tracks move: of rejected ones, then of the likeliest regions."""
     cut = np.where(base.right < 0.5, 1.0 - LEVEL, LEVEL)
     if (cut[linear.taking_part] > 0.5).any():
         yield cut
@@ -160,10 +159,9 @@ def _first_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, 
 
 
 def _region_gains(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Array:
-    """Return the gain [nats] (R,) of a common motion of each of the regions of the ground: a score test.
+    """Return the gain (R,) [nats] of a common motion of each region of the ground: a score test.
 
-    The cameras and what is beside them follow (Schur complement of the curvature at the fit `base`); cells of the
-    ground are summed up before.
+    Cameras and terms are eliminated (Schur complement of the curvature at the fit `base`).
     """
     scores = Mixture(linear, extra, sigma, base).scores(group.by_move, group.cell, GROUND_CELLS**2)
     regions = _REGIONS.astype(np.float64)
@@ -192,7 +190,7 @@ _REGIONS = _regions()
 
 
 def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
-    """Return the best regions (C,), none of which shares more than half of its union with another."""
+    """Return the best regions, none of which overlaps a better one in more than half of their union."""
     found: list[BoolArray] = []
     for n in np.argsort(-gains, kind="stable"):
         one = regions[n]
@@ -203,12 +201,13 @@ def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
 
 
 def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
-    gone, count = (np.bincount(cell[rows], w, GROUND_CELLS**2) for w in (member[rows], np.ones(rows.sum())))
-    return np.asarray((gone + 0.5) / (count + 1.0))
+    """Return the share of members in each cell, among the observations `rows`."""
+    moving_count, count = (np.bincount(cell[rows], w, GROUND_CELLS**2) for w in (member[rows], np.ones(rows.sum())))
+    return np.asarray((moving_count + 0.5) / (count + 1.0))
 
 
 def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureFit) -> MovingGroup:
-    """Return the motion of a group by a fit with it."""
+    """Return the moving group of a fit, with its largest motion between two views."""
     rows = linear.taking_part
     member = rows & (found.moving > 0.5)
     moved = np.vstack([np.zeros(2), found.move.reshape(-1, 2)]) * ground.pixel
@@ -216,7 +215,7 @@ def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureF
     up = np.array([ground.by_ground[:, :, member & (linear.view == v)].mean(axis=2) for v in seen])
     apart = np.zeros((1, 1)), (0, 0)
     if len(seen) >= 2:
-        # what all share is no motion, what goes with a view's parallax may be height
+        # a shift of all views is no motion; a part along the parallax of the views may be height
         parallax = -np.linalg.solve(up[:, :, :2], up[:, :, 2:])[..., 0]
         design = np.column_stack([np.tile(np.eye(2), (len(seen), 1)), parallax.ravel()])
         flat = moved[seen].ravel()
@@ -229,7 +228,7 @@ def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureF
 
 
 def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> BoolArray:
-    """Return the held-out observations (K,) that belong to a group found at cameras of unknowns (N, q)."""
+    """Return the observations (K,) of a block that belong to a group found at camera unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
     part, points = seen_in(problem, params, block)

@@ -14,7 +14,7 @@ from barpc.base.geodesy import Array
 
 
 class MovingObjects(Term):
-    """Displacements on the ground, one a view, of a group of tie points whose share is free in each cell."""
+    """Displacements on the ground, one for each view, of a group of tie points with a share in each ground cell."""
 
     NAME: ClassVar[str] = "moving_objects"
     NOUN: ClassVar[str] = "moving objects"
@@ -25,13 +25,13 @@ class MovingObjects(Term):
 
     @staticmethod
     def shows(residuals: Residuals) -> bool:
-        """Return whether a region of the ground may move."""
+        """Return whether a region of the ground may move (`moving_ground.shows`)."""
         seen = residuals
         return moving_ground.shows(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
 
     @classmethod
     def of(cls, residuals: Residuals) -> list[Self]:
-        """Return the most likely group."""
+        """Return the most likely moving group; empty: there is none."""
         linear = residuals.linear
         one = moving_ground.proposal(linear, residuals.ground, residuals.base, residuals.extra, residuals.sigma)
         if one is None:
@@ -40,9 +40,9 @@ class MovingObjects(Term):
         return [cls(-1, none, np.zeros(0), cost, group=one)]
 
     def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
-        """Return the displacement between two views, beside an effect of height, in the coarser one's pixels [px].
+        """Return the largest motion between two views, without an effect of height, in pixels of the coarser one.
 
-        Infinite where nothing is of the group.
+        Infinite for an empty group.
         """
         if self.group is None or not (found.moving > 0.5).any():
             return np.inf
@@ -50,8 +50,8 @@ class MovingObjects(Term):
         one = moving_ground.group_of(linear, ground, self.group, found)
         return one.metres / max(ground.pixel_of(np.flatnonzero(linear.view == v)) for v in one.between)
 
-    def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
+    def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
         """Yield its record, with the members of the group."""
         assert self.group is not None
         group = moving_ground.group_of(residuals.linear, residuals.ground, self.group, residuals.base)
-        yield Finding(self.NAME, self.view, None, np.zeros(2), unknowns=unknowns, moved=group, **said)
+        yield Finding(self.NAME, self.view, None, np.zeros(2), unknowns=unknowns, moved=group, **fields)

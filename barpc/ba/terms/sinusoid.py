@@ -26,7 +26,7 @@ class Sinusoid(Term):
 
     @classmethod
     def of(cls, residuals: Residuals, found: Period) -> Self:
-        """Return the term of a significant period."""
+        """Return the sinusoid of a significant period."""
         rows = np.flatnonzero(residuals.linear.view == found.view)
         columns = in_both_coordinates(
             residuals, rows, sine_and_cosine(residuals.place[1, rows], np.array(found.period))

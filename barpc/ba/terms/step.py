@@ -16,15 +16,15 @@ from barpc.sensor.image_corrections import profile
 
 
 class ImagePart(Term):
-    """A displacement of a part of one image, (col, row), that may decay along it."""
+    """A displacement (col, row) of a part of one image, which may decay along it."""
 
     FOLLOWED: ClassVar[bool] = True
     LOCAL: ClassVar[bool] = True
-    NUM_SHAPES: ClassVar[int]  # sizes and lengths that are paid for
+    NUM_SHAPES: ClassVar[int]  # shape parameters with a price: size, length
 
     @classmethod
     def at(cls, residuals: Residuals, view: int, where: Where, sigma: float = FIRST_SIGMA) -> Self:
-        """Return the term of a place, with a prior standard deviation [px]."""
+        """Return the term for a part `where` of a view, with prior standard deviation `sigma` [px]."""
         axis, *shape = where
         own = residuals.linear.view == view
         part = np.where(own, profile(residuals.place[axis], *map(np.asarray, shape)), 0.0)
@@ -38,9 +38,9 @@ class ImagePart(Term):
         return unknowns
 
     def gains(self, residuals: Residuals, found: MixtureFit, others: Array) -> tuple[Array, Array]:
-        """Return places (n,) [px] of the view's observations, ascending, and the gain (n,) [nats] of each by it.
+        """Return positions (n,) [px] of the view's observations, ascending, and the log-likelihood gain (n,) of each.
 
-        As if it displaced all of the view; `found` and `others` as for `refined`.
+        The gain is that of the displacement if it were everywhere; `found` and `others` as for `refined`.
         """
         linear = residuals.linear
         axis, _, _, *decay = self.where  # type: ignore[misc]
@@ -70,11 +70,11 @@ class Step(ImagePart):
         return [cls.at(residuals, interval.view, (interval.axis, *ends, 0.0, 0.0))]
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the step with the ends that single tie points tell, and a prior as wide as its size."""
+        """Return the step with the ends of largest likelihood, and a prior as wide as its size."""
         place, gain = self.gains(residuals, found, others)
         axis = self.where[0]  # type: ignore[index]
         first, last = largest_part(gain)
-        # an end within the image has to gain: few ties beyond it, some of them wrong, are none
+        # an end within the image must be significant: few tie points beyond it may be wrong
         first = 0 if gain[:first].sum() > -SURE else first
         last = len(gain) - 1 if gain[last + 1 :].sum() > -SURE else last
         start = -np.inf if first == 0 else 0.5 * (place[first - 1] + place[first])
@@ -85,7 +85,7 @@ class Step(ImagePart):
 
 
 class LinesLost(Step):
-    """A step of rows by a whole number of them: lines were lost, or repeated. `image_terms` makes it of a step."""
+    """A step of rows by a whole number of them: lost or repeated lines. `image_terms` makes it from a `Step`."""
 
     NAME: ClassVar[str] = "lines_lost"
     NOUN: ClassVar[str] = "lines lost, or repeated"
@@ -93,17 +93,17 @@ class LinesLost(Step):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return none: steps compete."""
+        """Return none: `Step` is proposed instead."""
         return []
 
 
 def open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
-    """Return the ends of a part, moved beyond an image's end where they reach it."""
+    """Return the ends of a part; those at an end of the image (of length `size`) are moved far beyond it."""
     return (-size if start <= 0.0 else start), (2.0 * size if stop >= size else stop)
 
 
 def largest_part(gain: Array) -> tuple[int, int]:
-    """Return the first and last of the run of values whose sum is the largest."""
+    """Return the first and last index of the run of values with the largest sum."""
     sums = np.concatenate([[0.0], np.cumsum(gain)])
     lowest = np.minimum.accumulate(sums[:-1])
     last = int((sums[1:] - lowest).argmax())

@@ -1,4 +1,4 @@
-"""A transient: the first, or last, rows of all images are displaced and decay, as a platform settles after a turn."""
+"""A transient: a decaying displacement of the first, or last, rows of all images, as after a turn of the platform."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from barpc.base.geodesy import Array
 
 
 class Transient(Decaying):
-    """The first, or last, rows of all images are displaced, each image by its own amount, with one rate of decay."""
+    """A displacement of the first, or last, rows of all images, each with its own size, and one rate of decay."""
 
     NAME: ClassVar[str] = "transient"
     NOUN: ClassVar[str] = "a decaying displacement at one end of all images"
@@ -39,14 +39,14 @@ class Transient(Decaying):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the transient of the most likely length and end."""
+        """Return the transient with the most likely length and end of the images."""
         lengths = LENGTHS * float(np.median(residuals.size[1]))
         tried = [cls.at_rate(residuals, sign / length, FIRST_SIGMA) for sign in (1.0, -1.0) for length in lengths]
         return [tried[int(np.argmin([one.first_cost(residuals) for one in tried]))]]
 
     @classmethod
     def at_rate(cls, residuals: Residuals, rate: float, sigma: float) -> Self:
-        """Return the transient of a rate [1/px], negative for one at the end; with a prior [px]."""
+        """Return the transient of a rate [1/px] (negative: at the end), with prior standard deviation `sigma` [px]."""
         parts = []
         for v, size in enumerate(residuals.size[1].tolist()):
             where = (1, *open_ended(0.0, size, size), 0.0 if rate > 0.0 else size, rate)
@@ -56,11 +56,11 @@ class Transient(Decaying):
         return cls(-1, columns, np.full(columns.shape[1], sigma), cost, where, parts=tuple(parts))
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the transient of its rate with a prior as wide as its size."""
+        """Return the transient with a prior as wide as its size."""
         return self.at_rate(residuals, self.where[4], self.prior_width(found))  # type: ignore[index]
 
-    def findings(self, residuals: Residuals, unknowns: Array, **said: Any) -> Iterator[Finding]:
-        """Yield a record a view."""
+    def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
+        """Yield a record for each view."""
         for part, own in zip(self.parts, np.split(unknowns, len(self.parts)), strict=True):
-            for one in part.findings(residuals, own, **said):
+            for one in part.findings(residuals, own, **fields):
                 yield replace(one, kind=self.NAME)

@@ -301,7 +301,8 @@ def _explanation_entry(one: Finding, adjustment: Adjustment) -> ExplanationEntry
     of_pair = len(names) == 2 and one.motion is None
     image, others = names[one.view], tuple(names[v] for v in ((1 - one.view,) if of_pair else one.or_of))
     of_all = one.motion is not None or TERMS[one.kind].OF_BLOCK
-    alike = [each for each in adjustment.findings if (each.kind, each.gain) == (one.kind, one.gain)]
+    same = [each for each in adjustment.findings if (each.kind, each.gain) == (one.kind, one.gain)]
+    alike = same if of_all else [one]
     size = max(float(np.hypot(*each.size)) for each in alike)
     fields: dict[str, Any] = {"size_px": size, "period": one.period, "candidates": None if of_all else others or None}
     # two images do not determine displacements along their epipolar lines
