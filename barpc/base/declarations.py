@@ -6,6 +6,7 @@ command line, the page of options, the JSON schema and `help(AdjustOptions)` are
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 import re
@@ -206,7 +207,9 @@ def with_values(
     known, changed = declared(type(options)), dict(values)
     for name, value in values.items():
         if name not in known:
-            raise InputError(f"{where}: unknown option {name!r}; known are {', '.join(known)}")
+            near = difflib.get_close_matches(str(name), known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            raise InputError(f"{where}: unknown option {name!r}; {hint}")
         nested, rule = getattr(options, name), known[name].rule
         runs = rule.hook and isinstance(value, str) and re.fullmatch(HOOK, value)
         if of_file and (rule.only or runs):

@@ -20,7 +20,7 @@ import click
 
 from barpc import __version__
 from barpc.base.errors import BarpcError, BarpcWarning, Remark, UsageError, has_room, out_of_memory
-from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, hold_streams, interruptible
+from barpc.cli.process import EXIT_INTERRUPTED, INTERRUPTED, Kept, hold_streams, interruptible
 from barpc.cli.terminal import EXIT_GATE as EXIT_GATE
 from barpc.cli.terminal import Formatter, echo, remark, say
 from barpc.verbs.workers import THREADS, quicken
@@ -135,7 +135,7 @@ def cli(verbose: int, quiet: bool, **_: bool) -> None:
         raise MemoryError
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s"))
+    handler.setFormatter(Formatter("%(levelname).1s %(name)s: %(message)s" if verbose else "barpc: %(message)s"))
     if not verbose:  # libraries log what is raised again, with its traceback
         handler.addFilter(logging.Filter("barpc"))
     logging.basicConfig(level=level, handlers=[handler])
@@ -154,9 +154,10 @@ def main(args: list[str] | None = None) -> None:
         hold_streams()
     os.environ.update(dict.fromkeys(THREADS, "1"))  # sums keep their order whatever is set; -j spreads the work
     code: object
+    kept = Kept()
     with interruptible(own=args is None) as interrupt, warnings.catch_warnings():
         try:
-            code = cli.main(args=argv, prog_name="barpc", standalone_mode=False)
+            code = cli.main(args=argv, prog_name="barpc", standalone_mode=False, obj=kept)
             sys.stdout.flush()
         except click.exceptions.Exit as stop:
             code = stop.exit_code
@@ -167,7 +168,7 @@ def main(args: list[str] | None = None) -> None:
             code = EXIT_FAILED
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  (nobody wants a traceback)
             # what an interruption makes of others' code may be any error
-            code, message = _exit_message(KeyboardInterrupt() if interrupt.end() else error)
+            code, message = _exit_message(KeyboardInterrupt() if interrupt.end() else error, kept)
             if "--debug" in argv:
                 echo(traceback.format_exc(), err=True)
             say(message)
@@ -178,12 +179,12 @@ def main(args: list[str] | None = None) -> None:
     sys.exit(code)
 
 
-def _exit_message(error: BaseException) -> tuple[int, str]:
-    """Return the exit code and the message of an error."""
+def _exit_message(error: BaseException, kept: Kept) -> tuple[int, str]:
+    """Return the exit code and the message of an error; `kept`: what an interrupted verb left."""
     if isinstance(error, click.Abort):  # of an end of file, too
         error = error.__cause__ or error
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
-        return EXIT_INTERRUPTED, INTERRUPTED
+        return EXIT_INTERRUPTED, f"{INTERRUPTED}; {kept}"
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "barpc"
@@ -192,8 +193,7 @@ def _exit_message(error: BaseException) -> tuple[int, str]:
     if isinstance(error, BarpcError):
         text = str(error)
     elif out_of_memory(error):
-        kept = "what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
-        text = f"out of memory; {kept}"
+        text = "out of memory; what was finished is kept: run the same command again, with a smaller -j or [tie] tile"
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename or 'the system'}: {error.strerror}"
     return EXIT_USAGE if isinstance(error, UsageError) else EXIT_FAILED, text

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
-from barpc.cli.terminal import at_work, is_quiet, output_width, print_summary, tell, tell_gate, wants_json
+from barpc.cli.process import Kept
+from barpc.cli.terminal import EXIT_GATE, at_work, is_quiet, output_width, print_summary, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
     from barpc.pipeline import AdjustResult, Plan
 
 MOST_PAIRS = 10  # of a plan on the terminal
 _images_argument = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
-_out_dir = click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the results.")
+_out_dir = click.option("-o", "--out-dir", "--output", required=True, metavar="DIR", help="Folder for the results.")
 
 
 @click.command("adjust", cls=Grouped)
@@ -88,8 +90,11 @@ def _run_pipeline(work: Callable[..., Any], flags: dict[str, Any], tell_of: Call
     """Run a verb of the pipeline with the options of the flags, and print the result."""
     options, where = run_options(flags, flags["options_file"]), [flags["out_dir"]] if "out_dir" in flags else []
     images = image_paths(flags["images"], flags["image_list"], options.keep_going)
+    kept = click.get_current_context().find_object(Kept) or Kept()
+    kept.folder = Path(where[0]) if where and where[0] else None
     with at_work() as progress:
-        return (tell_of or _tell_result)(work(images, *where, options, jobs=flags["jobs"], progress=progress))
+        result = work(images, *where, options, jobs=flags["jobs"], progress=kept.following(progress))
+        return (tell_of or _tell_result)(result)
 
 
 def _tell_plan(plan: Plan) -> int:
@@ -107,10 +112,10 @@ def _tell_result(result: AdjustResult) -> int:
     if wants_json():
         tell(result.summary)
     elif not is_quiet():
-        print_summary(result.record, result.root)
+        print_summary(result.record)
     if result.passed:
         return 0
-    # on the screen: every reason once
-    said = output_width() is not None and not (wants_json() or is_quiet())
-    reasons = [] if said else list(result.record.reasons)
+    if output_width() is not None and not (wants_json() or is_quiet()):  # on the screen: every reason once
+        return EXIT_GATE
+    reasons = list(result.record.reasons)
     return tell_gate("" if is_quiet() and reasons else result.record.headline, reasons)

@@ -21,7 +21,7 @@ _FORMAT_NAMES = ", ".join(f"{name} ({row.suffixes[0]})" for name, row in WRITABL
 
 @click.command("convert")
 @click.argument("files", nargs=-1, required=True, metavar="SOURCE... [TARGET]")
-@click.option("-o", "--out-dir", metavar="DIR", help="New folder for images of the same names, with proof.")
+@click.option("-o", "--out-dir", "--output", metavar="DIR", help="New folder for images of the same names, with proof.")
 @flags_of(ConvertOptions, rpc_format=f"Of {_FORMAT_NAMES}. Without: that of TARGET's name; in a folder txt.")
 def convert(files: tuple[str, ...], out_dir: str | None, **flags: Any) -> int:
     r"""Write the RPC of SOURCE to TARGET, whose name chooses the format, or those of many images to a folder.

@@ -12,13 +12,18 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from barpc.base.atomic import STATE
 from barpc.base.errors import OutputError
 
+if TYPE_CHECKING:
+    from barpc.tie.tasks import Progress
+
 EXIT_INTERRUPTED = 130
-INTERRUPTED = "interrupted; run the same command again to go on"
+INTERRUPTED = "interrupted"
 CLEAN_UP = 2.0
 """Seconds after a first signal in which more of them change nothing: `timeout` and batch systems send two at once."""
 
@@ -60,6 +65,27 @@ def hold_streams() -> None:
             held = io.BufferedWriter(_Stream(number, mode, closefd=False))
             how = {"encoding": stream.encoding, "errors": stream.errors, "line_buffering": stream.line_buffering}
             setattr(sys, name, io.TextIOWrapper(held, write_through=stream.write_through, **how))
+
+
+class Kept:
+    """Results of an interrupted verb that are kept, in words: of a run with a `folder` those of finished tasks."""
+
+    folder: Path | None = None
+    stage = "its start"
+
+    def __str__(self) -> str:
+        if self.folder is None or not any((self.folder / STATE / "cache").glob("*/*.npz")):
+            return "nothing was kept"
+        return f"finished tasks are kept: the same command goes on at {self.stage}"
+
+    def following(self, progress: Progress) -> Progress:
+        """Return a progress that stores the stage, too."""
+
+        def follow(stage: str, done: int, total: int) -> None:
+            self.stage = stage
+            progress(stage, done, total)
+
+        return follow
 
 
 # --- signals ----------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
 
 @click.command("calibrate")
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...")
-@click.option("-o", "--out", required=True, metavar="FILE", help="The calibration to write: SENSOR.cal.")
+@click.option("-o", "--out", "--output", required=True, metavar="FILE", help="The calibration to write: SENSOR.cal.")
 @flags_of(CalibrateOptions)
 def calibrate(runs: tuple[str, ...], out: str, **flags: Any) -> int:
     r"""Estimate the interior distortion and detector steps of one sensor from finished runs.
@@ -155,7 +155,7 @@ def calibrate(runs: tuple[str, ...], out: str, **flags: Any) -> int:
 
 @click.command("ortho")
 @click.argument("images", nargs=-1, required=True, metavar="RUN | IMAGE...")
-@click.option("-o", "--out-dir", required=True, metavar="DIR", help="Folder for the orthoimages.")
+@click.option("-o", "--out-dir", "--output", required=True, metavar="DIR", help="Folder for the orthoimages.")
 @flags_of(OrthoOptions)
 def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     r"""Make orthoimages of images with RPCs: Cloud-Optimised GeoTIFFs whose pixels lie on one grid.
@@ -183,7 +183,7 @@ def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
 
 @click.command("dsm")
 @click.argument("source", nargs=-1, required=True, metavar="RUN | IMAGE IMAGE...")
-@click.option("-o", "--out", required=True, metavar="FILE", help="The GeoTIFF to write.")
+@click.option("-o", "--out", "--output", required=True, metavar="FILE", help="The GeoTIFF to write.")
 @flags_of(DsmOptions)
 @jobs_option
 def dsm(source: tuple[str, ...], out: str, jobs: int | str, **flags: Any) -> int:

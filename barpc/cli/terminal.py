@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 
 EXIT_GATE = 3
-MOST_LINES = 60  # of a summary, whatever its size
+MOST_LINES = 14  # of a summary, whatever its size; with -v any number
+_FIRST = 3  # sentences of the results that come before reservations: how they agree, what moved, how sure
+_COMMAND = "  "  # before a command to copy
 _TERMINAL_COLUMNS = 80  # columns of a terminal
 _LIMITS = {
     "views": "{:,} images, none with a reservation: all {}",
@@ -88,7 +90,7 @@ def tell(data: object, *lines: object) -> None:
 def tell_gate(headline: str, reasons: list[str]) -> int:
     """Say why a command that finished does not pass; its exit code."""
     more = [f"and {len(reasons) - _REASONS} more"] if len(reasons) > _REASONS else []
-    say(" ".join([f"exit code {EXIT_GATE}:", headline, *reasons[:_REASONS], *more]))
+    say(" ".join([f"needs review (exit code {EXIT_GATE}):", headline, *reasons[:_REASONS], *more]))
     return EXIT_GATE
 
 
@@ -104,41 +106,48 @@ class Formatter(logging.Formatter):
         return visible(super().formatException(ei))
 
 
-def print_summary(summary: Summary, root: str = "") -> None:
-    """Print tables of views, pairs and control, and the verdict: `MOST_LINES` in a pipe, or 80 columns wide.
+def print_summary(summary: Summary) -> None:
+    """Print verdict, motion, uncertainty, reservations and next commands of a run in at most `MOST_LINES` lines.
 
-    `root`: that of the files that were written.
+    With `-v` every sentence, below the tables of views, pairs and control.
     """
-    from barpc.report.ranking import TABLE_ROWS_SHOWN, VERDICT_SENTENCES, sentences
+    from barpc.report.ranking import sentences
 
-    width, lines = output_width(), sentences(summary)
-    folder = shlex.quote(summary.out_dir or ".")
-    steps = [f"Next: {_step_line(step, folder)}" for step in summary.next]
-    counted = width and max(width, _TERMINAL_COLUMNS)  # nothing is dropped because a terminal is narrow
-    for rows in range(TABLE_ROWS_SHOWN, 0, -1):
-        tables = _tables(summary, rows)
-        room = MOST_LINES - 2 - bool(root) - sum(_height(table, counted) for table in tables)
-        room -= sum(len(_wrapped(step, counted)) for step in steps)
-        if room >= min(len(lines), VERDICT_SENTENCES):
-            break
-    for title, texts, more in tables:
-        _echo_table(title, texts, width, more)
-    echo(summary.headline, bold=True, fg=_COLORS[summary.status])
-    _echo_lines(_fitting(lines, room, counted), width)
-    if summary.out_dir:
-        echo(f"Written to {summary.out_dir}")
-        if root:
-            echo(f"Root: {root}")
-    _echo_lines(steps, width)
-
-
-def _step_line(step: StepEntry, folder: str) -> str:
-    """Return a step as a line, its commands with the folder of the run."""
-    commands = "; ".join(command.replace(" . ", f" {folder} ") for command in step.commands)
-    return f"{step.text[:-1]}: {commands}" if commands else step.text
+    width, folder = output_width(), shlex.quote(summary.out_dir or ".")
+    results, wrong = sentences(summary)
+    first, rest = results[:_FIRST], results[_FIRST:]
+    head = summary.headline if summary.passed else f"{summary.headline[:-1]} (exit code {EXIT_GATE})."
+    written = [f"Written to {summary.out_dir} (tables: -v, or report.html there)"] * bool(summary.out_dir)
+    steps = [line for step in summary.next if step.kind != "review" for line in _step_lines(step, folder)]
+    if _general("verbose"):
+        for title, texts, more in _tables(summary):
+            _echo_table(title, texts, width, more)
+    else:
+        counted = width and max(width, _TERMINAL_COLUMNS)  # nothing is dropped because a terminal is narrow
+        room = MOST_LINES - 1 - sum(len(_wrapped(line, counted)) for line in [head, *first, *written])
+        num = len(wrong) + len(rest)
+        wrong, steps, rest = _fitting((wrong, steps, rest), room, counted)
+        left = num - len(wrong) - len(rest)
+        wrong += [f"And {left} more: -v, or report.html."] * bool(left)
+    echo(head, bold=True, fg=_COLORS[summary.status])
+    _echo_lines([*first, *rest, *wrong, *written, *steps], width)
 
 
-def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str]]:
+def _step_lines(step: StepEntry, folder: str) -> list[str]:
+    """Return a step and its commands as lines, with the folder of the run."""
+    return [step.text, *(_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)]
+
+
+def _fitting(groups: Sequence[Sequence[str]], room: int, width: int | None) -> Iterator[list[str]]:
+    """Yield of each group the first lines that there is room for, when those of the groups before it are taken."""
+    for lines in groups:
+        ends = accumulate(len(_wrapped(line, width)) for line in lines)
+        taken = [(line, end) for line, end in zip(lines, ends, strict=True) if end <= room]
+        room -= taken[-1][1] if taken else 0
+        yield [line for line, _ in taken]
+
+
+def _tables(summary: Summary) -> list[tuple[str, list[list[str]], str]]:
     """Return titles, cells and a remark on omitted rows: of many rows the worst of those beyond a limit are kept."""
     from barpc.report import ranking
     from barpc.report.records import table
@@ -147,6 +156,7 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     from barpc.report.summary.pairs import PairEntry
     from barpc.report.summary.views import ViewEntry
 
+    rows = ranking.TABLE_ROWS_SHOWN
     views, pairs, adjusted = summary.views, summary.pairs, summary.adjusted
     some_views = views if len(views) <= rows else ranking.flagged(views)[:rows]
     some_pairs = pairs if len(pairs) <= rows else ranking.torn(pairs)[:rows]
@@ -172,23 +182,10 @@ def _tables(summary: Summary, rows: int) -> list[tuple[str, list[list[str]], str
     return found
 
 
-def _height(table: tuple[str, list[list[str]], str], width: int | None) -> int:
-    """Return the number of lines of a table with its title, its remark and the empty line behind."""
-    title, texts, more = table
-    return (len(_wrapped(title, width)) + len(layout(texts, width)) if texts else 0) + bool(more) + 1
-
-
-def _fitting(lines: Sequence[str], room: int, width: int | None) -> list[str]:
-    """Return so many sentences as there is room for, and how many more there are."""
-    heights = [len(_wrapped(line, width)) for line in lines]
-    if sum(heights) <= room:
-        return list(lines)
-    num = sum(total <= room - 1 for total in accumulate(heights))
-    return [*lines[:num], f"And {len(lines) - num} more: verdict in summary.json."]
-
-
 def _wrapped(text: str, width: int | None) -> list[str]:
-    return [text] if width is None else textwrap.wrap(text, width, break_on_hyphens=False) or [""]
+    """Return the lines of a text; a command is one, as it is copied."""
+    whole = width is None or text.startswith(_COMMAND)
+    return [text] if whole else textwrap.wrap(text, width or 1, break_on_hyphens=False) or [""]
 
 
 def print_comparison(comparison: Mapping[str, Any]) -> None:
@@ -269,7 +266,7 @@ def _echo_table(title: str, table: Sequence[Sequence[str]], width: int | None, m
 
 def _echo_lines(lines: Sequence[str], width: int | None) -> None:
     for line in lines:
-        echo(line if width is None else textwrap.fill(line, width, break_on_hyphens=False))
+        echo("\n".join(_wrapped(line, width)))
 
 
 def _three_decimals(value: float | None) -> str:

@@ -67,6 +67,7 @@ def load_views(
     images: Sequence[Image],
     *,
     min_views: int = 2,
+    control: bool = False,
     keep_going: bool = False,
     band: int = 1,
     distinct: bool = True,
@@ -76,16 +77,18 @@ def load_views(
 ) -> LoadedViews:
     """Read the camera of every image, in the order of their names: files, perhaps with choices behind them, or views.
 
-    With `keep_going` a bad file (ImageError, RpcError) is left out instead of stopping; `band` will be read, from 1;
-    `distinct`: an image that is there twice, also as other files or under another RPC (see `Twins`), is refused;
-    `hosts`: others than this machine from which files may be read (`RunOptions.allow_remote`). InputError for too few
+    `control`: one image would be enough with control. With `keep_going` a bad file (ImageError, RpcError) is left out
+    instead of stopping; `band` will be read, from 1; `distinct`: an image that is there twice, also as other files or
+    under another RPC (see `Twins`), is refused; `hosts`: others than this machine from which files may be read
+    (`RunOptions.allow_remote`). InputError for too few
     images, the same image twice, or a name that the files of a run cannot carry.
     """
     files = [plain_path(image_path(image, hosts)) for image in images]
     if len(files) < min_views:
         found = files[0] if files else "none"
-        alone = "; one alone is adjusted by ground control points (--gcp)" if len(files) == 1 else ""
-        raise InputError(f"{len(files)} image(s) given ({found}): at least {min_views} that overlap are needed{alone}")
+        alone = "; one alone is adjusted by ground control points (--gcp)" if control and len(files) == 1 else ""
+        num = f"{len(files)} image{'s' * (len(files) != 1)}"
+        raise InputError(f"{num} given ({found}): at least {min_views} that overlap are needed{alone}")
     given = sorted(zip(unique_names(files), files, images, strict=True), key=lambda row: row[:2])
     how = (band, distinct, tuple(hosts))
     opened, spent = _read_all(given, how, executor if len(given) > GROUP else None, progress)

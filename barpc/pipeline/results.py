@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,10 @@ class RunResult:
         record, adjusted = self.record, self.record.adjusted
         shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
         heads, *rows = shown.texts
-        return html_table(shown.caption, rows, heads)
+        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in record.reasons)
+        page = Path(record.out_dir) / "report.html" if record.out_dir else None
+        link = f'<a href="{escape(str(page))}">report.html</a>' if page is not None and page.is_file() else ""
+        return html_table(shown.caption, rows, heads) + f"<ul>{reasons}</ul>" * bool(reasons) + link
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -339,6 +339,7 @@ def _with_views(
     least = 1 if options.gcp or options.reference else 2  # one image and control are enough
     how: dict[str, Any] = {
         "min_views": least,
+        "control": kind == "adjust" and options.stop_after != "matching",
         "keep_going": options.keep_going,
         "band": options.tie.band,
         "hosts": options.allow_remote,

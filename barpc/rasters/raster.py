@@ -10,6 +10,7 @@ process for bytes: it sees nothing else, and only this process speaks with the h
 from __future__ import annotations
 
 import os
+import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -97,7 +98,18 @@ def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iter
             yield dataset
     except RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
+        if driver == "GTiff" and (damage := _damage_of(file, reason)):
+            raise ImageError(f"{name}: {damage}; copy it again") from error
         raise ImageError(f"{name}: cannot be read as {driver}: {reason}") from error
+
+
+def _damage_of(file: PathOrUrl, reason: str) -> str:
+    """Return the damage of a TIFF file by GDAL's message, in words; empty where that is another error."""
+    directory = re.search(r"Failed to read directory at offset (\d+)", reason)
+    size = 0 if isinstance(file, Remote) else file.stat().st_size
+    if directory and 0 < size <= int(directory[1]):
+        return f"is cut off after {size:,} bytes (its directory begins at {int(directory[1]):,})"
+    return f"is cut off or damaged ({reason})" if directory or "TIFFReadEncoded" in reason else ""
 
 
 def _open_dataset(file: PathOrUrl, driver: str) -> Any:

@@ -28,7 +28,7 @@ from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, figure, known, metres
+from barpc.report.summary.words import counted, figure, known, metres, two_digits
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
@@ -158,6 +158,8 @@ def ground_map(files: RunFiles) -> str:
         if outline
     }
     named = worst_first([view for _, view, _ in drawn if view.name in middles])
+    shown = map_labels([(view, middles[view.name]) for view in named], taken, triangles)
+    taken += [(x, y, 4.1 * len(name)) for _, name, x, y in shown] + triangles
     text: str = template("drawings.svg.j2").module.ground(
         plane=plane,
         lines=lines,
@@ -168,7 +170,11 @@ def ground_map(files: RunFiles) -> str:
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
         gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
         pairs=_pair_lines(middles, files),
-        shown=map_labels([(view, middles[view.name]) for view in named], taken, triangles),
+        shown=shown,
+        misses=_misses(summary.gcps, plane),
+        labels=_point_labels(
+            [(point.name, *plane(at).tolist()) for (*_, point), at in zip(points, placed, strict=True)], taken
+        ),
         marks=[
             (kind, "doubted" * doubted(point), point.name, x, y, up)
             for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)
@@ -176,6 +182,39 @@ def ground_map(files: RunFiles) -> str:
         summary=summary,
     )
     return text
+
+
+def _misses_in_plan(points: Sequence[GcpEntry]) -> Array:
+    """Return residuals (n, 2) of GCPs, east and north [m]; NaN where unknown."""
+    return np.array([point.residual_enu_m[:2] for point in points], dtype=np.float64).reshape(-1, 2)
+
+
+def largest_miss(points: Sequence[GcpEntry]) -> float:
+    """Return the longest residual of GCPs in plan [m]; 0 where none is known."""
+    return float(np.nan_to_num(np.hypot(*_misses_in_plan(points).T)).max(initial=0.0))
+
+
+def _misses(points: Sequence[GcpEntry], plane: Plane) -> list[tuple[list[Array], list[Array]]]:
+    """Return arrows of the residuals of GCPs in plan, from the points that are drawn; the longest has one length."""
+    scale, found = 2 * _ARROW_LENGTH / (largest_miss(points) or 1.0), []
+    for point, vector in zip(evenly(points, MAX_SHOWN), _misses_in_plan(evenly(points, MAX_SHOWN)), strict=True):
+        if np.isfinite(vector).all() and vector.any():
+            shaft = vector * [scale, -scale]
+            found.append(_arrow(plane(np.array([point.lon, point.lat])) + shaft / 2, shaft))
+    return found
+
+
+def _point_labels(points: Sequence[tuple[str, float, float]], taken: OccupiedAreas) -> list[tuple[str, float, float]]:
+    """Return names of points with where they begin, right of their marks or left of these, where there is room."""
+    taken, found = list(taken), []
+    for name, x, y in points:
+        half = 3.6 * len(name)
+        for middle in (x + 8.0 + half, x - 8.0 - half):
+            if half < middle < WIDTH - half and _is_free(middle, y, half, taken):
+                taken.append((middle, y, half))
+                found.append((name, middle - half, y + 4.0))
+                break
+    return found
 
 
 def doubted(point: GcpEntry | CheckPointEntry) -> bool:
@@ -334,7 +373,7 @@ def residual_panels(
 
 
 def _px(length: float) -> str:
-    return f"{float(f'{length:.2g}'):g} px"  # two digits, and no power of ten for residuals of hundreds of pixels
+    return f"{two_digits(length)} px"
 
 
 def panel_box(view: ViewEntry) -> Array:

@@ -1,4 +1,4 @@
-"""Next steps of a run: files to hand over, inputs that would improve it with their expected gain, parts to review."""
+"""Next steps of a run: files to use, inputs that would improve it with their expected gain, parts to review."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def next_steps(summary: Summary, added: Added | None = None) -> tuple[StepEntry,
 
     `added` is the effect of its images on those of an earlier run, where they were added to one.
     """
-    use = {"adjust": _hand_over, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
+    use = {"adjust": _use, "check": _adjust_checked, "match": _adjust_matched}[summary.kind]
     if added is not None and added.contradicted is not None:
         use = partial(_update, added)
     return (*use(summary), *_improve(summary), *_review(summary))
 
 
-# --- files to hand over ------------------------------------------------------------------------------------
+# --- files to use -------------------------------------------------------------------------------------------
 
 
-def _hand_over(summary: Summary) -> Iterator[StepEntry]:
+def _use(summary: Summary) -> Iterator[StepEntry]:
     """Yield the files of the images without reservation, and the commands that such images are enough for."""
     good = [view for view in summary.views if view.outputs and not view.advice]
     if not good:
@@ -65,11 +65,10 @@ def _hand_over(summary: Summary) -> Iterator[StepEntry]:
     best = ""
     if heights:
         pair = min(heights, key=lambda pair: pair.height_m_per_px or np.inf)
-        best = f"; best pair for heights: {pair.a} - {pair.b}, {metres(pair.height_m_per_px or np.nan)} per pixel"
-        best += " (cars and asp are exported as s2p is)"
+        best = f" Best pair for heights: {pair.a} - {pair.b} (a pixel is {metres(pair.height_m_per_px or np.nan)})."
         commands = ["barpc dsm . -o dsm.tif", "barpc export . s2p --to s2p", *commands]
-    start = "Hand over" if summary.passed else "After review, hand over"
-    yield StepEntry("use", f"{start} {listed(files, NAMED)}{best}.", tuple(commands))
+    start = "Use" if summary.passed else "After review, use"
+    yield StepEntry("use", f"{start} {listed(files, NAMED)}.{best}", tuple(commands))
 
 
 def _update(added: Added, summary: Summary) -> Iterator[StepEntry]:
@@ -105,18 +104,18 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         then = _sigma_with(covariance, *_dem_observations(options))
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
-            words.append(f"with a DEM of known vertical datum (--dem, --geoid): height to about {metres(then[2])}")
+            words.append(f"--dem FILE --geoid NAME would give {metres(then[2])} up")
     up = now[2] * _height_ratio(summary, scene)
     if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))
-        words.append(f"with a third image {NEW_ANGLE:g} deg from both: height to about {metres(up)}")
+        words.append(f"a third image {NEW_ANGLE:g} deg from both would give {metres(up)} up")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
     if (now > LEAST_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
         accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
-        words.append(f"with {NUM_GCPS} GCPs accurate to {accuracy} (--gcp): to about {lengths(then)}")
+        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} would give {lengths(then)}")
     if found:
-        text = f"The scene's position is uncertain by {lengths(now)} (east, north, up; 1 sigma); {'; '.join(words)}."
+        text = f"To improve the position: {'; '.join(words)}."
         yield StepEntry("improve", text, expected=tuple(found), part="gauge")
 
 
@@ -193,7 +192,7 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         rest = len(views) - len(alike)
         more = f", then at {counted(rest, 'more image')}" if rest else ""
         part = _REPORT_PARTS.get(views[0].cause or "", "images")
-        yield StepEntry("review", f"Look at {listed(alike, NAMED)} ({label}){more}.", part=part)
+        yield StepEntry("review", f"Review {listed(alike, NAMED)} ({label}){more}.", part=part)
     elif summary.left_out:
         names = listed([one.path for one in summary.left_out], NAMED)
         yield StepEntry("review", f"Check the files that were left out: {names}.")

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from barpc.base.errors import visible
 from barpc.base.statistics import LARGEST
-from barpc.report.maps import doubted, ground_map, residual_panels, template
+from barpc.report.maps import doubted, ground_map, largest_miss, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.ranking import (
     GOOD_RMSE,
@@ -37,7 +38,7 @@ from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, Held
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, largest
+from barpc.report.summary.words import NAMED, largest, metres
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
@@ -70,7 +71,7 @@ def page_of(files: RunFiles) -> str:
             summary=summary,
             sections=shown,
             keys={section.key: section.question for section in shown},
-            verdict=sentences(summary),
+            verdict=[*chain.from_iterable(sentences(summary))],
             large=len(summary.views) > TABLE_ROWS_SHOWN,
             shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,
@@ -118,7 +119,7 @@ _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
     "fits": ("Refitted RPCs against the corrected cameras, on independent points", ViewEntry, ViewEntry.FITS),
 }
 """Key of a table -> its caption, and the columns of its records."""
-_FOLDED = "places", "control", "decided", "again", "options"
+_FOLDED = "places", "control", "decided", "again", "fits", "files", "options"
 
 
 def _tables_of(
@@ -180,11 +181,13 @@ def _map_section(files: RunFiles) -> Section:
     links = [(number[pair.a], number[pair.b]) for pair in summary.pairs]
     partners = np.bincount(np.array(links, dtype=np.int64).ravel(), minlength=num)
     lonely = [view.name for view, n in zip(summary.views, partners, strict=True) if n == 1 and num > 2]
+    miss = largest_miss(summary.gcps)
     drawn = {
         "Footprints at the altitude of the scene": True,
         "those that need review on top": any(view.advice for view in summary.views),
         "dots: tie points": len(files.points),
         f"triangles: GCPs{', red where they contradict others' * any(map(doubted, summary.gcps))}": summary.gcps,
+        f"arrows: their residuals in plan, at most {metres(miss)}": miss,
         "inverted triangles: check points": summary.check_points,
         "thicker lines: more matches": len(links) > 1,
         "dashed: tie points that move": any(one.box for one in (summary.scene.explanations if summary.scene else ())),

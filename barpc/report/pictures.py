@@ -28,7 +28,8 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             evenly((seen.xy[rows] + 0.5) * (box / view.size), _DOTS) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
-        counts = f"{counted(view.num_observations, 'tie point')} (blue), {view.num_rejected} rejected (red)"
+        used, *rest = (f"{count} {name}" for name, count in view.counts.items())
+        counts = f"tie points: {used} (blue){'; ' * bool(rest)}{', '.join(rest)}{' (red)' * bool(rest)}"
         text = template("drawings.svg.j2").module.thumbnail(
             number=k,
             view=view,
@@ -89,7 +90,8 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
     draw = template("drawings.svg.j2").module.strip
     words = (
         "{0.image}, the worst pair, at {0.tiles} of its tie points, {0.half_px:.0f} px to every side, resampled along "
-        "epipolar lines: with right cameras a feature stands at one height in all rows; shifts along it are heights."
+        "epipolar lines. With correct cameras a feature lies at one height in every row; shifts along "
+        "the row are due to terrain height."
     )
     told = [(one, words.format(one)) for one in files.strips]
     return [(draw(one, said, WIDTH, WIDTH * one.size[1] / one.size[0]), said) for one, said in told]

@@ -17,7 +17,7 @@ from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_
 from barpc.report.ranking import GOOD_RMSE
 from barpc.report.summary.block import AXES, LeftEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, counted, enu, known, metres
+from barpc.report.summary.words import CAUSES, NAMED, counted, enu, known, metres, two_digits
 from barpc.report.unseen import unseen_parts
 from barpc.scene import GroundPoints
 from barpc.sensor.rpc import RPC
@@ -28,6 +28,7 @@ ENOUGH_GCPS = 3  # Control points that constrain a view without any tie point
 WORST_LEFT = 0.15  # px: a larger misfit of one RPC anywhere needs review
 NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher states: more needs review
 
+_WHOLE = 0.9  # share of the rows or columns that is the whole image
 _CONTROL_WORDS = {
     "rejected": "{} rejected, as the others contradict {}: check coordinates, axes and image positions",
     "contradicts": "{} with residuals above 4 standard deviations, used nevertheless: the stated accuracies are too "
@@ -83,7 +84,7 @@ def _poorly_fitted_parts(view: ViewEntry, adjustment: Adjustment) -> Causes:
         if one.image == view.name and matters(one) and (what := inconsistency(one)):
             place, cause = one.place, "clouds, water, change there"
             if one.axis == AXES[0] and one.rejected <= MANY_REJECTED:  # nothing on the ground is as long as the pass
-                place, cause = f"{place}, over all rows,", "detectors or resampling"
+                place, cause = f"{place}, over all rows", "detectors or resampling"
             yield "place", {"place": place, "what": what, "cause": cause}
 
 
@@ -174,21 +175,20 @@ def inconsistency(one: LeftEntry) -> str:
     if one.moving:
         return ""
     if one.rejected > MANY_REJECTED:
+        far = two_digits(one.rejected_median_px)
         return (
-            f"{100 * one.rejected:.0f} % of their tie points contradict the others, half of these by more than "
-            f"{one.rejected_median_px:.2f} px"
+            f"{100 * one.rejected:.0f} % of the tie points disagree with the rest of the image, typically by {far} px"
         )
-    return f"their tie points share a residual of {one.off_px:.2f} px" if one.off_px > SMOOTH_LEFT else ""
+    return f"the tie points share a residual of {one.off_px:.2f} px" if one.off_px > SMOOTH_LEFT else ""
 
 
 def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
     """Return the region with most of a view's rejected tie points in words; empty without one."""
     for one in left_entries(adjustment):
         if one.image == view.name and one.rejected > MANY_REJECTED and not one.moving:
-            return (
-                f"; most in {one.place}, where {100 * one.rejected:.0f} % were, half of these by more than "
-                f"{one.rejected_median_px:.2f} px"
-            )
+            whole = one.last - one.first > _WHOLE * view.size[AXES.index(one.axis)]
+            far = f"typically by {two_digits(one.rejected_median_px)} px"
+            return f", {far}" if whole else f"; most in {one.place} ({100 * one.rejected:.0f} %, {far})"
     return ""
 
 
@@ -346,16 +346,20 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
     if not terrain.total:
         yield from ["The DEM constrains nothing: there are no tie points."] * (not by_reference)
         return
-    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'tie point')}"
-    if terrain.held:
-        single = f"{metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)} per point"
-        if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
-            single += f" ({terrain.alike:.1f} correlated heights count as one)"
-        yield f"{held}. Assumed error: {single}, and {metres(terrain.bias)} common to all."
-    else:
-        yield f"{held}: the DEM has no height where one is needed."
-    lie = f"; they lie {terrain.offset:+.1f} m above it (median; NMAD {terrain.spread:.1f} m)" if terrain.known else ""
-    yield f"The DEM covers {100 * terrain.known / terrain.total:.0f} % of the tie points{lie}."
+    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'used tie point')}"
+    covers = f"; the DEM covers {100 * terrain.known / terrain.total:.0f} %" if terrain.known < terrain.total else ""
+    if not terrain.held:
+        yield f"{held}: the DEM has no height where one is needed{covers}."
+        return
+    yield f"{held}{covers}."
+    single = metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)
+    measured = ""
+    if terrain.known:
+        lie = f"they lie {metres(abs(terrain.offset))} {'above' if terrain.offset > 0 else 'below'} it"
+        measured = f"; measured: {lie} (median; scatter {metres(terrain.spread)})"
+    yield f"DEM accuracy assumed: {metres(terrain.bias)} shared by all points, {single} each{measured}."
+    if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
+        yield f"DEM errors are correlated: {terrain.alike:.1f} points count as one."
 
 
 CONTROL_WORDS = {"dem": "the DEM", "gcps": "the GCPs", "reference": "the reference"}

@@ -57,8 +57,8 @@ def torn(pairs: Sequence[PairEntry]) -> list[PairEntry]:
     return [pair for pair in worst_pairs(pairs) if offset_of(pair) > GOOD_RMSE]
 
 
-def sentences(summary: Summary) -> list[str]:
-    """Return the verdict, one sentence for all images of one cause, one for all files left out for one reason."""
+def sentences(summary: Summary) -> tuple[list[str], list[str]]:
+    """Return the results and the reservations: a sentence for all images of a cause, or files of a reason."""
     alike: dict[tuple[str, str], list[tuple[str, str]]] = {}  # names and sentences
     for view in flagged(summary.views):
         alike.setdefault((view.status, view.cause or view.advice), []).append((view.name, view.reservation))
@@ -66,13 +66,9 @@ def sentences(summary: Summary) -> list[str]:
         why = file.reason.replace(file.path, "").lstrip(": ")
         alike.setdefault(("", why), []).append((file.path, file.reason_text))
     own = {text for found in alike.values() for _, text in found}
-    rest = [line for line in summary.verdict if line not in own]
-    place = next((k for k, line in enumerate(summary.verdict) if line in own), len(rest))
-    return [
-        *rest[:place],
-        *(line for why, found in alike.items() for line in _status_sentences(*why, found)),
-        *rest[place:],
-    ]
+    wrong = [line for why, found in alike.items() for line in _status_sentences(*why, found)]
+    results = [line for line in summary.verdict if line not in {*own, *summary.reasons}]
+    return results, wrong + [line for line in summary.reasons if line not in own]
 
 
 def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:

@@ -52,7 +52,7 @@ _IMAGE_CHECKED = "The image was checked"
 _ALL_WELL = {
     "adjust": ("The image is adjusted", "Both images are adjusted", "All {} images are adjusted"),
     "check": (_IMAGE_CHECKED, "The cameras of both images agree", "The cameras of all {} images agree"),
-    "match": (_IMAGE_CHECKED, "Both images are tied together", "All {} images are tied together"),
+    "match": (_IMAGE_CHECKED, "Both images are matched", "All {} images are matched"),
 }
 """Kind of a run -> its headline for one, two and more images without reservation."""
 
@@ -169,13 +169,16 @@ def _of_image_model(found: Adjustment) -> Iterator[str]:
     """Yield the selection of an affine in the image, and the uncertainty of the scene's shape with it."""
     if found.in_space_rms is None:
         return
-    tilts, bends = (lengths(found.gauge.motion_sigma[part]) for part in (_SHAPE[:2], _SHAPE[2:]))
     yield (
-        f"Check tie points keep residuals of {found.in_space_rms:.3f} px with a rotation and translation an image, "
-        f"of {median(found.held_out_rms):.3f} px with an affine in each image, which was selected. Possible "
-        "causes: images rotated, resampled or cropped after their RPCs were made, or RPCs of other images. At "
-        f"{metres(found.gauge.radius)} from the scene's middle its heights have standard deviations of {tilts} by its "
-        f"tilts (east, north), over the scene of {bends} by its twist and bending (twist, east, north)."
+        f"Rotations and translations leave {found.in_space_rms:.3f} px at check tie points, an affine transform per "
+        f"image {median(found.held_out_rms):.3f} px: the affine is used. This is unusual: was an image resampled, "
+        "or does its RPC belong to another image?"
+    )
+    (east, north), (*bends,) = (found.gauge.motion_sigma[part] for part in (_SHAPE[:2], _SHAPE[2:]))
+    yield (
+        f"The scene may be tilted, by {metres(east)} at its eastern and {metres(north)} at its northern edge "
+        f"({metres(found.gauge.radius)} out), and bent, by {metres(max(bends))}. Add GCPs or a DEM before using "
+        "heights."
     )
 
 
@@ -205,7 +208,7 @@ def _unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], 
     said = {view.name for view in views if view.cause in _SAY_WHERE}
     worst: dict[str, tuple[bool, str]] = {}
     regions: list[tuple[LeftEntry | HeldOutEntry, str]] = [
-        (one, f"{one.place.capitalize()} of {one.image} are inconsistent with the rest: {what}.")
+        (one, f"In {one.place} of {one.image} {what}.")
         for one in left_entries(adjustment)
         if (what := inconsistency(one))
     ]
@@ -297,6 +300,9 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         yield f"Tie points of {tied} agree to {after:.3f} px{was}."
     else:
         yield "There are no tie points: control alone constrains the cameras."
+    if len(run.tracks) or gcps is not None:
+        yield f"The scene as a whole moved by {enu(gauge.shift)}."
+    yield from _known_lines(run, run.adjustment, views)
     if radars := [_clocks(view) for view in views if view.correction and view.correction.timing_sigma]:
         yield f"Radar timing corrections: {listed(radars, NAMED)}."
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
@@ -314,15 +320,12 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from _unmet_places(run, run.adjustment, views, matter=False)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
-    if len(run.tracks) or gcps is not None:
-        yield f"The scene as a whole moved by {enu(gauge.shift)}."
     yield from reference_lines(run)
     if (heights := run.adjustment.altimetry) is not None and not heights.why_not:
         yield (
             f"{heights.agree} of {heights.near} altimetry heights agree with the surface of the tie points to "
             f"{metres(heights.spread)} ({metres(heights.expected)} expected); they shifted it by {enu(heights.motion)}."
         )
-    yield from _known_lines(run, run.adjustment, views)
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))

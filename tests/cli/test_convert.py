@@ -461,7 +461,8 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     assert last == "1 image written, 1 of 2 readings differ from the camera by up to 2e-06 px."
     assert said.err.splitlines() == [
         "barpc: not tried: 3",
-        f"barpc: exit code 3: The hand-off needs review. {out / 'scene.vrt'}: gdal reads it with an error of 2.0e-06 "
+        f"barpc: needs review (exit code 3): The hand-off needs review. {out / 'scene.vrt'}: gdal reads it with an "
+        "error of 2.0e-06 "
         f"px. {out / 'scene_RPC.TXT'}: rpcm no field.",
     ]
     assert run("convert", str(image), *words) == 1  # the folder is not empty

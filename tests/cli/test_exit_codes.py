@@ -25,7 +25,7 @@ def assert_told(said, *words):
     """Exit code 3, and the last line says why."""
     assert said.code == 3, said
     last = said.err.strip().splitlines()[-1]
-    assert last.startswith("barpc: exit code 3: "), said
+    assert last.startswith("barpc: needs review (exit code 3): "), said
     for word in words:
         assert word in last, said
 
@@ -53,7 +53,7 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     few += [row for row in rows if row.startswith("view_02")][:20]
     (tmp_path / "few.csv").write_text("\n".join([head, *few]))
     said = command("adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out")
-    assert_told(said, "1 image needs review", "view_02: weakly tied")
+    assert_told(said, "1 image needs review", "view_02: weakly connected")
 
 
 def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # noqa: F811

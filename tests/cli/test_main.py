@@ -154,11 +154,11 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
-        (KeyboardInterrupt(), 130, "interrupted; run the same command again to go on"),
-        (_from(KeyboardInterrupt(), click.Abort()), 130, "interrupted; run the same command again to go on"),
+        (KeyboardInterrupt(), 130, "interrupted; nothing was kept"),
+        (_from(KeyboardInterrupt(), click.Abort()), 130, "interrupted; nothing was kept"),
         (_from(EOFError("x"), click.Abort()), 1, "unexpected EOFError: x; this is a bug: please report what --debug "
          "shows"),
-        (click.Abort(), 130, "interrupted; run the same command again to go on"),
+        (click.Abort(), 130, "interrupted; nothing was kept"),
         (click.UsageError("no"), 2, "no (see 'barpc --help')"),
         (click.UsageError("no", click.Context(click.Command("x"), info_name="x")), 2, "no (see 'x --help')"),
         (click.ClickException("no"), 1, "no (see 'barpc --help')"),
@@ -229,7 +229,11 @@ def test_only_a_process_of_its_own_has_its_garbage_left_alone(
     with pytest.raises(SystemExit):
         main()
     assert asked == [50_000, "streams", True, "freeze"]
-    assert given == [{"args": ["info", "a b"], "prog_name": "barpc", "standalone_mode": False}]
+    (one,) = given
+    assert (one.pop("obj").folder, one) == (
+        None,
+        {"args": ["info", "a b"], "prog_name": "barpc", "standalone_mode": False},
+    )
 
 
 # --- the log ----------------------------------------------------------------------------------------------

@@ -161,7 +161,7 @@ def test_a_point_without_a_value_is_nan_or_null_and_the_exit_code_3(
     assert run(*words) == 3
     assert capsys.readouterr() == (
         f"col,row\n{col:.6f},{row:.6f}\nnan,nan\nnan,nan\n",
-        "barpc: exit code 3: 2 of 3 points could not be projected\n",
+        "barpc: needs review (exit code 3): 2 of 3 points could not be projected\n",
     )
     assert run(*words, "--json") == 3
     nothing = {"col": None, "row": None}
@@ -223,7 +223,7 @@ def test_triangulate_takes_the_images_that_see_a_point(
     np.testing.assert_allclose(found[:2, 3], 0.0, atol=1e-4)
     assert np.isnan(found[2, :3]).all()
     assert [len(cell.partition(".")[2]) for cell in told.out.splitlines()[1].split(",")] == [10, 10, 4, 4]
-    assert told.err == "barpc: exit code 3: 1 of 3 points could not be intersected\n"
+    assert told.err == "barpc: needs review (exit code 3): 1 of 3 points could not be intersected\n"
 
 
 def test_triangulate_tells_the_root_mean_square_over_the_images(
@@ -235,7 +235,7 @@ def test_triangulate_tells_the_root_mean_square_over_the_images(
     assert run("triangulate", *files, *words, "--json") == 3  # they are pixels apart
     told = capsys.readouterr()
     (point,) = json.loads(told.out)
-    assert told.err.startswith("barpc: exit code 3: 1 of 1 points do not meet: they are up to 1.6")
+    assert told.err.startswith("barpc: needs review (exit code 3): 1 of 1 points do not meet: they are up to 1.6")
     again = np.array([rpc.project([point["lon"], point["lat"], point["alt"]]) for rpc in rpcs])
     expected = np.sqrt(((again - seen) ** 2).sum(axis=1).mean())
     assert expected > 0.3

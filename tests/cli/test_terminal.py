@@ -108,7 +108,7 @@ def test_a_word_of_the_command_is_one_line_on_stderr(capsys: pytest.CaptureFixtu
 )  # fmt: skip
 def test_of_many_reasons_five_are_told(count: int, told: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert tell_gate("It failed.", [f"{n}." for n in range(1, count + 1)]) == 3
-    assert capsys.readouterr() == ("", f"barpc: exit code 3: It failed.{told}\n")
+    assert capsys.readouterr() == ("", f"barpc: needs review (exit code 3): It failed.{told}\n")
 
 
 def test_a_record_of_the_log_is_a_line_and_a_traceback_keeps_its_own() -> None:
@@ -134,8 +134,9 @@ def spoken(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
 
 
 def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
-    spoken: list[tuple[str, dict[str, Any]]],
+    spoken: list[tuple[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
     summary = a_summary(
         [a_view("A"), a_view("B", rmse_before=3.0)],
         [a_pair("A", "B", 77)],
@@ -160,11 +161,14 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
         ("Look here.", {"err": False, "bold": True, "fg": "yellow"}),
         ("One.", {"err": False}),
         ("Two.", {"err": False}),
-        ("Written to out", {"err": False}),
+        ("Written to out (tables: -v, or report.html there)", {"err": False}),
     ]
 
 
-def test_what_holds_the_scene_is_a_table_where_several_sources_do(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_holds_the_scene_is_a_table_where_several_sources_do(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
     entry = DatumEntry("east", 0.5, 0.7, 0.0, 0.0, 0.3, 0.0)
     print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
     title, head, row, *_ = capsys.readouterr().out.splitlines()
@@ -191,6 +195,7 @@ def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
         ("All of it well.", {"err": False, "bold": True, "fg": colour}),
         ("five\ntie-points\nof a view", {"err": False}),
     ]
+    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
     print_summary(a_summary([a_view("A")], status=status))
     assert spoken[2][0] == "Reprojection\nerror of the\ntie points"
 

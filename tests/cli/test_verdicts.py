@@ -197,7 +197,7 @@ def test_two_runs_are_compared_and_one_is_reported_again(
 
 @pytest.mark.parametrize(
     ("quiet", "as_json", "out"),
-    [(False, False, "All well.\n"), (True, False, ""), (True, True, '{\n "a": 1\n}\n')],
+    [(False, False, "All well.\nOne.\n"), (True, False, ""), (True, True, '{\n "a": 1\n}\n')],
 )
 def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     quiet: bool,
@@ -209,14 +209,15 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     for place in ("adjust", "terminal"):
         monkeypatch.setattr(f"barpc.cli.{place}.wants_json", lambda: as_json)
         monkeypatch.setattr(f"barpc.cli.{place}.is_quiet", lambda: quiet)
-    record = a_summary([], reasons=("One.",))
+    record = a_summary([], verdict=("One.",))
     result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True, root="")
     assert _tell_result(result) == 0
     assert capsys.readouterr() == (out, "")
-    result.passed = False
+    result.passed, result.record = False, a_summary([], verdict=("One.",), reasons=("One.",), passed=False)
+    out = out.replace("well.", "well (exit code 3).")
     assert _tell_result(result) == 3
     headline = "" if quiet else "All well. "
-    assert capsys.readouterr() == (out, f"barpc: exit code 3: {headline}One.\n")
+    assert capsys.readouterr() == (out, f"barpc: needs review (exit code 3): {headline}One.\n")
 
 
 def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: pytest.MonkeyPatch) -> None:

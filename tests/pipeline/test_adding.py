@@ -84,7 +84,7 @@ def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: Sim
     said = "\n".join(found.summary["verdict"])
     assert "1 image added to the 11 images of first" in said
     assert "The cameras of first were held as they are written" in said
-    assert found.summary["next"][0]["text"].startswith("Hand over view_0004.vrt")
+    assert found.summary["next"][0]["text"].startswith("Use view_0004.vrt")
     assert "clouds" not in said
     assert found.summary["status"] == whole.summary["status"]
     sound(eleven / "first")
@@ -96,7 +96,7 @@ def test_what_moves_is_written_where_that_is_asked_for(eleven: Path, archive: Pa
     block, before = (BlockPrior.load(eleven / one / "tables/block.npz") for one in ("updated", "first"))
     assert set(before.names) < set(block.names)
     assert "their new cameras are written here" in "\n".join(found.summary["verdict"])
-    assert found.summary["next"][0]["text"].startswith("Hand over")
+    assert found.summary["next"][0]["text"].startswith("Use")
     written = {path.stem for path in (eleven / "updated").glob("*.vrt")}
     said = next(line for line in found.summary["verdict"] if "change by more" in line)
     assert {"view_0004", *(name for name in before.names if name in said)} <= written

@@ -469,5 +469,5 @@ def test_a_fault_is_one_line_and_leaves_nothing(name, scene, tmp_path, monkeypat
         assert not (tmp_path / "out").exists()
     else:
         assert said.code == code
-        assert said.err.startswith("barpc: exit code 3: ") if code == 3 else said.err == ""
+        assert said.err.startswith("barpc: needs review (exit code 3): ") if code == 3 else said.err == ""
         assert (tmp_path / "out/view_00_RPC.TXT").exists()

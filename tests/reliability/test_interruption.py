@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -110,7 +111,7 @@ def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path
     out, err = process.communicate(timeout=600)
     assert process.returncode == 130
     assert out == ""
-    assert err.strip() == "barpc: interrupted; run the same command again to go on"
+    assert re.fullmatch(r"barpc: interrupted; finished tasks are kept: the same command goes on at \w.*\n", err)
     assert not [path for path in (tmp_path / "out").iterdir() if path.name != ".barpc"]  # it did not finish
     for worker in workers:
         wait_until_gone(worker)

@@ -158,24 +158,32 @@ def _(s, far, side):
 
 
 @says(
-    r"DEM heights constrain (\d+) of (\d+) tie points?(: the DEM has no height .*|\. "
-    rf"Assumed error: {LENGTH} per point.*)"
+    r"DEM heights constrain (\d+) of (\d+) used tie points?(: the DEM has no height where one is needed)?"
+    r"(?:; the DEM covers (\d+) %)?\."
 )
-def _(s, held, num, rest, sigma):
+def _(s, held, num, nowhere, percent):
     dem = s.scene.dem
     assert (int(held), int(num)) == (dem.num_held, dem.num_tracks)
-    assert ("no height" in rest) == (dem.num_held == 0)
-    assert sigma is None or sigma == metres(dem.sigma_m)
+    assert bool(nowhere) == (dem.num_held == 0)
+    near(percent or "100", 100.0 * dem.num_known / dem.num_tracks)
 
 
-@says(rf"The DEM covers (\d+) % of the tie points(?:; they lie {NUM} m above it \(median; NMAD {NUM} m\))?\.")
-def _(s, percent, offset, spread):
+@says(
+    rf"DEM accuracy assumed: {LENGTH} shared by all points, {LENGTH} each(?:; measured: they lie {LENGTH} "
+    rf"(above|below) it \(median; scatter {LENGTH}\))?\."
+)
+def _(s, _shared, sigma, offset, side, spread):
     dem = s.scene.dem
-    near(percent, 100.0 * dem.num_known / dem.num_tracks)
+    assert dem.sigma_m is None or sigma == metres(dem.sigma_m)
     assert (offset is None) == (dem.num_known == 0)
     if offset:
-        near(offset, dem.offset_m)
-        near(spread, dem.spread_m)
+        assert (offset, spread) == (metres(abs(dem.offset_m)), metres(dem.spread_m))
+        assert (side == "above") == (dem.offset_m > 0)
+
+
+@says(rf"DEM errors are correlated: {NUM} points count as one\.")
+def _(s, alike):
+    near(alike, s.scene.dem.correlated_per_independent)
 
 
 @says(rf"The DEM does not show the terrain of the tie points: its relief is {NUM} times theirs\. .* It was not used\.")
@@ -282,11 +290,11 @@ def figures(view: ViewEntry, text: str) -> None:
 
 
 @says(
-    r"(After review, hand over|Hand over) (.*?)(?: and (\d+) more)?"
-    r"(?:; best pair for heights: (\S+) - (\S+), (.*) per pixel .*)?\."
+    r"(After review, use|Use) (.*?)(?: and (\d+) more)?\."
+    r"(?: Best pair for heights: (\S+) - (\S+) \(a pixel is (.*)\)\.)?"
 )
 def _(s, start, names, more, a, b, per_pixel):
-    assert (start == "Hand over") == s.passed
+    assert (start == "Use") == s.passed
     good = {name for view in s.views if not view.advice for name in view.outputs}
     assert {*names.split(", ")} <= good
     assert len(names.split(", ")) + int(more or 0) == len(good)
@@ -295,18 +303,17 @@ def _(s, start, names, more, a, b, per_pixel):
     assert a is None or not any(view.advice for view in s.views if view.name in (a, b))
 
 
-@says(r"The scene's position is uncertain by (.*?) \(east, north, up; 1 sigma\); (.*)\.")
-def _(s, sigma, gains):
-    assert sigma == ", ".join(map(metres, s.scene.sigma_enu_m))
+@says(r"To improve the position: (.*)\.")
+def _(s, gains):
     (step,) = [step for step in s.next if step.expected]
-    assert gains.count("with ") == len(step.expected)
+    assert gains.count(" would give ") == len(step.expected)
     for one in step.expected:
         better = [a / b for a, b in zip(s.scene.sigma_enu_m, one.sigma_enu_m, strict=True) if b is not None]
         assert max(better) > 1.5
-    assert ("with a DEM" in gains) <= (s.scene.dem is None or s.scene.dem.num_held == 0)
+    assert ("--dem" in gains) <= (s.scene.dem is None or s.scene.dem.num_held == 0)
 
 
-@says(r"Look at (.*?)(?: and \d+ more)? \((.*?)\).*\.")
+@says(r"Review (?!: )(.*?)(?: and \d+ more)? \((.*?)\).*\.")
 def _(s, names, _label):
     assert {*names.split(", ")} <= {view.name for view in s.views if view.advice}
 
@@ -335,15 +342,24 @@ def _(s, model):
     assert model == s.scene.model
 
 
-@says(r"The standard camera model explains all residuals; no extra model was needed\.")
+@says(r"No extra model was needed: in no image are systematic residuals significant \(F test: p above 1e-4\)\.")
 def _(s):
     assert not s.scene.explanations
-    assert not s.scene.left
-    assert any(view.num_observations for view in s.views)
-    for view in s.views:
-        assert (view.systematic_px or 0.0) <= SMOOTH or (view.systematic_p or 1.0) > SURE_P
-        assert (view.rmse_after or 0.0) < 0.5
-        assert (view.held_out_px or 0.0) < 1.0
+    assert min(view.systematic_p for view in s.views) >= 1e-4
+
+
+@says(
+    rf"No extra model was selected(?:: systematic residuals of at most {NUM} px remain \((\S+); F test: p below "
+    r"1e-4 in (\d+) images?\))?\."
+)
+def _(s, size, name, num):
+    assert not s.scene.explanations
+    sure = [view for view in s.views if view.systematic_p is not None and view.systematic_p < 1e-4]
+    assert len(sure) == int(num or 0)
+    if num:
+        largest = max(sure, key=lambda view: (view.systematic_px, view.name))
+        assert largest.name == name
+        assert float(size) == pytest.approx(largest.systematic_px, rel=0.06)
 
 
 @says(r"No extra model that was tested explains the inconsistent residuals\.")
@@ -383,36 +399,37 @@ def _(summary, times):
     assert not summary.passed
 
 
-@says(rf"The squares of the corrections are {NUM} times .* stated accuracies: (.*)\.")
-def _(s, ratio, rest):
+@says(rf"The stated accuracies were kept: the squares of the corrections are {NUM} times those expected\.()()(.*)")
+@says(
+    rf"Corrections are larger than the stated accuracies allow \(ratio of squares {NUM}\): the accuracies of (\d+) "
+    rf"images? were widened, at most {NUM} times \((.*)\)\..*"
+)
+def _(s, ratio, num, times, _rest):
     assert float(ratio) == pytest.approx(s.scene.prior_ratio, rel=0.06)
-    wide = [view for view in s.views if (view.prior_scale or 1.0) > 1.005]
-    assert ("no prior was widened" in rest) == (not wide)
-    if found := re.search(rf"priors of (\d+) images? were widened, at most {NUM} times \((\S+)\)", rest):
-        assert int(found[1]) == len(wide)
-        near(found[2], max(view.prior_scale for view in wide))
+    wide = [view.prior_scale for view in s.views if (view.prior_scale or 1.0) > 1.005]
+    assert int(num or 0) == len(wide)
+    assert not wide or near(times, max(wide)) is None
 
 
-@says(rf"(\d+) of (\d+) observations of tie points \({NUM} %\) were rejected as outliers, the most in (\S+): {NUM} %\.")
-def _(s, cut, num, percent, name, most):
-    gone = sum(view.num_rejected for view in s.views)
-    assert (int(cut), int(num)) == (gone, gone + sum(view.num_observations for view in s.views))
-    assert float(percent) == pytest.approx(100 * gone / int(num), abs=0.051)
-    assert float(percent) > 0 < float(most)
-    assert max(s.views, key=lambda view: view.lost).lost == next(view.lost for view in s.views if view.name == name)
+@says(
+    r"Observations of tie points: (\d+) used, (\d+) check \(independent of the adjustment\), (\d+) rejected as outliers"
+    rf"(?:, (\d+) excluded, as they move together)?\.(?: Most were rejected in (\S+): {NUM} % of those used or "
+    r"rejected\.)?"
+)
+def _(s, *found):
+    *counts, name, most = found
+    names = "num_observations", "num_check", "num_rejected", "num_moving"
+    assert [int(count or 0) for count in counts] == [sum(getattr(view, name) for view in s.views) for name in names]
+    assert sum(int(count or 0) for count in counts) == s.tracks.num_observations
+    assert int(counts[1]) == s.scene.num_held_out
+    assert (name is None) == (int(counts[2]) == 0)
+    if name:
+        (view,) = (view for view in s.views if view.name == name)
+        assert view.lost == max(view.lost for view in s.views)
+        near(most, 100 * view.lost)
 
 
-@says(r"No observation of a tie point was rejected\.")
-def _(s):
-    assert sum(view.num_rejected for view in s.views) == 0 < sum(view.num_observations for view in s.views)
-
-
-@says(r"(\d+) more were held out as independent checks\.")
-def _(s, num):
-    assert int(num) == s.scene.num_held_out
-
-
-@says(r"Independent check tie points fit equally well in all rows, columns and cells of every image\.")
+@says(r"Check tie points fit equally well in all rows, columns and cells of every image\.")
 def _(s):
     assert s.scene.held_out_places == ()
     errors = [view.held_out_px for view in s.views if view.num_observations]
@@ -447,13 +464,13 @@ def _(s, good, num, agreement):
     assert not agreement or s.tracks.num_observations
 
 
-@says(r"There are no tie points in use\.(?: Tied .*)?")
+@says(r"There are no tie points in use\.(?: Connected .*)?")
 def _(s):
     assert not any(s.tracks.by_length.values())
 
 
 @says(
-    r"Tie points connect (all images|the images in (\d+) separate groups)\.(?: Tied to one .*?\.)?"
+    r"Tie points connect (all images|the images in (\d+) separate groups)\.(?: Connected to one .*?\.)?"
     r"((?: \d+.* in \d+.*)?)"
 )
 def _(s, how, groups, lengths):
@@ -464,7 +481,7 @@ def _(s, how, groups, lengths):
         assert s.tracks.by_length[length] == int(count)
 
 
-@says(r"(Mostly|Not in [^:]*): in .*")
+@says(r"(Yes|Not in [^:]*): in .*")
 def _(s, start):
     assert start
 
@@ -518,7 +535,7 @@ def _(s, num):
     assert int(num) == len(s.check_points)
 
 
-@says(rf"(?:Not known for every image|Errors of at most {NUM} px, .*)\. Give other tools .*")
+@says(rf"(?:Not known for every image|Yes, exactly|Errors of at most {NUM} px, .*)\. Give other tools .*")
 def _(s, worst):
     errors = [max(view.fit.max_px) for view in s.views if view.fit]
     assert worst is None or float(worst) == pytest.approx(max(errors), rel=0.06)

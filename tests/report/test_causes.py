@@ -208,13 +208,9 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     found = adjustment(left=left)
     first, second = reasons(found)
     assert first == (
-        "Rows 100-399 of west are inconsistent with the rest: 80 % of their tie points contradict the others, "
-        "half of these by more than "
-        "2.50 px."
+        "In rows 100-399 of west 80 % of the tie points disagree with the rest of the image, typically by 2.5 px."
     )
-    assert (
-        second == "Rows 100-399 of east are inconsistent with the rest: their tie points share a residual of 0.19 px."
-    )
+    assert second == "In rows 100-399 of east the tie points share a residual of 0.19 px."
     assert [one.last for one in left_entries(found)] == [399.0] * 3
     assert reasons(adjustment(left=[interval(0, 0.1, 0.05)])) == []
     assert reasons(adjustment(left=[interval(0, 0.1, 0.09)])) == []  # of less than 0.1 px: a remark

@@ -46,12 +46,12 @@ def test_heights_that_lie_as_far_off_as_the_geoid_seem_to_count_from_it(provenan
         return f"Give --heights {other}, or --heights {present} to confirm the present datum."
 
     assert why == (
-        f"The heights of 6 GCPs lie 46.0 m {side} the ground by the delivered cameras, or by other heights, and the "
-        f"geoid lies 48.0 m {geoid} the ellipsoid here: they seem to be above sea level. {cure('egm96', 'ellipsoidal')}"
+        f"The heights of 6 GCPs lie 46 m {side} the ground by the delivered cameras, or by other heights, and the "
+        f"geoid lies 48 m {geoid} the ellipsoid here: they seem to be above sea level. {cure('egm96', 'ellipsoidal')}"
     )
     (why,) = told(block(sign * 46.0), provenance, -sign * GEOID, converted=True)
     assert (
-        f"the geoid lies 48.0 m {geoid} the ellipsoid here: they seem to be ellipsoidal. {cure('ellipsoidal', 'egm96')}"
+        f"the geoid lies 48 m {geoid} the ellipsoid here: they seem to be ellipsoidal. {cure('ellipsoidal', 'egm96')}"
         in why
     )
 
@@ -67,24 +67,24 @@ def test_what_nothing_settles_is_said_where_it_moves_the_scene(cameras, known, s
     assert len(found) == said
     assert told(block(5.0, cameras, known), INFERRED) == []
     if said:
-        assert "if they are above sea level, the scene is 48.0 m too low" in found[0]
+        assert "if they are above sea level, the scene is 48 m too low" in found[0]
         assert "--heights ellipsoidal, or --heights egm96" in found[0]
-        assert "48.0 m too high" in told(block(5.0, cameras, known), otherwise=-GEOID)[0]
+        assert "48 m too high" in told(block(5.0, cameras, known), otherwise=-GEOID)[0]
 
 
 def test_heights_that_hold_a_part_of_the_scene_move_a_part_of_it():
     half = block(-23.0, 30.0)
     half.gauge.shift[0] = 20.0
     half.datum["gcps"] = np.full(10, 0.5)
-    assert "the scene is 24.0 m too low" in told(half)[0]
+    assert "the scene is 24 m too low" in told(half)[0]
     half.gauge.delivered_sigma[2] = 10.0  # 46 m, of which half came about
-    assert "lie 46.0 m below" in told(half)[0]
+    assert "lie 46 m below" in told(half)[0]
 
 
 def test_other_heights_tell_where_cameras_do_not():
     wide = block(20.0, 500.0)
     assert told(wide, above=((1.0, 6.0),)) == []
-    assert "lie 47.0 m below" in told(wide, above=((-47.0, 6.0),))[0]
+    assert "lie 47 m below" in told(wide, above=((-47.0, 6.0),))[0]
     assert "is not stated" in told(wide, above=((-20.0, 30.0),))[0]
     assert told(block(-150.0), INFERRED) == []  # neither: something else is wrong, and it is not said of the datum
 
@@ -98,14 +98,14 @@ def test_control_that_was_refused_is_held_against_the_others():
     control = SimpleNamespace(used=np.zeros(4, bool), residual=np.tile([0.0, 0.0, 47.0], (4, 1)))
     refused = block(0.0, known=5.0, control=control)
     refused.datum["gcps"] = np.full(10, np.nan)
-    assert "lie 47.0 m below" in told(refused, INFERRED)[0]
+    assert "lie 47 m below" in told(refused, INFERRED)[0]
 
 
 def test_a_dem_is_held_against_the_tie_points_without_what_it_may_be_wrong_by():
     terrain = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 20.0), delivered=(47.0, 0.0, 0.0), beyond=(47 / 22.4, 0, 0))
     one = HeightDatum("heights", "the DEM d.tif", GEOID, DEFAULT)
     (why,) = datum_reasons([one], block(source="heights", terrain=terrain), 0.0)
-    assert "The heights of the DEM d.tif lie 47.0 m below" in why
+    assert "The heights of the DEM d.tif lie 47 m below" in why
     assert "Give --geoid egm96" in why
     (why,) = datum_reasons(
         [replace(one, converted=True, otherwise=48.0)], block(source="heights", terrain=terrain), 0.0
@@ -121,7 +121,7 @@ def test_a_dem_is_held_against_the_tie_points_without_what_it_may_be_wrong_by():
 
 
 @pytest.mark.parametrize(
-    ("lean", "share", "aside"), [(0.27, 1.0, "13.0"), (0.27, 0.5, "6.5"), (1 / 12, 1.0, ""), (0.0, 1, "")]
+    ("lean", "share", "aside"), [(0.27, 1.0, "13"), (0.27, 0.5, "6.5"), (1 / 12, 1.0, ""), (0.0, 1, "")]
 )
 @pytest.mark.parametrize("source", ["gcps", "heights"])
 def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_its_own(source, lean, share, aside):

@@ -48,22 +48,24 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     assert "nothing was matched" in said(record)
     count = len(record.pairs)
     plain = said(matched(record))
-    assert f"{count} pairs tied: {count} by guided" in plain
+    assert "Not all pairs were matched" not in plain
+    assert "Pairs by selection" not in plain
     assert "nothing was matched" not in plain
-    assert "matched again" not in plain
     fewer = ("guided 12 of 100", "guided, loosened 20 of 100")
     other = matched(record, tied_by="structure", decoy_share=0.03, beaten=fewer, num_matches=240, chosen_by="same date")
     text = said(other)
-    assert f"{count} pairs tied: {count - 1} by guided, 1 by structure" in text
-    assert "1 pair matched again" in text
+    assert f"Not all pairs were matched by guided: {count - 1} by guided, 1 by structure." in text
     first = record.pairs[0]
-    assert f"at most 3 % of the matches of a pair are false ({first.a} - {first.b})" in text
+    assert (
+        f"At most 3 % of a pair's matches are false, estimated by searching where none can be ({first.a} - {first.b})"
+        in text
+    )
     assert "Pairs by selection criterion: 1 same date." in text
 
 
 def test_the_matcher_is_said_to_be_asked_for(record):
     tie = {**record.options["tie"], "matcher": "structure"}
-    assert "the requested matcher is structure" in said(
+    assert "Not all pairs were matched by structure: " in said(
         replace(matched(record), options={**record.options, "tie": tie})
     )
 
@@ -75,12 +77,12 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
     assert (
-        "as a polynomial of degree 1 (standard deviation at the first and last row: 12.0 cm): no higher degree was "
+        "as a polynomial of degree 1 (standard deviation at the first and last row: 12 cm): no higher degree was "
         "needed" in plain
     )
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
     assert (
-        "as a polynomial of degree 2 (standard deviation at the first and last row: 12.0 cm, 30.0 cm): degree 1 left "
+        "as a polynomial of degree 2 (standard deviation at the first and last row: 12 cm, 30 cm): degree 1 left "
         in more
     )
     assert "a systematic residual of 0.31 px in B (F test: p = 3e-12; below 1e-4 in 3 images)" in more
@@ -101,18 +103,21 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
 def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed(record):
     plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
     assert "no higher degree was needed" in plain
-    assert "explains all residuals" in plain
+    assert "No extra model was needed: in no image are systematic residuals significant" in plain
     assert "fit equally well" in plain
     text = said(with_views(record, *[{"systematic_p": 0.3}] * 8, {"systematic_p": 9e-69}), held_out_places=())
     assert "no higher degree was needed" not in text
     last = record.views[8].name
+    assert f"px remain ({last}; F test: p below 1e-4 in 1 image)" in text
+    assert "No extra model was needed" not in text
     assert f"no higher degree removes the systematic residuals of {last} (F test: p below 1e-4)" in text
     for cause in ("systematic", "held_out", "wrong_matches", "left"):
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
-        assert "explains all residuals" not in text
+        assert "No extra model was" not in text
         assert "No extra model that was tested explains the inconsistent residuals." in text
         assert "fit equally well" not in text
-    assert "explains all residuals" in said(with_views(record, {"cause": "odd", "advice": "look"}), held_out_places=())
+    odd = with_views(record, *[{"systematic_p": 0.3}] * 8, {"cause": "odd", "advice": "look", "systematic_p": 0.3})
+    assert "No extra model was needed" in said(odd, held_out_places=())
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
     assert "fit equally well" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
@@ -121,18 +126,17 @@ def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert (
-        "The squares of the corrections are 0.7 times those expected from the stated accuracies: no prior was widened."
-        in said(held, prior_ratio=0.7)
+    assert "The stated accuracies were kept: the squares of the corrections are 0.7 times those expected." in said(
+        held, prior_ratio=0.7
     )
     text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
-    assert f"the priors of 2 images were widened, at most 3.2 times ({record.views[1].name})" in text
-    assert "no prior was widened" not in text
+    assert f"the accuracies of 2 images were widened, at most 3.2 times ({record.views[1].name})" in text
+    assert "The stated accuracies were kept" not in text
     assert "Squared corrections" not in said(held, prior_ratio=None)
     assert "Taken as shared" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
     assert (
-        "no prior was widened. As an error common to all images, the stated accuracies were widened 1.8 times."
+        "0.7 times those expected. As an error common to all images, the stated accuracies were widened 1.8 times."
         in shared
     )
 
@@ -141,20 +145,18 @@ def test_the_model_in_the_image_is_said_to_be_better(record):
     assert "Each camera is corrected by rotation+translation." in said(record)
     views = with_views(record, *[{"held_out_px": 0.05}] * 8, {"held_out_px": 0.08})
     text = said(views, rigid_model_px=0.4)
-    assert "Check tie points keep residuals of 0.400 px with a rotation and translation per image, of at most" in text
-    assert "at most 0.080 px with an affine in each image, which was selected" in text
+    least = "at most 0.080 px at check tie points, rotations and translations 0.400 px."
+    assert f"An affine transform per image is used: it leaves {least}" in text
     assert "Each camera is" not in text
 
 
 def test_what_was_cut_and_kept_out_is_counted(record):
     none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
-    assert "No observation of a tie point was rejected." in said(none)
-    text = said(with_views(none, {}, {"num_rejected": 100}), num_held_out=70)
-    most = f"the most in {record.views[1].name}: 50.0 %"
-    assert f"100 of 1000 observations of tie points (10.0 %) were rejected as outliers, {most}." in text
-    assert "70 more were held out as independent checks" in text
-    assert "No observation" not in text
-    assert "took no part, so" not in said(none, num_held_out=0)
+    assert "900 used, 0 check (independent of the adjustment), 0 rejected as outliers." in said(none, num_held_out=0)
+    text = said(with_views(none, {"num_moving": 4}, {"num_rejected": 100}), num_held_out=70)
+    most = f"Most were rejected in {record.views[1].name}: 50.0 % of those used or rejected."
+    counts = "900 used, 70 check (independent of the adjustment), 100 rejected as outliers, 4 excluded, as they move"
+    assert f"Observations of tie points: {counts} together. {most}" in text
 
 
 def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record):
@@ -210,15 +212,15 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     )
     older = with_views(record, *[{"neighbour_correlated_px": None, "systematic_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
-    assert [line.split()[0] for line in found] == ["The", "No"]
+    assert [line.split()[0] for line in found] == ["The", "Observations"]
 
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     calm = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "no prior was widened" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
+    assert "The stated accuracies were kept" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
     slightly = said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
-    assert "the priors of 1 image were widened, at most 1.0 times" in slightly
-    assert "no prior was widened" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
+    assert "the accuracies of 1 image were widened, at most 1.0 times" in slightly
+    assert "The stated accuracies were kept" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
     given = JustificationEntry(
         image="B", systematic_px=None, systematic_p=None, neighbour_correlated_px=0.0, num_images=1
     )
@@ -227,7 +229,8 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
 
 
 def test_where_nothing_won_it_is_said_why(record):
-    assert "The standard camera model explains all residuals" in said(record)
+    assert "No extra model was needed" in said(with_views(record, *[{"systematic_p": 0.3}] * 9))
+    assert "No extra model was selected." in said(with_views(record, {"systematic_p": None}))
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
     assert "No extra model that was tested explains the inconsistent residuals." in text
@@ -254,7 +257,7 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
 
 
 def test_what_took_no_part_is_said_to_agree(record):
-    agrees = "Independent check tie points fit equally well in all rows, columns and cells of every image."
+    agrees = "Check tie points fit equally well in all rows, columns and cells of every image."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)

@@ -80,7 +80,7 @@ def test_rows_that_stand_out_among_all_are_not_said_twice(run: Run) -> None:
     found: Any = replace(changed.adjustment, left=(first,))  # type: ignore[arg-type, type-var]
     reasons = summarize(replace(changed, adjustment=found)).reasons
     assert len(reasons) == 1
-    assert "are inconsistent with the rest" in reasons[0]
+    assert "disagree with the rest" in reasons[0]
 
 
 def test_of_a_view_whose_rpc_is_not_its_own_and_of_plain_least_squares_it_is_not_asked(run: Run) -> None:

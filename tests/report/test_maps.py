@@ -199,10 +199,10 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
         (found,) = drawn.points(f"outline {status}")
         assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "1", "2"]
-    assert drawn.titles("outline adjusted") == ["A: 5 tie points"]
+    assert drawn.titles("outline adjusted") == ["A: 5 used"]
     (dots,) = drawn.all("path", "point")
     assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
-    assert drawn.titles("tie") == ["A - C: 30 matches", "B - C: 70 matches", "A - B: 900 matches"]  # strongest on top
+    assert drawn.titles("tie") == ["A - C: 30 used", "B - C: 70 used", "A - B: 900 used"]  # strongest on top
     middle = [at(outline[0][:-1]).mean(axis=0) for outline in outlines]
     assert drawn.lines("tie")[0] == pytest.approx(np.concatenate([middle[0], middle[2]]), abs=0.006)
     (*_, widest) = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
@@ -289,6 +289,26 @@ def test_a_gcp_that_contradicts_others_is_red_and_the_caption_says_so(status):
     told = caption(files_of(summary, outlines))
     assert ("triangles: GCPs, red where they contradict others." in told) == wrong
     assert told.endswith("triangles: GCPs.") != wrong
+
+
+def test_residuals_of_gcps_are_named_arrows_in_plan_and_the_longest_is_said():
+    views, outlines, _ = scene()
+    east, north = a_gcp("E", 10.0, 0.0), a_gcp("N", 10.002, 0.001)
+    east, north = replace(east, residual_enu_m=(2.0, 0.0, 9.0)), replace(north, residual_enu_m=(0.0, -1.0, None))
+    files = files_of(a_summary(views, gcps=(east, north, a_gcp("unknown", 10.001, 0.002))), outlines)
+    drawn = Drawing(ground_map(files))
+    at, _ = sheet(np.concatenate([*chain(*outlines)]))
+    shafts = [corners(path.get("d")) for path in drawn.all("path", "miss")][::2]
+    for shaft, (lon, lat), (right, down) in zip(
+        shafts, ((10.0, 0.0), (10.002, 0.001)), ((40.0, 0.0), (0.0, 20.0)), strict=True
+    ):
+        start = at(np.array([lon, lat]))
+        assert shaft[0] == pytest.approx(start, abs=0.02)
+        assert shaft[1] == pytest.approx(start + (right, down), abs=0.02)
+    assert "arrows: their residuals in plan, at most 2.0 m" in caption(files)
+    assert {text[0] for text in drawn.texts("label")} <= {"E", "N", "unknown"}
+    assert drawn.texts("label")
+    assert "arrows" not in caption(files_of(a_summary(views, gcps=(a_gcp("P", 10.0, 0.0),)), outlines))
 
 
 def test_where_tie_points_move_is_outlined_and_says_so():

@@ -166,9 +166,9 @@ def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
     assert kinds(plain) == ["use", "improve"]
     use, improve = plain.next
     files = "view_0000.vrt, view_0001.vrt, view_0002.vrt"
-    assert use.text.startswith(f"Hand over {files}; best pair for heights: ")
+    assert use.text.startswith(f"Use {files}. Best pair for heights: ")
     best = min(plain.pairs, key=lambda pair: pair.height_m_per_px)
-    assert f"{best.a} - {best.b}, " in use.text
+    assert f"{best.a} - {best.b} (a pixel is " in use.text
     assert [command.split()[1:4] for command in use.commands] == [
         ["dsm", ".", "-o"], ["export", ".", "s2p"], ["ortho", ".", "-o"]
     ]  # fmt: skip
@@ -196,7 +196,7 @@ def test_with_a_dem_only_control_is_asked_for_and_with_wrong_control_the_part_th
     last = wrong.next[-1]
     assert (last.kind, last.part) == ("review", "gauge")
     assert "P0" in last.text
-    assert wrong.next[0].text.startswith("After review, hand over")
+    assert wrong.next[0].text.startswith("After review, use")
 
 
 def test_control_in_use_that_does_not_agree_promises_nothing(triplet):
@@ -242,8 +242,8 @@ def test_a_flagged_image_is_not_handed_over_and_the_part_that_shows_it_is_linked
     assert "A.tif" in use.text
     assert "C.tif" in use.text
     assert "B." not in use.text
-    assert "A - C, 2.0 m per pixel" in use.text
-    assert review.text.startswith("Look at B (")
+    assert "A - C (a pixel is 2.0 m)" in use.text
+    assert review.text.startswith("Review B (")
     views = [replace(view, correction=a_correction()) for view in views]
     files = files_of(a_summary(views, pairs), observed=seen([(0, 0, (0.0, 0.0), (1.0, 1.0), (0.1, 0.1), True)]))
     assert section(files, review.part) is not None
@@ -279,7 +279,7 @@ def test_new_cameras_are_used_with_old_ones_that_they_fit(moved, contradicted):
         assert use.text == "Run again with --update: cameras of first and new ones do not agree."
         assert not use.commands
     else:
-        assert use.text == "Hand over A.vrt."
+        assert use.text == "Use A.vrt."
     assert not next_steps(a_summary([a_view("A")]), added)  # no camera was written
 
 
@@ -315,9 +315,8 @@ def test_the_terminal_ends_with_the_steps_and_the_folder_that_was_written(triple
     summary, _ = triplet.adjusted()
     print_summary(replace(summary, out_dir="a run"))
     lines = capsys.readouterr().out.splitlines()
-    assert [line.startswith("Next: ") for line in lines[-3:]] == [False, True, True]
-    assert "barpc dsm 'a run' -o dsm.tif; barpc export 'a run' s2p --to s2p; " in lines[-2]
-    assert lines[-1] == f"Next: {summary.next[1].text}"
+    commands = ["dsm 'a run' -o dsm.tif", "export 'a run' s2p --to s2p", "ortho 'a run' -o ortho"]
+    assert lines[-5:] == [summary.next[0].text, *(f"  barpc {one}" for one in commands), summary.next[1].text]
 
 
 def test_the_page_shows_the_steps_before_its_questions_and_links_to_parts_that_it_has(block_run):

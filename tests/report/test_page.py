@@ -180,7 +180,7 @@ def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):
     written(Run("check", block_run.run.views, (), none), tmp_path / "run")
     html = (tmp_path / "run/report.html").read_text()
     assert "Which images can I use?" in html
-    assert "weakly tied" in html
+    assert "weakly connected" in html
 
 
 def test_barpc_report_makes_the_page_and_says_where(block_run, tmp_path):

@@ -46,7 +46,7 @@ def test_tie_points_lie_where_they_were_measured_and_rejected_ones_are_told_apar
     assert [corners(e.get("d")) for e in drawn.all("path", "kept")] == [[(0.0, 0.0)]]
     assert [corners(e.get("d")) for e in drawn.all("path", "cut")] == [[(300.0, 240.0)]]
     assert corners(Drawing(other).all("path", "kept")[0].get("d")) == [(150.0, 120.0)]
-    assert caption == "A: 100 tie points (blue), 1 rejected (red)"
+    assert caption == "A: tie points: 100 used (blue); 1 rejected (red)"
     assert drawn.all("image")[0].get("href") == f"data:image/jpeg;base64,{JPEG}"
     assert drawn.root.get("data-v") == "0"
 

@@ -39,7 +39,7 @@ def test_images_without_reservation_are_counted():
     agreement = " Residuals measure how well the images agree with each other, not their accuracy on the ground."
     assert section.answer == f"3 of 3 images passed.{agreement}"
     (table,) = section.tables
-    assert table.columns[:3] == ["image", "verdict", "tie points"]
+    assert table.columns[:3] == ["image", "verdict", "used"]
     assert [row[0].text for row in table.rows] == ["A", "B", "C"]
     assert table.marks == ["0", "1", "2"]
     doubted = asked("images", [VIEWS[0], a_view("B", status="weak", advice="look")])
@@ -61,7 +61,8 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "A",
             "needs review",
             "60",
-            "25.0%",
+            "0",
+            "25.0",
             "25%",
             "1.234",
             "0.100",
@@ -72,10 +73,10 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "-",
         ]
     ]
-    assert [cell.key for cell in table.rows[0]][1:5] == [4, 60, 0.25, 0.254]
+    assert [cell.key for cell in table.rows[0]][1:6] == [4, 60, 0, 25.0, 0.254]
     assert table.rows[0][1].kind == "status doubtful"
     (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
-    assert nothing.rows[0][3].text == "-"
+    assert nothing.rows[0][4].text == "-"
 
 
 def test_a_map_needs_an_outline_and_says_where_some_are_left_out(sized):
@@ -97,8 +98,11 @@ def test_how_images_hang_together():
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
     assert answer(ring) == "Tie points connect all images."
-    assert answer(ring[:3]) == "Tie points connect all images. Tied to one other image only: A, D."
-    assert answer(ring[:1]) == "Tie points connect the images in 3 separate groups. Tied to one other image only: A, B."
+    assert answer(ring[:3]) == "Tie points connect all images. Connected to one other image only: A, D."
+    assert (
+        answer(ring[:1])
+        == "Tie points connect the images in 3 separate groups. Connected to one other image only: A, B."
+    )
     assert answer(ring[:1], 2) == "Tie points connect all images."
     assert answer([]) == "Tie points connect the images in 4 separate groups."
 
@@ -116,13 +120,13 @@ def pushed(view: int, cells: int, of: int):
 def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
     calm = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
     assert calm.answer.startswith(
-        "Mostly: in no image do residuals point the same way in more than half of the cells. A cell"
+        "Yes: in no image do residuals point the same way in more than half of the cells. Colour: size."
     )
     assert len(calm.panels) == 3
     assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
     assert len(calm.folds[0][1]) == 3
     told = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
-    assert told.answer.startswith("Not in B: in most of their cells the residuals point the same way. A cell")
+    assert told.answer.startswith("Not in B: in most of their cells the residuals point the same way. Colour")
     check = asked("random", observed=seen(pushed(1, 2, 3)), kind="check")
     assert check.folds == []
     assert 'id="panel-before0-t"' in check.panels[0][0]
@@ -140,7 +144,7 @@ def test_pairs_are_told_by_the_worst_offset_and_the_best_heights():
     assert section.answer == (
         "The epipolar offset, the part of a mismatch that no height explains, is 0.100 px (RMS) in the worst pair "
         "(A - B); stereo matching along epipolar lines needs it well below 0.5 px. The best pair for heights is A - C: "
-        "its convergence angle is 0.9 degrees, so one pixel of parallax is 71.2 cm of height."
+        "its convergence angle is 0.9 degrees, so one pixel of parallax is 71 cm of height."
     )
     assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
     assert texts(section.tables[0])[0] == [
@@ -297,7 +301,7 @@ def test_files_are_held_to_what_their_readers_found():
     fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
     outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
     section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
-    assert section.answer.startswith("Errors of at most 4.0e-03 px, on check points")
+    assert section.answer.startswith("Errors of at most 4.0e-03 px, on points over")
     fits, files = section.tables
     assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100%", "500", "lstsq"]
     assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
@@ -357,7 +361,7 @@ def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
     assert [row[0].text for row in table.rows] == ["F", "E", "D", "C", "G", "B", "A"]
     assert table.marks == ["5", "4", "3", "2", "6", "1", "0"]
     assert [row[2].text for row in table.rows][:3] == [
-        "not tied to the others",
+        "not connected to the others",
         "contradicts the others",
         "large residuals of check tie points",
     ]
@@ -398,7 +402,7 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     shown = section(replace(files, reliefs=(before, after)), "surface")
     said = "41 % of its cells have a height with the delivered cameras, 93 % with the corrected ones."
     assert said in shown.answer
-    assert ("differ by 25.0 cm and by 50.0 cm" in shown.answer) == told
+    assert ("differ by 25 cm and by 50 cm" in shown.answer) == told
     assert [words.partition(",")[0] for _, words in shown.charts] == [
         "Surface from the delivered cameras", "Surface from the corrected cameras",
     ]  # fmt: skip

@@ -60,7 +60,7 @@ def test_a_row_of_a_pair_chooses_both_its_images(found, pair):
     assert sorted(lit) == ["0", "1"]
     assert [row for row in rows if row.startswith("t-images")] == ["t-images view_0000", "t-images view_0001"]
     assert [row for row in rows if row.startswith("t-pairs")] == ["t-pairs view_0000 - view_0001"]
-    assert said == f"view_0000 - view_0001: {pair['num_matches']} matches"
+    assert said == f"view_0000 - view_0001: {pair['num_matches']} used"
     assert found["cleared"] == [[], [], ""]
 
 

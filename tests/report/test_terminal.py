@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from barpc.cli import terminal
 from barpc.cli.terminal import layout, print_summary
-from barpc.report.summary import LeftOutEntry
+from barpc.report.summary import LeftOutEntry, StepEntry
 from barpc.report.summary.pairs import OffsetEntry
 from barpc.report.summary.words import CAUSES
 
@@ -59,7 +59,7 @@ def test_in_a_pipe_a_row_is_one_line_and_columns_line_up(table):
     assert len(ends) == 1
 
 
-def shown(finished, width, monkeypatch):
+def shown(finished, width, monkeypatch, verbose=True):
     import click
 
     @click.command()
@@ -67,6 +67,7 @@ def shown(finished, width, monkeypatch):
         print_summary(finished.record)
 
     monkeypatch.setattr(terminal, "output_width", lambda: width)
+    monkeypatch.setattr(terminal, "_general", lambda name: verbose and name == "verbose")
     return CliRunner().invoke(command).output
 
 
@@ -93,7 +94,7 @@ def test_a_check_shows_no_columns_of_new_cameras(check_run, monkeypatch):
 def test_few_pairs_keep_every_column_at_every_width(width, monkeypatch):
     finished = SimpleNamespace(record=a_summary([a_view("A"), a_view("B")], [a_pair("A", "B")]))
     squeezed = " ".join(shown(finished, width, monkeypatch).split())
-    for word in ("matches", "angle", "[deg]", "B/H", "before", "after", "+0.300 ± 0.200"):
+    for word in ("used", "angle", "[deg]", "B/H", "before", "after", "+0.300 ± 0.200"):
         assert word in squeezed
 
 
@@ -120,22 +121,43 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
         *(view.reservation for view in views if view.advice),
         *fields.pop("more", ()),
     )
-    return a_summary(views, pairs, status="bad", headline="Look.", verdict=verdict, out_dir="out", **fields)
+    return a_summary(
+        views,
+        pairs,
+        status="bad",
+        headline="Look.",
+        verdict=verdict,
+        reasons=verdict[1:],
+        passed=False,
+        out_dir="out",
+        **fields,
+    )
 
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("width", [None, 200, 80])
 @pytest.mark.parametrize("bad", [0, 3, 8, 299])
-def test_a_summary_is_sixty_lines_whatever_its_size(bad, width, monkeypatch):
+def test_a_summary_is_fourteen_lines_whatever_its_size(bad, width, monkeypatch):
     many = tuple(f"{n} is another reason of the block, with words enough to fill more than a line." for n in range(60))
     files = tuple(LeftOutEntry(f"{n}.tif", f"{n}.tif: no RPC") for n in range(90))
+    use = StepEntry("use", "Use A.vrt.", tuple(f"barpc {verb} . -o {'long ' * 20}" for verb in ("dsm", "ortho")))
     for fields in ({}, {"more": many}, {"left_out": files, "more": tuple(one.reason_text for one in files)}):
-        text = shown(SimpleNamespace(record=a_large_run(bad, **fields)), width, monkeypatch)
+        text = shown(SimpleNamespace(record=a_large_run(bad, next=(use,), **fields)), width, monkeypatch, False)
         lines = text.splitlines()
-        assert len(lines) <= 60
-        assert lines.index("Look.") <= len(lines) - 3
-        assert lines[-1] == "Written to out"
+        assert len(lines) <= 14
+        assert lines[0].startswith("Look (exit code 3).")
+        assert [line for line in lines if line.startswith("Written to out")]
+        for line in lines:
+            assert not line.startswith("  barpc") or line.endswith("long ")  # a command is copied whole
     assert "90 files were left out" in " ".join(text.split())
+
+
+def test_what_there_is_no_room_for_is_counted(monkeypatch):
+    many = tuple(f"Reason {n}." for n in range(60))
+    lines = shown(SimpleNamespace(record=a_large_run(0, more=many)), 80, monkeypatch, False).splitlines()
+    assert (lines[0], lines[1], len(lines)) == ("Look (exit code 3).", "It rests on this.", 14)
+    assert lines[-2] == "And 50 more: -v, or report.html."
+    assert lines[2:-2] == [f"Reason {n}." for n in range(10)]
 
 
 def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(monkeypatch):
@@ -150,7 +172,7 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
     assert [line.partition(": view_")[0] for line in causes] == [
         "100 images: needs review, contradicts the others",
         "100 images: needs review, large residuals of check tie points",
-        "99 images: weakly tied, few tie points",
+        "99 images: weakly connected, few tie points",
     ]
     assert "view_0298, view_0295, view_0292, view_0289, view_0286 and 95 more" in causes[0]
 
@@ -162,9 +184,9 @@ def test_of_a_large_run_that_is_good_only_counts_are_shown(monkeypatch):
         "",
         "299 pairs, none with an epipolar offset of more than 0.5 px (RMS): all in tables/pairs.csv",
         "",
-        "Look.",
+        "Look (exit code 3).",
         "It rests on this.",
-        "Written to out",
+        "Written to out (tables: -v, or report.html there)",
     ]
 
 

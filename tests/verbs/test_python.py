@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -493,6 +494,11 @@ def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path
     assert shown.count("<tr>") == 3
     assert found.record.headline.split(".")[0] in shown
     assert "view_00" in shown
+    assert "report.html" not in shown
+    reserved = replace(found, record=replace(found.record, reasons=("a < b",), out_dir=str(tmp_path)))
+    assert reserved._repr_html_().endswith("<ul><li>a &lt; b</li></ul>")
+    (tmp_path / "report.html").touch()
+    assert reserved._repr_html_().endswith(f'<a href="{tmp_path}/report.html">report.html</a>')
 
 
 # --- who works --------------------------------------------------------------------------------------------

@@ -45,8 +45,9 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
     num, tracks, keep, after = len(run.views), run.tracks, run.keep, run.ties_after
     first = rmse_by_view(run.ties_before.residuals[keep], tracks.view[keep], num)
     last = [None] * num if after is None else rmse_by_view(after.residuals[keep], tracks.view[keep], num)
-    parts = keep, ~(keep | run.held_out | run.moving), run.moving
-    count, cut, moving = (np.bincount(tracks.view[rows], minlength=num).tolist() for rows in parts)
+    unused = run.held_out & ~keep  # of a check all that agree with its cameras are in use
+    parts = keep, ~(keep | unused | run.moving), run.moving, unused & ~run.moving
+    count, cut, moving, check = (np.bincount(tracks.view[rows], minlength=num).tolist() for rows in parts)
     gcps = np.zeros(num, np.int64) if run.gcps is None else np.bincount(run.gcps.view, minlength=num)
     cells = cell_numbers(tracks.xy[keep], np.array([view.size for view in run.views])[tracks.view[keep]])
     filled = np.unique(cells + tracks.view[keep] * COVERAGE_CELLS**2) // COVERAGE_CELLS**2
@@ -69,6 +70,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             num_observations=count[i],
             num_rejected=cut[i],
             num_moving=moving[i],
+            num_check=check[i],
             num_gcps=int(gcps[i]),
             tie_coverage=float(covered[i]),
             rmse_before=first[i],

@@ -60,7 +60,7 @@ class ExpectedEntry(Record):
 class StepEntry(Record):
     """A next step: use of the results, a further input, or a review."""
 
-    kind: Literal["use", "improve", "review"] = column("Files to hand over; further inputs; parts to review")
+    kind: Literal["use", "improve", "review"] = column("Files to use; further inputs; parts to review")
     text: str = column("The step as a sentence", min_length=1)
     commands: tuple[str, ...] = column("Commands for it, where . is the run folder", default=())
     expected: tuple[ExpectedEntry, ...] = column("Effect of further inputs", default=())

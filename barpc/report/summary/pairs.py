@@ -47,7 +47,7 @@ class PairEntry(Record):
 
     a: str = column("First view")
     b: str = column("Second view")
-    num_matches: Count = column("Common tie points", head="matches")
+    num_matches: Count = column("Common tie points in use", head="used")
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
     base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
@@ -57,7 +57,7 @@ class PairEntry(Record):
     epipolar_after: OffsetEntry | None = column("The same through the new cameras")
     matching: Mapping[str, Any] | None = column("Report of the matcher; null: not matched")
     tied_by: str | None = column(
-        "Matcher that succeeded, and whether its thresholds were relaxed", head="tied by", default=None
+        "Matcher that succeeded, and whether its thresholds were relaxed", head="matched by", default=None
     )
     decoy_share: Number = column(
         "Share of false matches, by search bands without true ones", head="false matches", form=".1%", default=None

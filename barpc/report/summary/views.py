@@ -113,16 +113,16 @@ class ViewEntry(Record):
         "verdict": Column("verdict", _verdict),
         "wrong": Column("reservation", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
         "lost": Column(
-            "rejected", lambda view: view.lost if view.num_observations + view.num_rejected else None, ".1%"
+            "rejected [%]", lambda view: 100.0 * view.lost if view.num_observations + view.num_rejected else None, ".1f"
         ),
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
         "largest": Column("RPC misfit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
     PAGE: ClassVar = (
-        "name verdict wrong num_observations lost tie_coverage rmse_before rmse_after held_out_px "
+        "name verdict wrong num_observations num_check lost tie_coverage rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
-    TERMINAL: ClassVar = "name verdict num_observations lost rmse_before rmse_after correction.center_shift_px largest"
+    TERMINAL: ClassVar = "name verdict num_observations lost rmse_before rmse_after correction.center_shift_px"
     CORRECTIONS: ClassVar = (
         "name moves correction.angle_urad correction.translation_norm_m camera_center.altitude_m camera_center.method"
     )
@@ -131,8 +131,8 @@ class ViewEntry(Record):
         "correction.ellipse.ce90_m stated_ce90_m"
     )
     DECISIONS: ClassVar = (
-        "name prior_scale num_rejected lost systematic_px systematic_p neighbour_correlated_px correction.jitter_px "
-        "correction.detector_px correction.step_px correction.sinusoid_px"
+        "name prior_scale num_observations num_check num_rejected num_moving systematic_px systematic_p "
+        "neighbour_correlated_px correction.jitter_px correction.detector_px correction.step_px correction.sinusoid_px"
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
     CONTROL: ClassVar = "name control_w control_w_point"
@@ -147,6 +147,12 @@ class ViewEntry(Record):
         return self.num_rejected / max(self.num_rejected + self.num_observations, 1)
 
     @property
+    def counts(self) -> dict[str, int]:
+        """Its tie points by their names in all sentences and tables: in use, then others of which it has some."""
+        found = {"check": self.num_check, "rejected": self.num_rejected, "excluded": self.num_moving}
+        return {"used": self.num_observations, **{name: count for name, count in found.items() if count}}
+
+    @property
     def reservation(self) -> str:
         """Its verdict and advice as a sentence; without meaning for an image without reservation."""
         return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
@@ -159,8 +165,8 @@ class ViewEntry(Record):
     gsd_m: Number = column("Ground sampling distance at the image centre", "m", "GSD", ".2f")
     incidence_deg: Number = column("Incidence angle, from the vertical to the sensor", "deg", "incidence", ".1f")
     azimuth_deg: Number = column("Direction to the sensor, clockwise from north", "deg")
-    num_observations: Count = column("Tie-point observations in use", head="tie points")
-    num_rejected: Count = column("Observations rejected as outliers", head="rejected obs.")
+    num_observations: Count = column("Tie-point observations in use", head="used")
+    num_rejected: Count = column("Observations rejected as outliers", head="rejected")
     num_gcps: Count = column("Observations of ground control points")
     tie_coverage: Share = column("Share of the cells of an 8 x 8 grid with a tie point", head="covered", form=".0%")
     rmse_before: Number = column("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
@@ -180,7 +186,8 @@ class ViewEntry(Record):
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
     cause: str | None = column("Name of the reservation; null without one", default=None, enum=CAUSES)
-    num_moving: Count = column("Excluded observations of tie points that move together", default=0)
+    num_moving: Count = column("Excluded observations of tie points that move together", head="excluded", default=0)
+    num_check: Count = column("Observations of check tie points", head="check", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
     systematic_p: Number = column(

@@ -17,7 +17,7 @@ STATUS_WORDS = {
     "adjusted": "adjusted",
     "consistent": "consistent",
     "tied": "tied",
-    "weak": "weakly tied",
+    "weak": "weakly connected",
     "doubtful": "needs review",
     "failed": "not adjusted",
 }
@@ -63,6 +63,17 @@ def known(value: float | None) -> float:
     return float("nan") if value is None else value
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two digits.
+
+    Examples
+    --------
+    >>> two_digits(33.11), two_digits(0.256), two_digits(684.0)
+    ('33', '0.26', '680')
+    """
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def figure(value: float) -> str:
     """Return a number with one decimal, or with one digit where it would read 0.0.
 
@@ -75,17 +86,16 @@ def figure(value: float) -> str:
 
 
 def metres(value: float) -> str:
-    """Return a length with a unit that keeps it readable.
+    """Return a length of two digits with a unit that keeps it readable.
 
     Examples
     --------
-    >>> metres(3.14159), metres(0.0421), metres(0.00012)
-    ('3.1 m', '4.2 cm', '0.1 mm')
+    >>> metres(3.14159), metres(53.9), metres(684.0), metres(0.0421), metres(0.00012)
+    ('3.1 m', '54 m', '680 m', '4.2 cm', '0.1 mm')
     """
-    for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")):
-        if abs(value) * factor >= 1.0:
-            return f"{value * factor:.1f} {unit}"
-    return f"{value * 1e3:.1f} mm"
+    scaled = ((float(f"{value * factor:.2g}"), unit) for factor, unit in ((1.0, "m"), (1e2, "cm"), (1e3, "mm")))
+    length, unit = next((one for one in scaled if abs(one[0]) >= 1.0), (value * 1e3, "mm"))
+    return f"{length:.{1 if abs(length) < 10.0 else 0}f} {unit}"
 
 
 @dataclass(frozen=True)
@@ -106,7 +116,7 @@ CAUSES = {
     "no_overlap": Cause("failed", "in no matched pair",
         "no pair with it was selected for matching (overlap, angle or list), and its camera was not changed",
         "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap in a file given with --options"),
-    "untied": Cause("failed", "not tied to the others",
+    "untied": Cause("failed", "not connected to the others",
         "no tie points connect it to the main group of images{tried}, and its camera was not changed",
         "check for clouds, water and other dates, or supply matches (--matches)"),
     "other_rpc": Cause("failed", "RPC does not match the image",
@@ -140,18 +150,18 @@ CAUSES = {
     "systematic": Cause("doubtful", "systematic residuals",
         "systematic residuals of {size:.2f} px {along} remain: {why}"),
     "rejected": Cause("doubtful", "many tie points rejected",
-        "{share:.0f} % of its tie points were rejected, with neighbouring errors in the same direction{place}",
+        "{share:.0f} % of its tie points were rejected; neighbours err in the same direction, so it is no noise{place}",
         "check for clouds, water, change"),
     "wrong_matches": Cause("doubtful", "wrong matches",
         "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of "
         "mismatches, and check tie points have residuals of {error:.2f} px",
         "check for repeated patterns and noise, or supply matches (--matches)"),
     "place": Cause("doubtful", "inconsistent rows or columns",
-        "{place} are inconsistent with the rest of the image: {what}", "check for {cause}"),
+        "in {place} {what}", "check for {cause}"),
     "gap": Cause("doubtful", "rows or columns with few tie points",
         "{place} have {found} of about {due} tie points expected from their detail, so an error there would not show",
         "check for clouds, water, change there, or a jump in the image"),
-    "beside": Cause("doubtful", "tied to a contradicting image",
+    "beside": Cause("doubtful", "connected to a contradicting image",
         "check tie points have residuals of {error:.2f} px, and most of them are observed in {other}, too, whose tie "
         "points contradict the others",
         "check that image first"),
