@@ -111,7 +111,7 @@ def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path
     out, err = process.communicate(timeout=600)
     assert process.returncode == 130
     assert out == ""
-    assert re.fullmatch(r"barpc: interrupted; finished tasks are kept: the same command goes on at \w.*\n", err)
+    assert re.fullmatch(r"barpc: interrupted; finished tasks are kept: the same command goes on at \w.*", err.strip())
     assert not [path for path in (tmp_path / "out").iterdir() if path.name != ".barpc"]  # it did not finish
     for worker in workers:
         wait_until_gone(worker)
