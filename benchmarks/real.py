@@ -216,7 +216,8 @@ def by_cars(interpreter: str, arguments: list[str], place: Path) -> list[tuple[R
     }
     (place / "cars.json").write_text(json.dumps(config))
     cpu, peak, code = measured([str(program), str(place / "cars.json")], place, place / "cars.log")
-    said = "" if code == 0 else (place / "cars.log").read_text().strip().splitlines()[-1][:100]
+    made = next((place / "cars").rglob("*.geom"), None)  # without rpcfit it says so, and ends with exit code 0
+    said = "" if code == 0 and made else (place / "cars.log").read_text().strip().splitlines()[-1][:100]
     found = []
     for kind, back in (("as written", 0.0), ("half a pixel back", 0.5)):
         shifted = {}

@@ -171,9 +171,9 @@ def shipped(data: Path, place: Path) -> None:
     images = sorted(theirs.parent.glob("img_*.tif"))
     run = adjusted(images, place)
     known, (low, high) = heights(theirs, theirs), read_scene(run).alt_range
-    one, _, three = names = [shot.name for shot in read_scene(run).shots]
+    names = [shot.name for shot in read_scene(run).shots]
     print("| cameras, pairs | of s2p's cells | to s2p's heights: median, NMAD [m]; > 5 m |\n|---|---|---|")
-    for kind, views in {"corrected, all": names, "corrected, the widest": [one, three], "delivered, all": []}.items():
+    for kind, views in {"corrected, all": names, "delivered, all": []}.items():
         given = [run / f"{view}.vrt" for view in views] or images
         call = [sys.executable, "-m", "barpc", "-q", "dsm", *map(str, given), "--alt", str(low), str(high)]
         call += ["--gsd", "0.5", "-o", str(place / "dsm.tif"), "--overwrite"]
