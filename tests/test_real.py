@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -13,10 +12,9 @@ import rasterio
 from rasterio.transform import Affine
 from scipy import ndimage
 
-from barpc.rpcio import read_rpc
 from barpc.sensor.rpc import RPC
-from benchmarks.real import Row, across, by_sba, delivered, features, held_out, matched, measured
-from benchmarks.real_sets import Change, Scene, as_rasterio, changed, correlated, write_image
+from benchmarks.real import Row, across, features, held_out, matched, measured
+from benchmarks.real_sets import Change, as_rasterio, changed, correlated
 from benchmarks.surfaces import between, heights
 from tests.fit.cameras import synthetic_rpc
 
@@ -180,28 +178,3 @@ def test_memory_of_a_command_is_not_that_of_who_measures_it(tmp_path: Path) -> N
     assert 0.01 < cpu < 10
     assert 60 < peak < 180
     assert held.size
-
-
-def test_a_checkout_gets_images_and_rpcs_in_two_folders_and_its_answer_is_read(tmp_path: Path) -> None:
-    """As its README describes them: images/*.tif, rpcs/*.rpc, and rpcs_adj in the output."""
-    place, checkout = tmp_path / "set", tmp_path / "checkout"
-    checkout.mkdir()
-    write_image(tmp_path / "a.tif", np.ones((30, 40), np.uint8), as_rasterio(CAMERA, np.zeros(2)))
-    (checkout / "main.py").write_text(
-        "import json, pathlib, shutil, sys\n"
-        "told = json.load(open(sys.argv[1]))\n"
-        "out = pathlib.Path(told['output_dir'], 'rpcs_adj')\n"
-        "out.mkdir(parents=True)\n"
-        "source = pathlib.Path(told['input_dir'])\n"
-        "names = [path.stem for path in (source / 'images').glob('*.tif')]\n"
-        "[shutil.copy(source / 'rpcs' / f'{n}.rpc', out / f'{n}.rpc_adj') for n in names]\n"
-    )
-    _, arguments = delivered(Scene("one", (tmp_path / "a.tif",), change=Change((3.0, 4.0))), place)
-    row, cameras = by_sba(checkout, arguments, place)
-    assert row.code == 0
-    off = read_rpc(cameras["a"]).project(GROUND) - CAMERA.project(GROUND)
-    np.testing.assert_allclose(off, [3.0, 4.0], atol=1e-6)
-    (checkout / "main.py").write_text("import sys\nprint('no such module')\nsys.exit(2)\n")
-    shutil.rmtree(place / "sba_in")
-    row, cameras = by_sba(checkout, arguments, place)
-    assert (row.code, row.said) == (2, "no such module")

@@ -355,7 +355,7 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
     single = metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)
     measured = ""
     if terrain.known:
-        lie = f"they lie {metres(abs(terrain.offset))} {'above' if terrain.offset > 0 else 'below'} it"
+        lie = f"the tie points lie {metres(abs(terrain.offset))} {'above' if terrain.offset > 0 else 'below'} it"
         measured = f"; measured: {lie} (median; scatter {metres(terrain.spread)})"
     yield f"DEM accuracy assumed: {metres(terrain.bias)} shared by all points, {single} each{measured}."
     if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:

@@ -56,7 +56,7 @@ def _keywords() -> dict[str, str]:
     known = {name: one.kind for record in fields for name, one in record} | dict.fromkeys(FLAG_NAMES.values(), str)
     words = {name: f"{name}=True" if kind is bool else name for name, kind in known.items()}
     flags = {f"--{name.replace('_', '-')}": text for name, text in words.items()}
-    return flags | {"--csv": "csv=True", "--options": "options", "-j": "jobs"}
+    return flags | {"--csv": "csv=True", "--images": "images", "--options": "options", "-j": "jobs"}
 
 
 def in_keywords(sentence: str, target: str = _TARGETS[0]) -> str:

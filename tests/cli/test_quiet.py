@@ -18,7 +18,7 @@ DONE = {
     "convert --window": ("{in}/view_00.tif", "{new}.tif", "--window", "0", "0", "64", "64"),
     "convert --bbox": ("{in}/view_00.tif", "{new}.tif", "--bbox", "5.0", "43.0", "6.0", "44.0"),
     "convert -o": ("{in}/view_00.tif", "--rpc", "{out}", "-o", "{new}"),
-    "export": ("{out}", "{new}", "--to", "stac"),
+    "export": ("{out}", "{new}", "--to", "stac", "--date", "2026-01-02"),
     "verify": ("{out}",),
     "report": ("{out}",),
     "ortho": ("{out}", "-o", "{new}"),

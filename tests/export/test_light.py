@@ -106,7 +106,7 @@ def test_where_nothing_tells_the_time_nothing_is_written_and_the_exit_code_is_3(
         assert stop.value.code == 3
         assert said.out == ""
         assert re.fullmatch(
-            rf"barpc: needs review (exit code 3): nothing is written: view_0001, view_0002: .*give {flag} .*\n",
+            rf"barpc: needs review \(exit code 3\): nothing is written: view_0001, view_0002: .*give {flag} .*\n",
             said.err,
         )
         assert not (tmp_path / "out").exists()

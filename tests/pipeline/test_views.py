@@ -72,7 +72,7 @@ def test_as_many_images_as_are_needed(pair, count, least, passes) -> None:
     if passes:
         assert len(load_views(pair[:count], min_views=least).views) == count
         return
-    said = rf"{count} image\(s\) given \({'none' if not count else '.*a.tif'}\): at least {least} that overlap"
+    said = rf"{count} images? given \({'none' if not count else '.*a.tif'}\): at least {least} that overlap"
     with pytest.raises(InputError, match=said):
         load_views(pair[:count], min_views=least)
 

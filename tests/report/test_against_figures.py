@@ -169,7 +169,7 @@ def _(s, held, num, nowhere, percent):
 
 
 @says(
-    rf"DEM accuracy assumed: {LENGTH} shared by all points, {LENGTH} each(?:; measured: they lie {LENGTH} "
+    rf"DEM accuracy assumed: {LENGTH} shared by all points, {LENGTH} each(?:; measured: the tie points lie {LENGTH} "
     rf"(above|below) it \(median; scatter {LENGTH}\))?\."
 )
 def _(s, _shared, sigma, offset, side, spread):
