@@ -98,7 +98,7 @@ class OpenedRun(RunResult):
     finished: FinishedRun
 
     @classmethod
-    def open(cls, folder: Path) -> OpenedRun:
+    def of_folder(cls, folder: Path) -> OpenedRun:
         """Open a folder; InputError where it holds no finished run, or its summary was changed since."""
         run = FinishedRun.open(folder)
         return cls(replace(run.summary, out_dir=os.fspath(folder)), run.sealed.root, run)

@@ -322,7 +322,7 @@ def open_run(run_dir: PathLike) -> OpenedRun:
     """
     from barpc.pipeline.results import OpenedRun
 
-    return OpenedRun.open(Path(run_dir))
+    return OpenedRun.of_folder(Path(run_dir))
 
 
 def report(run_dir: PathLike, *others: PathLike, csv: bool = False) -> Any:
