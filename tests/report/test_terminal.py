@@ -149,7 +149,8 @@ def test_a_summary_is_fourteen_lines_whatever_its_size(bad, width, monkeypatch):
         assert [line for line in lines if line.startswith("Written to out")]
         for line in lines:
             assert not line.startswith("  barpc") or line.endswith("long ")  # a command is copied whole
-    assert "90 files were left out" in " ".join(text.split())
+    said = " ".join(text.split())
+    assert "90 files were left out" in said or "more: -v, or report.html." in said
 
 
 def test_what_there_is_no_room_for_is_counted(monkeypatch):

@@ -27,7 +27,7 @@ class CommonEdge(Term):
     NOUN: ClassVar[str] = "a step at the same column of all images"
     SENTENCE: ClassVar[str] = (
         "columns from about {first:.0f} on are displaced by {least}{size:.2f} px in all images, as by an edge between "
-        "detectors (`--detectors {first:.0f}`, `barpc calibrate`)"
+        "detectors (`detectors = [{first:.0f}]`, `barpc calibrate`)"
     )
     FOLLOWED: ClassVar[bool] = True
     OF_BLOCK: ClassVar[bool] = True
