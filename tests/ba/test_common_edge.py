@@ -57,7 +57,8 @@ def test_an_edge_of_all_images_is_told_once() -> None:
     (one,) = explanations(adjusted(((200.0, (0.3, 0.4)),))[0])
     assert one.image is None
     assert one.axis == "columns"
-    said = re.search(r"about (\d+) on are displaced by (0\.\d+) px in all images.*`detectors = \[(\d+)\]`", one.sentence)
+    words = r"about (\d+) on are displaced by (0\.\d+) px in all images.*`detectors = \[(\d+)\]`"
+    said = re.search(words, one.sentence)
     assert said is not None
     assert 198 <= int(said[1]) <= 202
     assert int(said[1]) == int(said[3])
