@@ -508,11 +508,11 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
     assumed = "DEM accuracy assumed: 50 cm shared by all points, 2.0 m each"
     assert lines() == [
         "DEM heights constrain 30 of 40 used tie points; the DEM covers 50 %.",
-        f"{assumed}; measured: they lie 2.0 m above it (median; scatter 3.0 m).",
+        f"{assumed}; measured: the tie points lie 2.0 m above it (median; scatter 3.0 m).",
     ]
     assert lines(known=40, offset=-2.0) == [
         "DEM heights constrain 30 of 40 used tie points.",
-        f"{assumed}; measured: they lie 2.0 m below it (median; scatter 3.0 m).",
+        f"{assumed}; measured: the tie points lie 2.0 m below it (median; scatter 3.0 m).",
     ]
     assert lines(known=0)[1] == f"{assumed}."
     assert lines(known=0, total=0, held=0)[1] == "The DEM constrains nothing: there are no tie points."
@@ -532,8 +532,8 @@ def test_a_dem_is_said_to_hold_and_how_the_points_lie_to_it():
 def test_how_much_of_a_dem_is_believed_is_said():
     told = replace(TerrainTest(30, 30, 40, 2.0, 3.0, 0.5), sigma=4.0, alike=3.5, relief=0.98)
     assert said(run_of(adjusted(terrain=told)))[-2:] == [
-        "DEM accuracy assumed: 50 cm shared by all points, 4.0 m each; measured: they lie 2.0 m above it (median; "
-        "scatter 3.0 m).",
+        "DEM accuracy assumed: 50 cm shared by all points, 4.0 m each; measured: the tie points lie 2.0 m above it "
+        "(median; scatter 3.0 m).",
         "DEM errors are correlated: 3.5 points count as one.",
     ]
     assert wrong(told) == []
