@@ -10,6 +10,8 @@ import pytest
 
 import barpc
 
+pytest_plugins = ["pytester", "tests.costs"]
+
 SLOW = {f"barpc.verbs.runs.{verb}" for verb in ("dsm", "export")}
 """Examples of several whole runs."""
 

@@ -1,0 +1,84 @@
+"""What each test costs: told with `--cpu tell`, and with `--cpu hold` no more than its lane allows.
+
+An item may take `BUDGET` CPU seconds, its children's with them; one with the mark `costs(n)` n of them, one that waits
+for the nightly lane as many as it likes. What several items share (a fixture that is not of one function) is charged
+to none of them, and may take `SHARED` seconds.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+
+BUDGET, SHARED = 2.0, 10.0
+SLACK = 2.0
+"""A test is told at twice what it may take: CPU seconds are half as many again where other work takes all cores."""
+SPENT = pytest.StashKey[float]()
+shared = 0.0  # CPU seconds of fixtures that several items share
+
+
+def cpu() -> float:
+    """CPU seconds of this process and of the children that it waited for."""
+    return sum(os.times()[:4])
+
+
+def allowed(item: pytest.Item) -> float:
+    """CPU seconds that a test may take."""
+    mark = item.get_closest_marker("costs")
+    return float("inf") if item.get_closest_marker("nightly") else float(mark.args[0]) if mark else BUDGET
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--cpu", choices=("tell", "hold"), help="CPU seconds of folders and tests; hold: of a budget")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest) -> Iterator[None]:
+    global shared
+    before, others = cpu(), shared
+    try:
+        return (yield)
+    finally:
+        if fixturedef.scope != "function":
+            seconds = cpu() - before - (shared - others)
+            shared += seconds
+            if seconds > SLACK * SHARED and request.config.option.cpu == "hold":
+                pytest.fail(
+                    f"the fixture {fixturedef.argname} takes {seconds:.1f} CPU s, {SHARED:g} are allowed", False
+                )
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[None]:
+    item.stash[SPENT] = cpu() - shared
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    done = yield
+    seconds, most = cpu() - shared - item.stash[SPENT], allowed(item)
+    item.user_properties.append(("cpu", seconds))
+    if seconds > SLACK * most and item.config.option.cpu == "hold":
+        pytest.fail(f"{seconds:.1f} CPU s, {most:g} are allowed: a smaller case, or `costs(n)`, or `nightly`", False)
+    return done
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if not config.option.cpu:
+        return
+    reports = [
+        one for kind in terminalreporter.stats.values() for one in kind if getattr(one, "when", "") == "teardown"
+    ]
+    costs = sorted((dict(one.user_properties)["cpu"], one.nodeid) for one in reports)
+    folders: Counter[str] = Counter()
+    for seconds, name in costs:
+        folders["/".join(name.split("::")[0].split("/")[:-1])] += seconds
+    terminalreporter.section(f"CPU seconds: {sum(folders.values()):.0f} in {len(costs)} tests")
+    for name, seconds in folders.most_common():
+        terminalreporter.line(f"| {name} | {seconds:.1f} |")
+    for seconds, name in costs[:-21:-1]:
+        terminalreporter.line(f"{seconds:.1f} {name}")

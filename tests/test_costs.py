@@ -1,0 +1,41 @@
+"""A test that costs more than its lane allows is told by name."""
+
+from __future__ import annotations
+
+import pytest
+
+CASES = """
+import pytest, time
+def busy(seconds):
+    end = time.process_time() + seconds
+    while time.process_time() < end: pass
+@pytest.fixture(scope="module")
+def made(): busy(0.3)
+def test_cheap(made): pass
+def test_dear(): busy(0.3)
+@pytest.mark.costs(1)
+def test_telling(): busy(0.3)
+@pytest.mark.nightly
+def test_at_night(): busy(0.3)
+"""
+
+
+@pytest.mark.parametrize("how", ["tell", "hold"])
+def test_what_costs_more_than_its_lane_allows_is_told(pytester: pytest.Pytester, monkeypatch, how: str) -> None:
+    monkeypatch.setattr("tests.costs.BUDGET", 0.1)
+    pytester.makeini("[pytest]\nmarkers = nightly\n  costs\n")
+    pytester.makepyfile(CASES)
+    found = pytester.runpytest_inprocess("-p", "tests.costs", "-p", "no:xdist", "--cpu", how)
+    found.assert_outcomes(passed=4, errors=int(how == "hold"))
+    found.stdout.fnmatch_lines(["*CPU seconds: * in 4 tests*", "0.* test_what*::test_*"])
+    if how == "hold":
+        found.stdout.fnmatch_lines(["*0.[3-9] CPU s, 0.1 are allowed*", "ERROR *::test_dear*"])
+
+
+def test_a_shared_fixture_has_a_budget_of_its_own(pytester: pytest.Pytester, monkeypatch) -> None:
+    monkeypatch.setattr("tests.costs.SHARED", 0.1)
+    pytester.makeini("[pytest]\nmarkers = nightly\n  costs\n")
+    pytester.makepyfile(CASES)
+    found = pytester.runpytest_inprocess("-p", "tests.costs", "-p", "no:xdist", "--cpu", "hold")
+    found.assert_outcomes(passed=3, errors=1)
+    found.stdout.fnmatch_lines(["*the fixture made takes 0.[3-9] CPU s, 0.1 are allowed*"])
