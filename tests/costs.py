@@ -46,9 +46,7 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[object], request: pytest.
             seconds = cpu() - before - (shared - others)
             shared += seconds
             if seconds > SLACK * SHARED and request.config.option.cpu == "hold":
-                pytest.fail(
-                    f"the fixture {fixturedef.argname} takes {seconds:.1f} CPU s, {SHARED:g} are allowed", False
-                )
+                pytest.fail(f"{fixturedef.argname}, shared: {seconds:.1f} CPU s, {SHARED:g} are allowed", False)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -70,9 +68,8 @@ def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if not config.option.cpu:
         return
-    reports = [
-        one for kind in terminalreporter.stats.values() for one in kind if getattr(one, "when", "") == "teardown"
-    ]
+    told = [one for kind in terminalreporter.stats.values() for one in kind]
+    reports = [one for one in told if getattr(one, "when", "") == "teardown" and one.user_properties]
     costs = sorted((dict(one.user_properties)["cpu"], one.nodeid) for one in reports)
     folders: Counter[str] = Counter()
     for seconds, name in costs:

@@ -38,4 +38,4 @@ def test_a_shared_fixture_has_a_budget_of_its_own(pytester: pytest.Pytester, mon
     pytester.makepyfile(CASES)
     found = pytester.runpytest_inprocess("-p", "tests.costs", "-p", "no:xdist", "--cpu", "hold")
     found.assert_outcomes(passed=3, errors=1)
-    found.stdout.fnmatch_lines(["*the fixture made takes 0.[3-9] CPU s, 0.1 are allowed*"])
+    found.stdout.fnmatch_lines(["*made, shared: 0.[3-9] CPU s, 0.1 are allowed*"])

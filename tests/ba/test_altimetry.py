@@ -153,7 +153,7 @@ def test_two_groups_of_equal_weight_are_no_majority():
     np.testing.assert_allclose(found.motion[:3], [5.0, -7.0, 90.0], atol=0.6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_plain_tells_heights_and_no_place():
     """Slopes of a plain are its noise: they do not know where it is."""
     rng = np.random.default_rng(2)

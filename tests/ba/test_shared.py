@@ -100,7 +100,7 @@ def test_matches_that_are_biased_place_by_place_bend_no_camera(size: float, side
     assert judge(world, found.sensors).left < size
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_jump_is_told_among_matches_that_are_biased_place_by_place() -> None:
     world = make("local", 0)
     found = adjust_tracks(world.views, biased(world, 0.05, 8, 1).tracks)
