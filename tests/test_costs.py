@@ -39,3 +39,15 @@ def test_a_shared_fixture_has_a_budget_of_its_own(pytester: pytest.Pytester, mon
     found = pytester.runpytest_inprocess("-p", "tests.costs", "-p", "no:xdist", "--cpu", "hold")
     found.assert_outcomes(passed=3, errors=1)
     found.stdout.fnmatch_lines(["*made, shared: 0.[3-9] CPU s, 0.1 are allowed*"])
+
+
+def test_parts_are_all_tests_together_and_what_is_not_begun_in_time_is_said(pytester: pytest.Pytester) -> None:
+    pytester.makeini("[pytest]\n")
+    pytester.makepyfile("import pytest\n@pytest.mark.parametrize('k', range(12))\ndef test_one(k): pass")
+    how = ("-p", "tests.costs", "-p", "no:xdist", "-rs")
+    parts = [pytester.runpytest_inprocess(*how, "--part", f"{7 + k}/3").parseoutcomes() for k in range(3)]
+    assert sum(part["passed"] for part in parts) == 12
+    assert max(part["passed"] for part in parts) < 12
+    found = pytester.runpytest_inprocess(*how, "--minutes", "0")
+    found.assert_outcomes(skipped=12)
+    found.stdout.fnmatch_lines(["SKIPPED *not begun in 0 minutes"])
