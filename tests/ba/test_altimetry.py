@@ -109,7 +109,7 @@ def test_a_surface_finds_its_place_with_the_right_sign_and_says_how_well(wrong: 
     assert 0.4 < np.sqrt(np.mean(np.square(ratio))) < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_heights_that_mostly_disagree_agree_on_nothing():
     rng = np.random.default_rng(1)
     assert not registered(rng, given(rng, 150, [5.0, -7.0, 90.0], wrong=0.8)).is_most

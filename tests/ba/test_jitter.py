@@ -203,7 +203,7 @@ def test_nothing_is_found_where_nothing_is(name, seeds):
         np.testing.assert_array_equal(found.params, solved(name, seed, jitter="off")[0].params)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_splines_that_are_asked_for_cost_a_clean_block_little():
     for seed in SEEDS[:2]:
         found, after = solved("no drift", seed, jitter="4000")

@@ -53,6 +53,7 @@ MIDDLE = {"view": 1, "axis": 1, "start": 0.4, "stop": 0.6, "px": 0.8}
 DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR]), ids=["middle", "end", "detector"])
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
@@ -231,7 +232,7 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     assert max(size[0], size[2]) < 0.4 * size[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 600, MIDDLE)

@@ -438,8 +438,8 @@ def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: i
     assert judged.shape < 0.15
 
 
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
-@pytest.mark.landing(2)
 @pytest.mark.parametrize("seed", [41, 60, 40])
 def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
     world = make("biased", seed)

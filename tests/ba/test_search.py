@@ -70,6 +70,7 @@ class Fan(Term):
         return [cls(interval.view, columns, np.ones(2), SIZE_PRICE + np.log(residuals.linear.choices))]
 
 
+@pytest.mark.slow
 def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is proposed, beats those that resemble it and is recorded; without it they are taken in its place."""
 
@@ -127,9 +128,8 @@ def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, 
     np.testing.assert_allclose(one.size, 3.0 * DIRECTION[:, 0], rtol=0.06)
 
 
+@pytest.mark.nightly
 @pytest.mark.costs(3)
-@pytest.mark.landing(1)
-@pytest.mark.slow
 @pytest.mark.parametrize("length", [0.05, -0.05])
 def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
     seen = residuals_of(transient(6.0, length), views=4, tracks=200)
@@ -310,6 +310,7 @@ def placed(kind: str, view: int = 0) -> Term:
     return TERMS[kind](view, none, np.full(2, 0.5), 0.0, (1, 2.0, 5.0, 0.0, 0.0))
 
 
+@pytest.mark.slow
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):
@@ -428,8 +429,8 @@ def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_s
         assert search_terms(one.outcome, one.block, FLOOR).findings == ()
 
 
+@pytest.mark.nightly
 @pytest.mark.costs(3)
-@pytest.mark.slow
 def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(sized) -> None:
     """The same terms as of the whole block, under its numbers, and nothing of views far away."""
     one = solved(step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 4, 20.0), views=6, tracks=300)

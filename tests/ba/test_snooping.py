@@ -144,6 +144,7 @@ def test_two_points_that_contradict_each_other_are_never_good(seed):
     assert not any("Nothing checks" in line for line in summary.verdict)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", ONE)
 @pytest.mark.parametrize(("times", "good"), [(1.0, True), (3.5, False)])

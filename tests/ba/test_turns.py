@@ -99,6 +99,7 @@ def test_cameras_that_are_all_worse_than_stated_are_said_to_be_and_none_is_blame
     assert 0.15 < np.mean(nees) < 3.0
 
 
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
 @pytest.mark.parametrize("views", [4, 6, 12])
 def test_one_that_is_far_off_among_others_that_hold_is_named(views: int) -> None:

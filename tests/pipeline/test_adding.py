@@ -125,10 +125,8 @@ def refused(work: Callable[[], object], *words: str) -> bool:
     return False
 
 
+@pytest.mark.nightly
 @pytest.mark.costs(10)
-@pytest.mark.slow
-@pytest.mark.landing(1)
-@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(50))
 def test_a_chain_of_runs_refuses_nothing_without_cause_and_says_nothing_false(
     seed: int, archive: Path, tmp_path: Path

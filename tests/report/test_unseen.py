@@ -75,9 +75,7 @@ def test_rows_displaced_in_both_coordinates_are_no_lost_lines() -> None:
     assert [one.kind for one in found.findings] == ["step"]
 
 
-@pytest.mark.costs(9)
-@pytest.mark.slow
-@pytest.mark.parametrize(("lines", "views"), [(3.0, 3), (0.0, 2)])
+@pytest.mark.parametrize(("lines", "views"), [pytest.param(3.0, 3, marks=pytest.mark.nightly), (0.0, 2)])
 def test_a_third_image_sees_it_and_where_nothing_jumped_nothing_is_said(lines: float, views: int) -> None:
     run, _ = jumped(lines, views)
     assert not [part for i in range(views) for part in unseen_parts(run, i)]

@@ -143,7 +143,7 @@ def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, sea
     assert found.views[0].peak == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     with rasterio.open(reference) as file:
         pixels, profile, place = file.read(1), file.profile, file.transform

@@ -249,6 +249,7 @@ def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray
     return float(np.median(ours) - np.median(theirs))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("left", "right"),

@@ -100,6 +100,7 @@ def _unpickled(task: bytes):
     return pickle.loads(pickle.dumps(function(*args, **rest)))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "number", "side"),

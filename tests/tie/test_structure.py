@@ -87,7 +87,7 @@ def test_another_place_is_refused(render, winter) -> None:
         find_tracks([winter[0], replace(winter[1], path=other.path)], TieOptions(matcher=STRUCTURE, search=90.0))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     scene = render(views=2)
     found = find_tracks(scene.views, TieOptions(matcher=STRUCTURE))
