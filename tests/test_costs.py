@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from tests.costs import allowed
+
+MOST = 300.0  # CPU seconds of all cases at a landing that say that they take longer: a third of it
+
 CASES = """
 import pytest, time
 def busy(seconds):
@@ -51,3 +55,8 @@ def test_parts_are_all_tests_together_and_what_is_not_begun_in_time_is_said(pyte
     found = pytester.runpytest_inprocess(*how, "--minutes", "0")
     found.assert_outcomes(skipped=12)
     found.stdout.fnmatch_lines(["SKIPPED *not begun in 0 minutes"])
+
+
+def test_the_cases_that_take_longer_are_a_third_of_a_landing(request: pytest.FixtureRequest) -> None:
+    longer = [item for item in request.session.items if item.get_closest_marker("costs")]
+    assert sum(allowed(item) for item in longer if not item.get_closest_marker("nightly")) <= MOST

@@ -129,7 +129,6 @@ def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, 
 
 
 @pytest.mark.nightly
-@pytest.mark.costs(3)
 @pytest.mark.parametrize("length", [0.05, -0.05])
 def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
     seen = residuals_of(transient(6.0, length), views=4, tracks=200)
@@ -430,7 +429,6 @@ def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_s
 
 
 @pytest.mark.nightly
-@pytest.mark.costs(3)
 def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(sized) -> None:
     """The same terms as of the whole block, under its numbers, and nothing of views far away."""
     one = solved(step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 4, 20.0), views=6, tracks=300)

@@ -126,7 +126,6 @@ def refused(work: Callable[[], object], *words: str) -> bool:
 
 
 @pytest.mark.nightly
-@pytest.mark.costs(10)
 @pytest.mark.parametrize("seed", range(50))
 def test_a_chain_of_runs_refuses_nothing_without_cause_and_says_nothing_false(
     seed: int, archive: Path, tmp_path: Path

@@ -17,7 +17,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::barpc.base.e
 
 
 @pytest.mark.nightly
-@pytest.mark.costs(6)
 @pytest.mark.parametrize("off", [(0.0, 0.0), (150.0, 0.0), (400.0, -300.0), (-700.0, 500.0)])
 def test_cameras_far_off_are_found_on_an_orthoimage(shared_data: Path, off: tuple[float, float]) -> None:
     folder = shared_data / "cross_sensor/ngi_2015"
