@@ -52,13 +52,14 @@ from barpc.base.sealed import (
     read_state,
 )
 from barpc.base.tasks import Store
-from barpc.rpcio import hidden_by
 
 logger = logging.getLogger(__name__)
 
 LOCK, CACHE = "lock", "cache"
 _FILES = (STATE_FILE, NOTES, LOCK)
 
+SIDECAR_ENDS = ".rpb", ".xml", ".txt", ".rpc", ".geom"
+"""How names of files end that `barpc.rpcio` reads beside an image."""
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
 
@@ -210,6 +211,10 @@ class Workspace:
 
         For the inputs it does not matter whether barpc wrote such a file before.
         """
+        if not any(name.lower().endswith(SIDECAR_ENDS) for name in names):
+            return
+        from barpc.rpcio import hidden_by  # with GDAL
+
         for path, image, _ in hidden_by(self.folder / name for name in names):
             known = "the input " * (image.resolve() in self._keep)
             if known or not (self.owns(image.name) or os.path.lexists(path)):

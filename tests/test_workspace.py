@@ -681,3 +681,11 @@ def test_stages_and_the_place_of_a_run_outlast_what_is_added_to_it(tmp_path):
     with Workspace(tmp_path / "moved", adds=True):
         pass
     assert json.loads((tmp_path / "moved/.barpc/state.json").read_text())["stages"] == []
+
+
+def test_every_name_read_beside_an_image_may_hide_its_rpc():
+    from barpc.rpcio.sources import _sidecar_names
+    from barpc.workspace import SIDECAR_ENDS
+
+    for image in ("a.tif", "IMG_PHR1A_P_001_R1C1.TIF", "IMG-HH-ALPSMW.tif", "10APR-P2AS_R1C1-012_P001.NTF", "noend"):
+        assert all(name.lower().endswith(SIDECAR_ENDS) for _, name, _ in _sidecar_names(image))
