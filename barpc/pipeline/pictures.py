@@ -14,6 +14,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcError, listed
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.remote import is_url
+from barpc.base.tasks import Work
 from barpc.pipeline.executor import by_groups
 from barpc.report import Run, Summary
 from barpc.report.outcome import PairTies
@@ -23,7 +24,6 @@ from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.tie.patches.channels import picture, ticks
 from barpc.tie.pixels import Stretch, jpeg, thumbnail
-from barpc.tie.tasks import Work
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)

@@ -25,6 +25,7 @@ from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_optio
 from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.base.sealed import portable
+from barpc.base.tasks import Progress, Work
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.acquisitions import one_each
@@ -68,7 +69,6 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.pairing.overlaps import Pair, best_pairs, possible_pairs
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
-from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
