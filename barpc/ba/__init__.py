@@ -1,9 +1,9 @@
 """Tracks to corrections: the bundle adjustment.
 
 `adjust_tracks` is the entry; `AdjustOptions` says how it runs, `Adjustment` what it found. `consistent_observations`
-moves no camera and says which observations agree; `passes_told` tells how far either is. `block_prior` keeps what a block knows for a later run with more
-views; `pair_heights` says how well a stereo pair knows heights; `split_points` and `check_residuals` keep known points
-out of the solve and measure it by them.
+moves no camera and says which observations agree; `passes_told` tells how far they are. `block_prior` keeps what a
+block knows for a later run with more views; `pair_heights` says how well a stereo pair knows heights; `split_points`
+and `check_residuals` keep known points out of the solve and measure it by them.
 """
 
 from barpc.ba.adjustment import adjust_tracks, consistent_observations
