@@ -93,7 +93,7 @@ class FitEntry(Record):
     method: str = column("Solver", head="solver")
     num_check_points: Count = column("Check points", head="check points")
     localisation_m: Number = column(
-        "Largest error of the localisation RPC against P_BA on the ground", "m", default=None
+        "Largest error of the localisation RPC against the corrected camera on the ground", "m", default=None
     )
 
 
@@ -155,7 +155,7 @@ class ViewEntry(Record):
     @property
     def reservation(self) -> str:
         """Its verdict and advice as a sentence; without meaning for an image without reservation."""
-        return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
+        return f"{self.name}: {STATUS_WORDS[self.status]}. {self.advice}."
 
     name: str = column("Unique in the run", head="image", min_length=1)
     path: str = column("The image; empty for a view without pixels")
@@ -181,7 +181,7 @@ class ViewEntry(Record):
     camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
     fit: FitEntry | None = column("Certificate of the refitted RPC; null where none was fitted")
     outputs: Mapping[Annotated[str, Meta(pattern="^[^/]+$")], Mapping[str, float | str | None]] = column(
-        "File -> consumer -> difference to P_BA in px, or the reason without one"
+        "File -> consumer -> difference from the corrected camera in px, or the reason without one"
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
