@@ -186,7 +186,6 @@ def _with_block(
     """Write the block and the list of its images, and with `update` the cameras that move; return what that says."""
     assert run.adjustment is not None
     options = run.options
-    assert isinstance(options, RunOptions)
     with _stage_progress(workspace, "block", work.progress):
         block = block_prior(run.joint or run.adjustment)
         if run.earlier is not None:
@@ -238,7 +237,6 @@ def _portable_run(run: Run, folder: Path) -> Run:
         return tuple(map(at, path)) if isinstance(path, tuple) else portable(os.fspath(path), folder)
 
     options = run.options
-    assert isinstance(options, RunOptions)
     given = {key: getattr(options, key) for key in file_options()}
     return replace(
         run,
