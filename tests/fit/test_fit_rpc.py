@@ -132,6 +132,7 @@ def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> N
     assert fit.h[0] == fit.h[1]
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 def test_numbers_fitted_for_nitf_survive_it(some_vendors: list[Camera]) -> None:
     """Copying a good RPC into that format costs whole pixels."""
