@@ -23,7 +23,7 @@ from barpc.ba.solution import Solution
 from barpc.base.geodesy import enu_basis
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.report.page import decisions
+from barpc.report.answers import decisions
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from benchmarks import worlds_families as families

@@ -16,7 +16,7 @@ from barpc.base.geodesy import DEFAULT, STATED
 from barpc.rasters.dem import Dem, HeightGrid, datum_of, localize_on_terrain
 from barpc.rasters.vertical import Vertical, geoid_file, vertical_of
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import altitude_range
 from tests.sensor.conftest import make_rpc
 
 STEP = 0.01

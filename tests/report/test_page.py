@@ -85,7 +85,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
         "Do the pairs fit for stereo, and can heights be measured?",
         "How was each camera corrected?",
         "How uncertain are position and shape of the scene?",
-        "Which decisions were made, and on which figures?",
+        "What was decided, and why?",
         "Do the new RPC files reproduce the corrected cameras?",
         "With which options, and how much data?",
     ]

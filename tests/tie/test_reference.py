@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
+from barpc.base.tasks import HERE
 from barpc.pipeline.loading import load_views
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
@@ -30,7 +31,6 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
-from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference

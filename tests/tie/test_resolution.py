@@ -11,7 +11,8 @@ import pytest
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import altitude_range, epipolar_offset
+from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.rpc import altitude_range
 from barpc.tie import Matches, Pair, Scope, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
