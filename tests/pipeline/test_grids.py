@@ -445,7 +445,7 @@ def block(tmp_path_factory):
     return write_block(folder, 3)[1], str(folder / "matches.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
     images, matches = block
     options = RunOptions(matches=matches, matches_only=True, grids=True)
