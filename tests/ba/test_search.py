@@ -309,7 +309,7 @@ def placed(kind: str, view: int = 0) -> Term:
     return TERMS[kind](view, none, np.full(2, 0.5), 0.0, (1, 2.0, 5.0, 0.0, 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):

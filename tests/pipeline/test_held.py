@@ -54,8 +54,7 @@ def test_what_is_printed_is_what_lies_on_disk(tmp_path: Path) -> None:
     assert len(moved) == 1
 
 
-@pytest.mark.costs(5)
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_chain_that_held_ends_where_the_whole_does_when_it_is_updated(tmp_path: Path) -> None:
     few = {"points_per_image": 600}
     whole = barpc.adjust(VIEWS, tmp_path / "whole", **few)

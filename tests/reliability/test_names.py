@@ -173,6 +173,7 @@ def test_a_name_that_files_cannot_carry_is_refused_in_one_line(name, where, pris
         assert hashes([tmp_path]) == before
 
 
+@pytest.mark.nightly
 @pytest.mark.slow  # before a commit: names of images, and folders that are refused
 def test_folders_may_be_called_so(pristine, tmp_path):
     deep = tmp_path.joinpath(*FOLDERS)
