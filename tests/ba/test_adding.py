@@ -197,7 +197,7 @@ def test_old_views_need_no_tie_points_and_new_ones_do(sixty) -> None:
         adjust_tracks(*part(made, far, new), prior=prior)
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*constrained in height")
 @pytest.mark.parametrize("seed", range(12))

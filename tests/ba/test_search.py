@@ -92,6 +92,7 @@ def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.Mo
 # --- what is named ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.landing(3)
 @pytest.mark.parametrize("seed", rest_slow([1, 2]))
 @pytest.mark.parametrize(
     ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str

@@ -186,6 +186,7 @@ def test_folders_may_be_called_so(pristine, tmp_path):
             assert vrt.read(1).any()
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("names", rest_slow([["#a", " b "], ["-c", '"d']]), ids=short)
 def test_lists_of_images_hold_every_name(pristine, tmp_path, names):
