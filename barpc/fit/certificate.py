@@ -10,11 +10,12 @@ shape is assumed, so that oscillations, bursts and steps count equally.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from barpc.base.fields import given
 from barpc.base.frozen import Shown
 from barpc.base.geodesy import Array, metres_per_unit, parts, wrap_longitude
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
@@ -186,7 +187,8 @@ class RpcFit(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Return the certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        values = given(self)
+        del values["rpc"]
         for name in ("localisation", "reason"):
             part = values.pop(name)
             values |= {} if part is None else {name: asdict(part)}

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 
 from barpc.base.errors import FitError
+from barpc.base.fields import field_names
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
 from barpc.base.statistics import SURELY
@@ -269,7 +270,7 @@ def _nitf_coeffs(coeffs: Array) -> Array:
 
 
 def _rpcm_normalization(norm: Normalization) -> Normalization:
-    return Normalization(*(np.round(getattr(norm, name), 12) for name in norm._given()))
+    return Normalization(*(np.round(getattr(norm, name), 12) for name in field_names(Normalization)))
 
 
 class Precision(NamedTuple):
