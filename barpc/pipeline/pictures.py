@@ -48,7 +48,7 @@ def write_pictures(workspace: Workspace, run: Run, summary: Summary, work: Work)
     work : Work
     """
     chosen = [run.views[run.number[view.name]] for view in worst_first(summary.views)[:MAX_PICTURES]]
-    band: int = getattr(getattr(run.options, "tie", None), "band", 1)
+    band = run.options.tie.band
     most = min(_MOST_BYTES, _ALL_BYTES // max(len(chosen), 1))
     found = by_groups(work.executor, thumbnails, chosen, (band, most), "pictures", None)
     images = [one for group in found for one in group if "picture" in one]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations, passes_told
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
@@ -186,7 +186,6 @@ def _with_block(
     """Write the block and the list of its images, and with `update` the cameras that move; return what that says."""
     assert run.adjustment is not None
     options = run.options
-    assert isinstance(options, RunOptions)
     with _stage_progress(workspace, "block", work.progress):
         block = block_prior(run.joint or run.adjustment)
         if run.earlier is not None:
@@ -238,7 +237,6 @@ def _portable_run(run: Run, folder: Path) -> Run:
         return tuple(map(at, path)) if isinstance(path, tuple) else portable(os.fspath(path), folder)
 
     options = run.options
-    assert isinstance(options, RunOptions)
     given = {key: getattr(options, key) for key in file_options()}
     return replace(
         run,
@@ -253,6 +251,24 @@ def _portable_run(run: Run, folder: Path) -> Run:
 def _report_progress(progress: Progress | None, stage: str, done: int) -> None:
     if progress is not None:
         progress(stage, done, 1)
+
+
+@contextmanager
+def _passes(progress: Progress | None) -> Iterator[None]:
+    """Report the passes of an adjustment: their total, which residuals decide, is 0 until its end."""
+    last = 0
+
+    def tell(number: int) -> None:
+        nonlocal last
+        last = number
+        if progress is not None:
+            progress("adjustment", number, 0)
+
+    tell(0)
+    with passes_told(tell):
+        yield
+    if progress is not None:
+        progress("adjustment", last, last)
 
 
 @contextmanager
@@ -406,7 +422,7 @@ def _tied_and_adjusted(run: Run, options: RunOptions, dem: Dem | None, workspace
     if dem is not None and options.reference:
         with workspace.stage("reference"):
             run = replace(run, reference=_register_to_reference(run, options, dem, work))
-    with _stage_progress(workspace, "adjustment", work.progress):
+    with workspace.stage("adjustment"), _passes(work.progress):
         return _with_adjustment(run, options, dem)
 
 

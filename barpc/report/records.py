@@ -60,8 +60,6 @@ def column(
 class Record(Value):
     """A part of the summary: its children are frozen dataclasses whose fields are declared by `column`."""
 
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
     OWN: ClassVar[Mapping[str, Column]] = {}
     """Columns of tables that are no fields."""
 

@@ -153,6 +153,7 @@ def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
     assert ecef_from_ground(gcps.lonlatalt).shape == (5, 3)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("ventoux", ["right_image"], indirect=True)
 @pytest.mark.parametrize("with_geoid", [True, False])

@@ -96,6 +96,8 @@ def surface(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
     return 180.0 + 2000.0 * (lon - 5.0) - 900.0 * (lat - 44.0)
 
 
+@pytest.mark.landing(50)
+@pytest.mark.few(25)
 @pytest.mark.parametrize(
     ("crs", "geoid", "says"),
     [

@@ -54,6 +54,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, when: int, c
         yield seen
 
 
+@pytest.mark.landing(5)
 @pytest.mark.parametrize(
     ("where", "name", "least"),
     [

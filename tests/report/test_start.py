@@ -49,6 +49,7 @@ def run(tmp_path_factory) -> Path:
     return folder / "run"
 
 
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "most"),

@@ -60,6 +60,7 @@ def left(xy: np.ndarray) -> float:
     return float(np.mean(xy[:, 0] < SIDE / 2))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("most", "zoom"),
