@@ -26,9 +26,9 @@ from barpc.base.errors import visible
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
+    from barpc.base.tasks import Progress
     from barpc.report import Summary
     from barpc.report.summary import StepEntry
-    from barpc.tie.tasks import Progress
 
 
 EXIT_GATE = 3
@@ -335,8 +335,9 @@ class Lines:
                 return
             self._said = time
             line = f"{self._stage}: {self._done} of {self._total}"
-            if self._total == 1:
-                line = f"{self._stage}: at work for {_minutes(spent)}"
+            if self._total <= 1:
+                at = f"pass {self._done}, " * (self._done > self._total)
+                line = f"{self._stage}: {at}at work for {_minutes(spent)}"
             elif self._done:
                 line += f", about {_minutes(spent / self._done * (self._total - self._done))} left"
         self._say(line)
@@ -369,7 +370,7 @@ def _bars() -> Iterator[Progress]:
             finish()
             label = visible(f"{stage:<22}")
             bars[stage] = click.progressbar(length=total, label=label, show_pos=True, file=sys.stderr)
-        bars[stage].length = total
+        bars[stage].length = total or None  # None: the number alone, and no time left
         bars[stage].update(done - bars[stage].pos)
 
     try:

@@ -8,7 +8,7 @@ from barpc.base.errors import listed
 from barpc.report.summary import Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, capital
 
 GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
@@ -79,5 +79,4 @@ def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -
     if not status:
         return [f"{len(alike)} files were left out, {names}: {why}"]
     start = f"{len(alike)} images: {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
-    remedy = CAUSES[why].remedy.format(image="IMAGE")
-    return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]
+    return [". ".join(filter(None, (start, capital(CAUSES[why].remedy.format(image="IMAGE"))))) + "."]

@@ -149,6 +149,7 @@ def test_ground_that_moves_within_a_pass_moves_by_more_than_matches_err(block: A
         assert 1.0 < one.motion.metres < 11.0
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
 def test_a_deck_that_covers_more_than_half_is_told_by_the_priors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its cameras are far from where they were delivered; without that it is the larger group that stands."""
@@ -189,6 +190,8 @@ def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: floa
     assert swapped.lies_across() == across
 
 
+@pytest.mark.costs(5)
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
 def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = simulate_block(4, 600, seed=1)
