@@ -89,8 +89,9 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the points (P, 3) near `first` that cameras of unknowns (N, q) see robustly, and how much each
-    observation, of sigma (K,) [px], counts.
+    """Return the points (P, 3) of observations of sigma (K,) [px] by a robust loss, and the weights (K,) by it.
+
+    The cameras, of unknowns (N, q), are linear between these and the points `first`.
     """
     xy, counted = problem.xy, np.ones(len(sigma))
     projected = problem.project_points(params, first)  # near the end: from here it is linear

@@ -137,10 +137,10 @@ class Rounds:
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
-        """Return what `_robust` does, of cameras found on tracks drawn until each view has `MANY`, and points there.
+        """Return the result of `_robust` with cameras of a sample: of tracks drawn until each view has `MANY`.
 
-        None of few views, where observations tell of others, where the sample is half of all, and where a view lost
-        surely more of it than the others: of so few observations it has no smooth part.
+        None with few views or a joint prior, where the sample is half of all, and where a view lost significantly more
+        of it than the others: so few observations have no smooth part.
         """
         structure, use = start.structure, self.use
         if structure.num_views < _SAMPLED_VIEWS or self.smooth.alike is not None or start.joint_prior is not None:
