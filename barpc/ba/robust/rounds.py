@@ -139,8 +139,8 @@ class Rounds:
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
         """Return the result of `_robust` with cameras of a sample: of tracks drawn until each view has `MANY`.
 
-        None with few views or a joint prior, where the sample is half of all, and where a view lost significantly more
-        of it than the others: so few observations have no smooth part.
+        None with few views or a joint prior, where the sample is a quarter of all, and where a view lost significantly
+        more of it than the others: so few observations have no smooth part.
         """
         structure, use = start.structure, self.use
         if structure.num_views < _SAMPLED_VIEWS or self.smooth.alike is not None or start.joint_prior is not None:
@@ -150,7 +150,7 @@ class Rounds:
         chosen = np.isin(np.arange(structure.num_points), structure.point[~self.observations.is_tie])
         chosen[structure.point[order[np.arange(len(order)) - structure.bounds[structure.view] < MANY]]] = True
         rest = ~chosen[structure.point]
-        if rest.sum() <= 0.5 * len(rest):
+        if rest.sum() <= 0.75 * len(rest):
             return None
         part = self.block.without(rest)
         seen = make_structure(part.view, part.point, structure.num_views, structure.num_points, structure.place)
