@@ -77,7 +77,7 @@ class Frozen(Shown):
         # of another record, which nobody can write to either
         kept = isinstance(given, np.ndarray) and given.flags.owndata and not given.flags.writeable
         what = f"{type(self).__name__} {name}"
-        if np.ma.is_masked(given) or np.iscomplexobj(given):
+        if np.any(getattr(given, "mask", False)) or np.iscomplexobj(given):
             raise error(f"{what}: masked or complex numbers; leave them out, or give their real parts")
         value: npt.NDArray[Any] = np.array(given, dtype=dtype, copy=None if kept else True)
         if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):

@@ -26,9 +26,9 @@ from barpc.base.errors import visible
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
+    from barpc.base.tasks import Progress
     from barpc.report import Summary
     from barpc.report.summary import StepEntry
-    from barpc.tie.tasks import Progress
 
 
 EXIT_GATE = 3

@@ -33,6 +33,7 @@ from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.frozen import Shown
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import plain_path
+from barpc.base.tasks import Progress, one_by_one
 from barpc.base.verb_options import DsmOptions
 from barpc.cameras import open_camera
 from barpc.dsm.stereo import (
@@ -59,7 +60,6 @@ from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
 from barpc.tie.pairing.overlaps import Footprints
 from barpc.tie.pixels import read_pixels, sample_stretch
-from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import CalibrateKeywords, PathLike
-    from barpc.tie.tasks import Progress
+    from barpc.base.tasks import Progress
 
 logger = logging.getLogger(__name__)
 

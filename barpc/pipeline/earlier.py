@@ -339,7 +339,7 @@ def of_new(tracks: Tracks, is_old: BoolArray) -> Tracks:
 def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], folder: Path, block: BlockPrior) -> str:
     """Return the text of `tables/images.json`: the images of a block, those of an earlier run behind it too."""
     assert run.adjustment is not None
-    hosts = getattr(run.options, "allow_remote", ())
+    hosts = run.options.allow_remote
     choices: dict[str, Mapping[str, str] | None] = {}
     for image in given:
         choices[str(image_path(image, hosts))] = None if isinstance(image, View) else split_spec(image, hosts)[1]

@@ -16,6 +16,7 @@ from barpc.base.atomic import write_text
 from barpc.base.errors import BarpcError, FitError, OutputError, RpcError
 from barpc.base.geodesy import Array
 from barpc.base.options import RunOptions
+from barpc.base.tasks import Progress, ordered
 from barpc.fit import RpcFit
 from barpc.fit.points import Sample, widened
 from barpc.fit.refit import fit_only
@@ -31,7 +32,6 @@ from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
-from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)

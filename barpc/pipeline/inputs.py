@@ -21,6 +21,7 @@ from barpc.base.options import RunOptions
 from barpc.base.remote import here, located, location
 from barpc.base.safe_io import IMAGE, read_names, versioned
 from barpc.base.statistics import robust_spread
+from barpc.base.tasks import Progress, ordered
 from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
@@ -37,7 +38,6 @@ from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.pairing.overlaps import reach_of
 from barpc.tie.patches.channels import Sheet
-from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from barpc.rpcio import format_for, hidden_by
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
 
 if TYPE_CHECKING:
-    from barpc.tie.tasks import Progress
+    from barpc.base.tasks import Progress
 
 REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
 SAME, MOVED, LATER, NOT_ASKED = "same", "moved", "later", "not asked"

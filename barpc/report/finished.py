@@ -15,7 +15,6 @@ from barpc.base.keywords import PathLike
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.sealed import Sealed
-from barpc.rasters.raster import sources_of
 from barpc.report.renamed import is_old
 from barpc.report.runfiles import (
     FOLDER,
@@ -61,6 +60,8 @@ class FinishedRun:
         """
         if not (os.path.lexists(folder / LAST) and any(os.path.lexists(folder / name) for name in (SUMS, STATE))):
             return
+        from barpc.rasters.raster import sources_of  # with GDAL: to read no image, none is asked for
+
         run, names = cls.open(folder), {file.name for file in files}
         if of_images:
             outputs = [view.outputs for view in run.summary.views] + [one.outputs for one in run.summary.carried or ()]
@@ -117,6 +118,8 @@ class FinishedRun:
         """
         if (entry := self.inputs.get(path)) is None:
             return self.sealed.input(path, "")
+        from barpc.rasters.raster import sources_of
+
         found = self.sealed.input(path, entry.sha256, entry.bytes, more)
         for source in () if is_url(found) else sources_of(found):
             self.ask(source)

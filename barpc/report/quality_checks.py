@@ -114,9 +114,9 @@ def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
         yield "no_overlap" if run.matched and not tried else "untied", {"tried": words}
     if apart is not None and apart.placed is None:
         yield "contradicts_all" if apart.look.as_stated else "other_rpc", {"strangeness": strangeness(apart)}
-    tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
+    tolerance = run.options.fit.tolerance
     # grids represent the camera where the RPC does not
-    beyond = _follows_more(view, run) or getattr(run.options, "grids", False)
+    beyond = _follows_more(view, run) or run.options.grids
     if view.fit is not None and not beyond and not all(known(v) <= tolerance for v in view.fit.max_px):
         yield "one_rpc_misses", {"tolerance": tolerance}
     # where most contradict the others these are right by majority, and all over it: not as wrong matches do
@@ -195,7 +195,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
 
 def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
     """Yield the misfit of one RPC to a camera with corrections for jitter or detector steps."""
-    told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
+    told = run.options.grids or run.options.resample
     if view.fit is None or view.correction is None or told or not _follows_more(view, run):
         return
     left, most = float(np.linalg.norm([known(v) for v in view.fit.rmse_px])), max(map(known, view.fit.max_px))

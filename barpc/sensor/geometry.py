@@ -25,7 +25,7 @@ from barpc.base.geodesy import (
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Corrections
 from barpc.sensor.curve import cross
-from barpc.sensor.rpc import RPC, RpcStack, localize_stack
+from barpc.sensor.rpc import RpcStack, localize_stack
 from barpc.sensor.timing import Clocked
 
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
@@ -35,12 +35,6 @@ LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
-
-
-def altitude_range(rpc: RPC) -> tuple[float, float]:
-    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
-    offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
-    return offset - scale, offset + scale
 
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:

@@ -272,6 +272,12 @@ class RPC(Pointwise):
 # --- many cameras at once ----------------------------------------------------------------------------------
 
 
+def altitude_range(rpc: RPC) -> tuple[float, float]:
+    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
+    offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
+    return offset - scale, offset + scale
+
+
 class RpcStack:
     """The RPCs among the sensors, their numbers stacked (V of N rows are used, the others stay zero).
 

@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
+    from barpc.base.tasks import Progress
     from barpc.cameras import ImageLike
     from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult, Plan
     from barpc.pipeline.proof import Verification
     from barpc.pipeline.results import OpenedRun
-    from barpc.tie.tasks import Progress
 
 
 def adjust(

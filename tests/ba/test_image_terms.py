@@ -154,7 +154,7 @@ def test_terms_that_check_tracks_contradict_are_refused_and_those_not_asked_for_
     assert found.outcome is off.found.outcome
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() -> None:
     one = solved(STEP, step(1.5, 0, 0.1, 0.25), step(1.5, 2, 0.7, 0.85))
     found = one.with_terms()

@@ -176,7 +176,7 @@ def with_prior(made: Scene) -> Adjustment:
     return adjust_tracks(made.views, made.tracks, common=CommonErrors((prior,) * len(made.views)))
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polynomials", "waves"])
 @pytest.mark.parametrize("looks", [in_track, crossing])

@@ -53,6 +53,7 @@ MIDDLE = {"view": 1, "axis": 1, "start": 0.4, "stop": 0.6, "px": 0.8}
 DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR]), ids=["middle", "end", "detector"])
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
@@ -94,7 +95,7 @@ def test_two_of_them_in_two_images_are_both_found() -> None:
     assert all(one.share < 0.1 and one.off < 0.03 for one in found.left)  # ties beside an end
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_fades_is_named_with_its_length() -> None:
     where = {"view": 1, "axis": 1, "start": 0.0, "stop": 1.1, "px": 4.0, "length": 0.05}
     block, tracks = flawed(3, 2500, where)
@@ -106,6 +107,7 @@ def test_what_fades_is_named_with_its_length() -> None:
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
 
 
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
@@ -213,7 +215,7 @@ def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
     assert not found.left
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_that_wander_are_not_taken_for_strips() -> None:
     block = simulate_block(3, 1000, seed=3, attitude=10e-6, position=2.0)
     xy, rows = block.tracks.xy.copy(), block.views[1].size[1]
@@ -230,7 +232,7 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     assert max(size[0], size[2]) < 0.4 * size[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 600, MIDDLE)
@@ -263,7 +265,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     assert {one.view for one in found.left} == {1}  # and what stands out is still said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -> None:
     """More unknowns than all views may have together, so that explanations are tried on parts of the block."""
     jump = {"view": 30, "axis": 1, "start": 0.5, "stop": 1.1, "px": 3.0}

@@ -616,6 +616,7 @@ def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(cas
     assert asked == [np.count_nonzero((case.problem.structure.point == 11) & (case.weight > 0))]
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("known", "fixed"), diagonal([12, 11], [(), (1,)]))  # the last point: a GCP, a reference's
 def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed, known):

@@ -175,7 +175,7 @@ def found(slc: Scene) -> Adjustment:
     return adjust_tracks(slc.views, slc.tracks())
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 def test_a_moved_orbit_is_followed_by_clocks_as_well_as_by_an_attitude(request, scene: Scene) -> None:
     known = scene is request.getfixturevalue("slc")

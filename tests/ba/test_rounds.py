@@ -208,6 +208,8 @@ def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     assert passes == [6, 2]  # no more than six, and never less than two
 
 
+@pytest.mark.slow
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
     """Their smooth part is chance: weights that took it for the views' misfit moved when they were cut."""
@@ -220,6 +222,7 @@ def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
     assert found.inlier[~wrong].mean() > 0.88  # a tenth is held out
 
 
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_accuracies_stated_far_too_well_leave_no_trace_once_they_are_learnt(seed: int) -> None:
     """What views could not follow under them weighed down their ties, and nothing else may go by it at the end."""

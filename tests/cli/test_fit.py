@@ -14,8 +14,7 @@ from rasterio.crs import CRS
 
 from barpc.cli import main
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, altitude_range
 from barpc.sensor.sentinel1 import RangeDoppler
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.rpcio.conftest import make_rpc

@@ -345,6 +345,7 @@ def test_a_run_that_was_moved_or_copied_passes_and_a_whole_project_too(finished,
     assert findings(tmp_path / "link", project / "images", "--expect", root.upper())[0] == 0
 
 
+@pytest.mark.slow
 def test_the_same_inputs_give_the_same_root_and_no_file_holds_time_or_place(finished, tmp_path, monkeypatch) -> None:
     """Another folder, seen from elsewhere, by other paths; a run that is gone on with; one that is made again."""
     shutil.copytree(finished / "in", tmp_path / "project/in")

@@ -91,7 +91,7 @@ def tallest(after, before):
     return chosen
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_building_that_grew_is_the_change_and_the_rest_is_none(two_dates, tmp_path):
     scene, folder, chosen = two_dates
     with pytest.raises(SystemExit) as stop:

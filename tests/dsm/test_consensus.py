@@ -241,7 +241,8 @@ KINDS = {
 }
 
 
-@pytest.mark.landing(2)
+@pytest.mark.costs(7)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", rest_slow(list(KINDS), 2, pytest.mark.nightly))
 def test_few_cells_are_grossly_wrong_and_hardly_any_is_lost(kind, tmp_path, monkeypatch):

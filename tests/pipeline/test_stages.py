@@ -16,6 +16,7 @@ from rasterio import Affine
 
 from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.options import AdjustOptions, RunOptions
+from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
@@ -36,7 +37,6 @@ from barpc.report import Run
 from barpc.scene import Tracks, View
 from barpc.simulate import simulate_block
 from barpc.tie.reference import Accuracy
-from barpc.tie.tasks import HERE, Work
 from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
 

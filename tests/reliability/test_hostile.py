@@ -177,6 +177,7 @@ WHOLE_RUN = (  # a run goes on to its end: two are enough before a commit
 )  # fmt: skip
 
 
+@pytest.mark.landing(12)
 @pytest.mark.few(4)
 @pytest.mark.parametrize(
     "name",

@@ -82,7 +82,7 @@ def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
     require_same(scene, tmp_path, way, [orders[0], random.Random(way).choice(orders[1:])])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_order_of_three_images_changes_a_byte(scene, tmp_path):
     require_same(scene, tmp_path, "the defaults", list(permutations(images_of(scene, "the defaults"))))
 

@@ -105,6 +105,9 @@ def expected(summary: Summary) -> dict[str, tuple[float | None, ...]]:
     return {one.source: one.sigma_enu_m for step in summary.next for one in step.expected}
 
 
+@pytest.mark.landing(1)
+@pytest.mark.costs(5)
+@pytest.mark.slow
 def test_a_dem_and_control_do_what_was_promised_of_them(case):
     plain, _ = case.adjusted()
     promised = expected(plain)
@@ -123,6 +126,8 @@ def test_a_dem_and_control_do_what_was_promised_of_them(case):
     assert "dem" not in expected(with_dem)
 
 
+@pytest.mark.landing(1)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("between", [1.5, 6.0, 12.0, 20.0])
 def test_a_third_image_does_to_the_height_what_was_promised_of_it(monkeypatch, between):
     """Of a pair of good angle a third one is not asked for."""

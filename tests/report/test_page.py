@@ -161,6 +161,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
     return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines, thumbnails=small)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("num", rest_slow([300, 1000]))
 def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_run, monkeypatch, num):

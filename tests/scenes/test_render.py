@@ -59,7 +59,8 @@ def cast(sensor, terrain, image, step=0.02):
     return found
 
 
-@pytest.mark.landing(2)
+@pytest.mark.costs(4)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [100, pytest.param(300, marks=pytest.mark.nightly)])
 def test_altitudes_are_those_of_brute_force_ray_casting(sensor, surface, count):

@@ -527,7 +527,7 @@ def test_a_verb_works_in_the_process_that_calls_it_unless_told_otherwise():
     assert set(found.values()) == {1}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_processes_write_what_one_does(tmp_path):
     for jobs in (1, 2):
         barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)

@@ -13,11 +13,11 @@ import numpy.typing as npt
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import MANY
+from barpc.base.tasks import Store, Work, names_of
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
 from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
-from barpc.tie.tasks import Store, Work, names_of
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""

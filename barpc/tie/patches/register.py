@@ -19,11 +19,11 @@ import numpy as np
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
+from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
 from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
-from barpc.tie.tasks import HERE, Work
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
