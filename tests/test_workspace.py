@@ -19,7 +19,6 @@ from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
 from barpc.base.memory import peak_memory
 from barpc.base.sealed import noted_outputs
-from barpc.report.runfiles import table_path
 from barpc.workspace import (
     Workspace,
     code_version,
@@ -563,20 +562,6 @@ def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode, numbers)
                 "c": "new asp/c",
             }
             assert json.loads((folder / ".barpc/state.json").read_text())["status"] == "done"
-
-
-def test_a_table_lies_in_its_folder_and_that_of_an_earlier_run_beside_the_summary(tmp_path):
-    new, old = tmp_path / "tables/pairs.csv", tmp_path / "pairs.csv"
-    assert table_path(tmp_path, "pairs.csv") == new  # a message names the new place
-    old.write_text("old")
-    assert table_path(tmp_path, "pairs.csv") == old
-    new.parent.mkdir()
-    new.write_text("new")
-    assert table_path(tmp_path, "pairs.csv") == new
-    old.unlink()
-    new.unlink()
-    old.symlink_to(tmp_path / "nowhere")
-    assert table_path(tmp_path, "pairs.csv") == old  # to be refused by who opens it
 
 
 def test_a_run_whose_last_state_cannot_be_saved_is_not_taken_for_finished(tmp_path, monkeypatch):

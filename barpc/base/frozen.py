@@ -6,9 +6,8 @@ import json
 import math
 import sys
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from html import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,31 +20,7 @@ from barpc.base.remote import Remote
 from barpc.base.safe_io import ARRAYS, BYTES_PER_NUMBER, Kind, opened
 
 
-def html_table(title: str, rows: Iterable[Sequence[object]], heads: Sequence[object] = ()) -> str:
-    """Return a table as HTML for a notebook, every text escaped.
-
-    Examples
-    --------
-    >>> html_table("a < b", [("size", 3)])
-    '<b>a &lt; b</b><table><tr><th>size</th><td>3</td></tr></table>'
-    """
-    lines = [f"<tr>{''.join(f'<th>{escape(str(head))}</th>' for head in heads)}</tr>"] if heads else []
-    for first, *others in rows:
-        cells = "".join(f"<td>{escape(str(cell))}</td>" for cell in others)
-        lines.append(f"<tr><th>{escape(str(first))}</th>{cells}</tr>")
-    return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
-
-
-class Shown:
-    """Base of dataclasses that a notebook shows as a table, a row a field."""
-
-    def _repr_html_(self) -> str:
-        given = [(one.name, getattr(self, one.name)) for one in fields(self) if one.init]  # type: ignore[arg-type]
-        rows = [(name, value if isinstance(value, str | Path) else _short(value)) for name, value in given]
-        return html_table(type(self).__name__, rows)
-
-
-class Frozen(Shown):
+class Frozen:
     """Base of frozen dataclasses (declared with ``eq=False, repr=False``) that hold arrays and plain values.
 
     Arrays are copies of their own and read-only, after unpickling too; equality and hash go by the content of the

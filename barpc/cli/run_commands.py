@@ -97,7 +97,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     edits of a file together with the list. Missing inputs are searched by name beside the run, in it, and in the
     folders given; other hosts are not accessed. --figures measures what the run printed again, by the files on disk as
     another tool reads them, to 0.005 px. Exit code 0: everything is unchanged; 3: something is not; 1: no SHA256SUMS
-    (interrupted, or of release 0.3), or a damaged one.
+    (interrupted), or a damaged one.
 
     \b
     Examples:

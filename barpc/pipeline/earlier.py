@@ -86,7 +86,7 @@ class Earlier:
         """Read a run folder; InputError where it is none, unfinished, of another release, or was changed since."""
         run = FinishedRun.open(folder)
         block, table = run.table(PRIOR_FILE), run.table(IMAGES)
-        if not (run.sealed.layers and block.exists()):
+        if not block.exists():
             raise InputError(f"{block}: missing, or of another release, and later runs start from it: run the "
                              "adjustment again")  # fmt: skip
         prior = BlockPrior.load(block)

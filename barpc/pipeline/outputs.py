@@ -122,7 +122,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
         return [*names, *MATCH_FILES, *(f"asp/{name}" for name in pairs)]
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
-        names += [name for view in views for name in grid_names(view, options)]
+        names += [name for view in views for name in grid_names(view)]
     return [*names, f"{FOLDER}/{IMAGES}", f"{FOLDER}/{PRIOR_FILE}"]
 
 

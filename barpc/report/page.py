@@ -248,8 +248,7 @@ def _corrections_section(files: RunFiles) -> Section | None:
     ]
     if len(moves) < len(views):
         return None
-    radars = any(value_of(view, "correction.range_m") is not None for view in views)
-    tables = _tables_of("corrections", views, more=ViewEntry.CLOCKS * radars)
+    tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
     return _section("moves", f"By up to {max(moves):.2f} px at the image centre.", tables=tables)
 

@@ -195,8 +195,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
 
 def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
     """Yield the misfit of one RPC to a camera with corrections for jitter or detector steps."""
-    told = run.options.grids or run.options.resample
-    if view.fit is None or view.correction is None or told or not _follows_more(view, run):
+    if view.fit is None or view.correction is None or run.options.grids or not _follows_more(view, run):
         return
     left, most = float(np.linalg.norm([known(v) for v in view.fit.rmse_px])), max(map(known, view.fit.max_px))
     follows = "attitude jitter or detector steps"

@@ -306,8 +306,6 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if len(run.tracks) or gcps is not None:
         yield f"The scene as a whole moved by {enu(gauge.shift)}."
     yield from _known_lines(run, run.adjustment, views)
-    if radars := [_clocks(view) for view in views if view.correction and view.correction.timing_sigma]:
-        yield f"Radar timing corrections: {listed(radars, NAMED)}."
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
     if many := [view.name for view in unsaid if anywhere(view, run)]:
         # errors in one image reject tie points of the others, too
@@ -392,13 +390,6 @@ def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Ite
         yield f"With the DEM, {known}."
     else:
         yield f"Without ground control, {known}."
-
-
-def _clocks(view: ViewEntry) -> str:
-    by_range, azimuth, sigma = (
-        value_of(view, f"correction.{name}") for name in ("range_m", "azimuth_ms", "timing_sigma")
-    )
-    return f"{view.name}: range {by_range:+.2f} ± {sigma[0]:.2f} m, azimuth {azimuth:+.3f} ± {sigma[1]:.3f} ms"
 
 
 def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:

@@ -21,7 +21,6 @@ from rasterio.windows import Window
 from barpc import __version__
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, Remark
-from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
 from barpc.base.tasks import Progress
@@ -58,7 +57,7 @@ _WGS84 = CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True)
-class Ortho(Shown):
+class Ortho:
     """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with.
 
     `doubts`: reasons why the camera is not that of its image, in sentences.

@@ -206,8 +206,6 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
         (0.06, 0.16, {}, True),
         (0.07, 0.15, {}, True),
         (0.07, 0.25, {"grids": True}, False),
-        (0.07, 0.25, {"tiles": 512}, False),
-        (0.07, 0.25, {"resample": True}, False),
     ],
 )
 def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, most, options, doubted):
@@ -459,14 +457,6 @@ def test_what_tie_points_agree_to_is_the_median_over_the_images():
     assert any("moved by" in line for line in said(run_of(tracks=[], gcps=gcps()), of))
     check = block_verdict(run_of(kind="check"), of)["verdict"]
     assert check == ["Tie points of 3 images agree to 2.000 px with the cameras as given."]
-
-
-def test_the_clocks_of_radars_are_said():
-    radar = a_correction(range_m=1.5, azimuth_ms=-0.25, timing_sigma=(0.1, 0.02))
-    lines = said(run_of(), [a_view("A"), a_view("B", correction=radar)])
-    assert "Radar timing corrections: B: range +1.50 ± 0.10 m, azimuth -0.250 ± 0.020 ms." in lines
-    lines = said(run_of(), [a_view(f"B{k}", correction=radar) for k in range(7)])
-    assert any(line.endswith("ms and 2 more.") for line in lines)
 
 
 def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():

@@ -35,8 +35,8 @@ from barpc.sensor.image_corrections import (
     RowSpline,
     Splined,
 )
+from barpc.sensor.radar import aside, dot, on_circle
 from barpc.sensor.sicd import ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler, open_sicd
-from barpc.sensor.timing import Timing, aside, dot, on_circle
 from tests.sensor.conftest import MODELS, make_rpc
 from tests.sensor.radar_documents import document
 from tests.sensor.test_geometry import tilted_rpc
@@ -292,12 +292,6 @@ def test_rows_of_a_spline_move_each_other_in_the_derivative() -> None:
         step[:, axis] = 5.0 / metres_per_unit(ground)[:, axis]
         difference = (model.project(ground + step) - model.project(ground - step)) / 10.0
         np.testing.assert_allclose(jacobian[..., axis], difference, rtol=0, atol=1e-4)
-
-
-def test_a_timing_and_its_rate_are_polynomials_of_the_place_along_the_flight() -> None:
-    timing = Timing([[3.0, 1e-4], [0.5, -2e-5], [0.25, 0.0]], 100.0, 50.0)
-    np.testing.assert_allclose(timing.at(np.array([100.0, 150.0, 0.0])), [[3.0, 3.75, 3.0], [1e-4, 8e-5, 1.4e-4]])
-    np.testing.assert_allclose(timing.rate(np.array([100.0, 150.0])), [[0.01, 0.02], [-4e-7, -4e-7]])
 
 
 # --- geometry ----------------------------------------------------------------------------------------------------

@@ -110,8 +110,8 @@ def minimise(
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "scipy", "sparse" or "auto"
-    (see the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
+    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "auto" or "sparse" (see
+    the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
     ------

@@ -50,12 +50,6 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = column("Length of T", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
-    range_m: Number = column("Radar: correction of the range", "m", "range", "+.3f", default=None)
-    azimuth_ms: Number = column("Radar: correction of the azimuth time", "ms", "azimuth", "+.4f", default=None)
-    timing_sigma: Pixel | None = column("Posterior standard deviations of both, m and ms", default=None)
-    timing_slopes: tuple[Pixel, ...] | None = column(
-        "Radar: further correction at the end, m and ms, by power", default=None
-    )
     jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = column("Rows between its knots", "px", default=None)
     detector_px: Number = column("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
@@ -92,9 +86,6 @@ class FitEntry(Record):
     coverage: Number = column("Share of the image covered by the fit's points", head="covered", form=".0%")
     method: str = column("Solver", head="solver")
     num_check_points: Count = column("Check points", head="check points")
-    localisation_m: Number = column(
-        "Largest error of the localisation RPC against the corrected camera on the ground", "m", default=None
-    )
 
 
 def _moves(view: ViewEntry) -> list[Cell]:
@@ -136,7 +127,6 @@ class ViewEntry(Record):
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
     CONTROL: ClassVar = "name control_w control_w_point"
-    CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fit.coverage fit.num_check_points fit.method"
     )

@@ -170,7 +170,7 @@ CAUSES = {
         "add an image from another direction, or a DEM (--dem)"),
     "follows_more": Cause("doubtful", "one RPC is not enough",
         "its corrected camera includes {follows}, and one RPC misses it by {left:.2f} px (RMS; {most:.2f} px at most)",
-        "use its grids ({image}_grid.tif), or --resample"),
+        "use its grids ({image}_grid.tif)"),
     "disagrees": Cause("doubtful", "cameras disagree",
         "tie points have residuals of {error:.2f} px", "adjust the cameras"),
     "left": Cause("doubtful", "large residuals",
