@@ -21,6 +21,11 @@ _SIGNIFICANT = 1e-4  # probability of the F test below which systematic residual
 _WIDENED = 1.005  # factor that reads as more than 1.0
 _ROUNDING = 1e-6  # px
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
+FOOTER = (
+    "Residuals are projected minus observed. Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of "
+    "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
+    "observations.csv, pairs.csv, footprints.geojson."
+)
 
 
 def of_images(views: Sequence[ViewEntry], agree: bool) -> str:
