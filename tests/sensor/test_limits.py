@@ -19,7 +19,6 @@ from barpc.sensor.curve import Curve, about_middle, rotation_matrix
 from barpc.sensor.document import XmlFields, parse_time, seconds
 from barpc.sensor.geometry import (
     Several,
-    altitude_range,
     camera_center,
     image_border,
     image_grid,
@@ -36,6 +35,7 @@ from barpc.sensor.image_corrections import (
     Splined,
 )
 from barpc.sensor.radar import aside, dot, on_circle
+from barpc.sensor.rpc import altitude_range
 from barpc.sensor.sicd import ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler, open_sicd
 from tests.sensor.conftest import MODELS, make_rpc
 from tests.sensor.radar_documents import document
