@@ -208,8 +208,7 @@ def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     assert passes == [6, 2]  # no more than six, and never less than two
 
 
-@pytest.mark.slow
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
     """Their smooth part is chance: weights that took it for the views' misfit moved when they were cut."""
