@@ -159,7 +159,7 @@ class Rounds:
         few._search()
         kept, count = seen.sum_views(np.stack([few.counted, few.use])).T
         usual = kept.sum() / count.sum()
-        if (kept < usual * count - OUTLIER * np.sqrt(usual * (1.0 - usual) * count)).any():
+        if (kept < usual * count - SURELY * np.sqrt(usual * (1.0 - usual) * count)).any():
             return None
         params, sigma = few.state.params, np.where(use, self.observations.sigma * few.noise, np.inf)
         points, counted = robust_points(start, params, self.state.points, sigma)
