@@ -564,7 +564,7 @@ def made(kind: str) -> tuple[Summary, list[str]]:
 KINDS = [pytest.param(kind, marks=pytest.mark.filterwarnings("ignore")) for kind in WORLDS]
 
 
-@pytest.mark.landing(16)
+@pytest.mark.landing(10)
 @pytest.mark.parametrize("kind", rest_slow(KINDS, 8))
 def test_no_sentence_is_against_its_figure(kind):
     summary, sentences = made(kind)
