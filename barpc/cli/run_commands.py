@@ -118,7 +118,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     kinds = {kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in _VERIFIED}
     if not flags.get("figures"):
         del kinds["figure"]
-    tell(found, *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
+    tell(list(found), *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
     if not wrong:
         return 0
     return tell_gate("the run has changed:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))

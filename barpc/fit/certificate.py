@@ -146,8 +146,7 @@ class RpcFit:
 
     def summary(self) -> dict[str, Any]:
         """Return the certificate as plain numbers and lists, col before row, lengths in px."""
-        values = given(self)
-        del values["rpc"]
+        values = {name: held for name, held in given(self).items() if name != "rpc"}
         if (part := values.pop("reason")) is not None:
             values["reason"] = given(part)
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
