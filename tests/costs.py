@@ -15,7 +15,10 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, wraps
+from typing import Any
 
 import pytest
 
@@ -55,18 +58,38 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [by_name[name] for name in kept]
 
 
+@contextmanager
+def charged_to_nobody() -> Iterator[list[float]]:
+    """Its own CPU seconds, once it ends: those of others within it were counted by them."""
+    global shared
+    before, others, own = cpu(), shared, [0.0]
+    try:
+        yield own
+    finally:
+        own[0] = cpu() - before - (shared - others)
+        shared += own[0]
+
+
+def once(make: Callable[..., Any]) -> Callable[..., Any]:
+    """`functools.cache` of what several tests ask for."""
+
+    @cache
+    def made(*args: Any, **options: Any) -> Any:
+        with charged_to_nobody():
+            return make(*args, **options)
+
+    return wraps(make)(made)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup(fixturedef: pytest.FixtureDef[object], request: pytest.FixtureRequest) -> Iterator[None]:
-    global shared
-    before, others = cpu(), shared
-    try:
+    if fixturedef.scope == "function":
         return (yield)
-    finally:
-        if fixturedef.scope != "function":
-            seconds = cpu() - before - (shared - others)
-            shared += seconds
-            if seconds > SLACK * SHARED and request.config.option.cpu == "hold":
-                pytest.fail(f"{fixturedef.argname}, shared: {seconds:.1f} CPU s, {SHARED:g} are allowed", False)
+    with charged_to_nobody() as own:
+        made = yield
+    if own[0] > SLACK * SHARED and request.config.option.cpu == "hold":
+        pytest.fail(f"{fixturedef.argname}, shared: {own[0]:.1f} CPU s, {SHARED:g} are allowed", False)
+    return made
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -7,7 +7,6 @@ errors of its own. Whole blocks are the worlds of `benchmarks.worlds_families`, 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from itertools import starmap
 from types import SimpleNamespace
 from typing import Any
@@ -31,6 +30,7 @@ from benchmarks.worlds import judge
 from benchmarks.worlds_families import CONTROL, make
 from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.costs import once
 from tests.lanes import diagonal, rest_slow
 
 SIGMA = 0.3
@@ -264,7 +264,7 @@ def test_what_a_block_says_of_points_has_the_covariance_that_it_states_of_them()
         np.testing.assert_allclose(whitened, moved @ moved.T + np.eye(3), rtol=0.05, atol=0.05)
 
 
-@cache
+@once
 def flown(kind: str, times: int = 0) -> Any:
     """A world of a kind adjusted, with what is said, and the same block without control."""
     world = make("control", [name for name, _ in CONTROL].index(kind) + times * len(CONTROL))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -18,11 +17,12 @@ from barpc.report.measures.block import explanations
 from barpc.report.outcome import triangulate_tracks
 from barpc.simulate import simulate_block
 from tests.ba.residuals import Displacement, residuals_of, step
+from tests.costs import once
 
 Edges = tuple[tuple[float, tuple[float, float]], ...]
 
 
-@cache
+@once
 def adjusted(edges: Edges, views: int = 3, seed: int = 11, only: int = -1) -> tuple[Adjustment, np.ndarray]:
     """A simulated block with its columns displaced from edges on, and the RMS left of exact tie points [px]."""
     rng = np.random.default_rng(seed)

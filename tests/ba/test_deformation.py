@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from barpc.report.quality_checks import deformation_reasons, dem_reasons
 from barpc.scene import GroundPoints, Terrain, Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
+from tests.costs import once
 
 LON, LAT, NOISE, SIZE = 5.4, 43.3, 0.05, (1200, 1200)
 UNIT = metres_per_unit(np.array([[LON, LAT, 200.0]]))[0, :2]
@@ -78,7 +78,7 @@ def seen_by(num_views: int, count: int) -> tuple[tuple[View, ...], Array, Array]
     return block.views, ground[inside], seen[:, inside] + rng.normal(0, NOISE, (num_views, int(inside.sum()), 2))
 
 
-@cache
+@once
 def ties(num_views: int) -> tuple[tuple[View, ...], Tracks]:
     """Views, and tie points on the hills."""
     views, _, seen = seen_by(num_views, 700)

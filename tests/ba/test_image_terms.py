@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +22,7 @@ from barpc.ba.solution import Solution, solve_block
 from barpc.ba.terms.term import Finding
 from barpc.simulate import simulate_block
 from tests.ba.residuals import DIRECTION, Displacement, cell_errors, sinusoid, step
+from tests.costs import once
 from tests.lanes import rest_slow
 
 # --- how many splines -----------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ class Solved:
         return with_splines(self.found, self.parts, self.options)
 
 
-@cache
+@once
 def solved(*moved: Displacement, tracks: int = 300, all_of: bool = True, **given: Any) -> Solved:
     """Three views, of which the check tracks may be displaced as the others are, or may not."""
     made, options = simulate_block(3, tracks, seed=3, attitude=1e-6, position=0.2), AdjustOptions(**given)

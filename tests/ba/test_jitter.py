@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from barpc.sensor.image_corrections import Splined
 from barpc.simulate import simulate_block
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills
+from tests.costs import once
 from tests.lanes import known, rest_slow
 
 TABLE = cases()
@@ -30,12 +30,12 @@ SHARED = known("0.04 px of one of three images are said to be shared by neighbou
 FOUND = [FEW_STEPS, pytest.param("all", 3000, marks=pytest.mark.nightly)]
 
 
-@cache
+@once
 def scene(name, seed=0, **changed):
     return make(replace(TABLE[name], seed=seed, **changed), hills)
 
 
-@cache
+@once
 def solved(name, seed=0, jitter="auto", detectors=(), **changed):
     made = scene(name, seed, **changed)
     sensors, found = solve(made, AdjustOptions(jitter=jitter, detectors=detectors))
@@ -84,7 +84,7 @@ def test_jitter_that_is_not_followed_stays_and_bends_heights_no_less(seeds, trac
         assert solved(name, seed, **many)[1].shape < 1.05 * off.shape
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_spline_that_is_subtracted_makes_it_worse():
     made = scene("jitter 0.5 at 1 Hz", 1, tracks=1500)
     found, after = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
@@ -251,7 +251,7 @@ def test_the_same_tracks_give_the_same_bytes(name, tracks):
     assert first.splines == again.splines
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_covariance_counts_the_splines():
     found, _ = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     q = found.params.shape[1]
@@ -262,7 +262,7 @@ def test_the_covariance_counts_the_splines():
     assert sigma.max() < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "tracks"), FOUND)
 def test_a_later_run_goes_on_from_splines(tmp_path, name, tracks):
     made = scene(name, 1, tracks=tracks)
@@ -275,7 +275,7 @@ def test_a_later_run_goes_on_from_splines(tmp_path, name, tracks):
     assert [len(spline.edges) for spline in again.splines] == [len(spline.edges) for spline in found.splines]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_best_single_rpc_is_fitted_to_the_camera_with_jitter():
     found, _ = solved("jitter 0.5 at 1 Hz", 1, tracks=1500)
     view, camera = scene("jitter 0.5 at 1 Hz", 1, tracks=1500).views[2], found.sensors[2]

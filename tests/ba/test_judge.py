@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from barpc.scene import Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import Splined
 from barpc.simulate import SimulatedBlock, simulate_block
+from tests.costs import once
 from tests.lanes import rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
@@ -41,7 +41,7 @@ def adjusted(block: SimulatedBlock, tracks: Tracks, **options: Any) -> Adjustmen
     return adjust_tracks(block.views, tracks, AdjustOptions(**options))
 
 
-@cache
+@once
 def in_the_middle() -> tuple[SimulatedBlock, Tracks, Adjustment]:
     """A block of which rows in the middle of an image lie off, and its adjustment."""
     block, tracks = flawed(3, 300, MIDDLE)

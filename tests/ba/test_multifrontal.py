@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from barpc.scene import GroundPoints, Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.constants import Sized
+from tests.costs import once
 from tests.lanes import diagonal
 
 
@@ -180,7 +180,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@cache
+@once
 def _square(views: int) -> SimulatedBlock:
     """So many views in a square."""
     return simulate_block(views, 20 * views, seed=3, num_gcps=5, num_checks=0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from itertools import product, starmap
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from benchmarks.referee import Case, Errors, cases, judge, make, referee, referee_run, solve
+from tests.costs import once
 from tests.lanes import known, rest_slow
 
 SEEDS = (0, 1, 2)
@@ -27,7 +27,7 @@ def hills(lon, lat):
     return 900.0 + sum(waves)
 
 
-@cache
+@once
 def verdict(name, seed, **options):
     return referee(replace(TABLE[name], seed=seed), AdjustOptions(**options), hills)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,6 +36,7 @@ from tests.ba.residuals import (
     transient,
 )
 from tests.ba.test_moving import drifting
+from tests.costs import once
 from tests.lanes import rest_slow
 
 FLOOR = 0.05  # px
@@ -242,7 +242,7 @@ def test_a_sinusoid_or_a_motion_is_taken_from_two_and_a_half_floors_on() -> None
     assert ("moving_objects", -1) not in kinds(searched(moved, interval(10000.0, 20000.0, 1), floor=3.0))
 
 
-@cache
+@once
 def moving(*beside: Displacement) -> tuple[Residuals, np.ndarray]:
     """Residuals of a block of which a tenth of the ground moves by 2 m; the observations there."""
     made, tracks, moves = drifting(3, 300, 0.1, 2.0)
@@ -297,7 +297,7 @@ def test_a_sinusoid_of_a_pair_may_be_that_of_the_other_where_the_evidence_is_no_
     assert (one.gap < SURE) == bool(also)
 
 
-@cache
+@once
 def combined(*rows: tuple[str, int, float]) -> _SearchState:
     """A combination of terms, each of a kind and view, with what it gains."""
     seen = residuals_of(tracks=30)
@@ -342,7 +342,7 @@ class Solved:
     outcome: Outcome
 
 
-@cache
+@once
 def solved(*moved: Displacement, views: int = 3, tracks: int = 250) -> Solved:
     made = simulate_block(views, tracks, seed=3, attitude=1e-6, position=0.2)
     size = np.array([view.size for view in made.views], dtype=np.float64)

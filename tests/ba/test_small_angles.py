@@ -6,7 +6,6 @@ The cameras are pushbrooms that are rolled, their errors those of attitude and p
 from __future__ import annotations
 
 import warnings
-from functools import cache
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from barpc.fit import fit_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import Look, fly
+from tests.costs import once
 
 ATTITUDE, POSITION, NOISE, SIZE = 5e-6, 2.0, 0.3, (10_000, 10_000)
 TARGET = np.array([5.5, 44.5, 900.0])
@@ -31,7 +31,7 @@ def relief(lon: Array, lat: Array) -> Array:
     return 900.0 + 150.0 * np.sin(east / 900.0 + north / 2100.0) + 60.0 * np.cos(north / 300.0) * np.sin(east / 410.0)
 
 
-@cache
+@once
 def pair(angle: float, seed: int, num: int = 1200) -> tuple[tuple[View, ...], Tracks, Array]:
     """Two views under an angle [deg], their tracks and where these are, lon, lat, alt (P, 3)."""
     rng = np.random.default_rng(seed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,13 +22,14 @@ from benchmarks.referee import cases, judge, make
 from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.ba.test_referee import hills
+from tests.costs import once
 from tests.lanes import rest_slow
 
 SEEDS = (1, 2)
 ONE = rest_slow(SEEDS, mark=pytest.mark.nightly)
 
 
-@cache
+@once
 def scene_of(count: int, seed: int):
     return make(replace(cases()["5 GCPs"], gcps=count, seed=seed), hills)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.refit import bundle_of_lines, wrong_axes, wrong_axes_of_grid
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.simulate import Look, fly
+from tests.costs import once
 from tests.fit.cameras import adjusted, synthetic_rpc
 from tests.fit.models import Bent, Frame, Radar, hard, waves
 
@@ -56,7 +56,7 @@ class Changed:
         return self._ground(self.model.localize(self._image(image), alt))
 
 
-@cache
+@once
 def own() -> dict[str, Case]:
     """Name -> model, size, altitude range of models of many kinds, made without a file."""
     found: dict[str, Case] = {}

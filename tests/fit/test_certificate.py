@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +13,7 @@ from barpc.fit.points import SAMPLE_CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
+from tests.costs import once
 from tests.fit.cameras import synthetic
 from tests.fit.models import Bent, bump, hard, pushbroom, waves
 from tests.lanes import rest_slow
@@ -32,7 +32,7 @@ def truth(name: str, count: int = 100_000, seed: int = 5) -> tuple[np.ndarray, n
     return ground, image
 
 
-@cache
+@once
 def fitted(name: str) -> RpcFit:
     return fit_rpc(*hard()[name], strict=False)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares, minimize
@@ -13,6 +11,7 @@ from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO, Region, bounded
 from barpc.fit.system import TriangularSystem
 from barpc.sensor.rpc import RPC
+from tests.costs import once
 from tests.fit.models import Bent, pushbroom
 
 ALL = np.arange(20)
@@ -30,7 +29,7 @@ def detector(rate: float) -> Bent:
     return Bent(pushbroom(45.0), moves)
 
 
-@cache
+@once
 def fitted(rate: float, margin: float = 0.25) -> RpcFit:
     return fit_rpc(detector(rate), SIZE, ALTS, options=FitOptions(pole_margin=margin), strict=False)
 

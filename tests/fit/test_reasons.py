@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 
 from barpc import open_camera
 from barpc.base.errors import FitError
 from barpc.fit import FitOptions, RpcFit, fit_rpc
+from tests.costs import once
 from tests.fit.models import Bent, Frame, bump, pushbroom, waves
 from tests.lanes import rest_slow
 
@@ -100,7 +99,7 @@ CASES = {
 }
 
 
-@cache
+@once
 def fitted(name: str) -> RpcFit:
     return fit_rpc(CASES[name][0](), SIZE, ALTS, strict=False)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -29,6 +28,7 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
     twice_tied,
 )
+from tests.costs import once
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 from tests.tie.stages import select_pairs
@@ -224,7 +224,7 @@ class Looks:
         return every, [pair for pair, (_, _, report) in sorted(trials.tried.items()) if report.status == "ok"]
 
 
-@cache
+@once
 def pairs_in_a_row(count: int, neighbours: int) -> list[Pair]:
     """Dates do not change where views lie."""
     return possible_pairs(dated(count, {}), TieOptions(neighbours=neighbours))

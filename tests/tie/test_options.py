@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ from barpc.tie.patches import dense
 from barpc.tie.patches.register import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
+from tests.costs import once
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.stages import detect, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
@@ -42,7 +42,7 @@ class Row(NamedTuple):
     rest: dict[str, Any] = {}  # noqa: RUF012 - never changed
 
 
-@cache
+@once
 def known(scene: Rendered) -> tuple[tuple[Keypoints, Keypoints], list[Pair]]:
     """Keypoints and pairs as they are by default."""
     first, second = detect(scene.views, TieOptions())
@@ -62,7 +62,7 @@ def verified(scene: Rendered, options: TieOptions) -> float:
     return report(scene, options).verified
 
 
-@cache
+@once
 def linked(scene: Rendered) -> Tracks:
     """What is registered by default."""
     found, pairs = known(scene)
