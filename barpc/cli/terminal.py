@@ -339,7 +339,7 @@ class Lines:
             if self._total <= 1:
                 at = f"pass {self._done}, " * (self._done > self._total)
                 line = f"{self._stage}: {at}at work for {_minutes(spent)}"
-            elif self._done:
+            elif 0 < self._done < self._total:
                 line += f", about {_minutes(spent / self._done * (self._total - self._done))} left"
         self._say(line)
 
