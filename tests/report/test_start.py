@@ -55,7 +55,7 @@ def run(tmp_path_factory) -> Path:
     ("words", "most"),
     [
         (["verify", "{run}"], 58),
-        (["report", "{run}"], 54),
+        (["report", "{run}"], 55),
         (["report", "{run}", "{run}"], 61),
         (["export", "{run}", "{out}", "--to", "s2p"], 72),
         (["export", "{run}", "{out}", "--to", "points"], 72),
