@@ -26,7 +26,6 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -38,6 +37,7 @@ from barpc import __version__
 from barpc.base import manifest
 from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.fields import given, is_record
 from barpc.base.identity import Stamp
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.memory import give_back, peak_memory
@@ -85,9 +85,8 @@ def key_of(*parts: object) -> str:
 
 
 def _key_form(value: object) -> object:
-    if is_dataclass(value) and not isinstance(value, type):
-        kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-        return {"type": type(value).__name__, **kept}
+    if is_record(value):
+        return {"type": type(value).__name__, **given(value)}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), list(value.shape), hashlib.sha256(value.tobytes()).hexdigest()]
     if isinstance(value, np.generic):

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.base.errors import visible
+from barpc.base.fields import given, is_record
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
@@ -81,7 +82,7 @@ def remark(message: str) -> None:
 def tell(data: object, *lines: object) -> None:
     """Print the result of a command on stdout: its lines, or with --json its data; with -q the JSON alone."""
     if wants_json():
-        echo(json.dumps(data, indent=1))
+        echo(json.dumps(data, indent=1, default=lambda part: given(part) if is_record(part) else str(part)))
     else:
         for line in () if is_quiet() else lines:
             echo(line)
@@ -338,7 +339,7 @@ class Lines:
             if self._total <= 1:
                 at = f"pass {self._done}, " * (self._done > self._total)
                 line = f"{self._stage}: {at}at work for {_minutes(spent)}"
-            elif self._done:
+            elif 0 < self._done < self._total:
                 line += f", about {_minutes(spent / self._done * (self._total - self._done))} left"
         self._say(line)
 

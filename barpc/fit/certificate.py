@@ -10,11 +10,12 @@ shape is assumed, so that oscillations, bursts and steps count equally.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from barpc.base.fields import given
 from barpc.base.geodesy import Array, parts, wrap_longitude
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
@@ -145,9 +146,9 @@ class RpcFit:
 
     def summary(self) -> dict[str, Any]:
         """Return the certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
+        values = {name: held for name, held in given(self).items() if name != "rpc"}
         if (part := values.pop("reason")) is not None:
-            values["reason"] = asdict(part)
+            values["reason"] = given(part)
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:

@@ -19,7 +19,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -27,6 +27,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError, out_of_memory
+from barpc.base.fields import given, is_record
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
 from barpc.base.safe_io import MB
@@ -127,9 +128,8 @@ class CachingExecutor(Executor):
             return self._fingerprints.get(value, value)
         if isinstance(value, np.ndarray):
             return self._digest(value)
-        if is_dataclass(value) and not isinstance(value, type):
-            given = [getattr(value, field.name) for field in fields(value) if field.init]
-            return [type(value).__qualname__, *(self._canonical(part) for part in given)]
+        if is_record(value):
+            return [type(value).__qualname__, *map(self._canonical, given(value).values())]
         if isinstance(value, (tuple, list)):
             return [self._canonical(v) for v in value]
         return value
@@ -138,8 +138,8 @@ class CachingExecutor(Executor):
         """Return the hashed inputs that the arguments of a task name."""
         if isinstance(args, str):
             return (self._inputs[args],) if args in self._inputs else ()
-        if is_dataclass(args) and not isinstance(args, type):
-            args = [getattr(args, field.name) for field in fields(args) if field.init]
+        if is_record(args):
+            args = list(given(args).values())
         if not isinstance(args, (tuple, list)) or not self._inputs:
             return ()
         return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))

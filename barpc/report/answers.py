@@ -13,7 +13,7 @@ from barpc.report.summary import Summary
 from barpc.report.summary.block import JustificationEntry, SceneEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import CorrectionEntry, ViewEntry
-from barpc.report.summary.words import counted, figure, known, metres, two_digits
+from barpc.report.summary.words import counted, known, metres, two_digits
 
 _UNEXPLAINED = "systematic", "held_out", "wrong_matches", "beside", "contradicted", "rejected", "left", "place"
 """Causes of a reservation whose residuals nothing explains."""
@@ -21,6 +21,11 @@ _SIGNIFICANT = 1e-4  # probability of the F test below which systematic residual
 _WIDENED = 1.005  # factor that reads as more than 1.0
 _ROUNDING = 1e-6  # px
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
+FOOTER = (
+    "Residuals are projected minus observed. Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of "
+    "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
+    "observations.csv, pairs.csv, footprints.geojson."
+)
 
 
 def of_images(views: Sequence[ViewEntry], agree: bool) -> str:
@@ -48,9 +53,9 @@ def of_map(by_length: Mapping[int, int] | Mapping[str, int], groups: int, lonely
 
 def of_residuals(marked: Sequence[str], key: str) -> str:
     """Return the images most of whose cells have a significant mean residual, and the key of their maps."""
-    random = "Yes: in no image do more than half of the cells have a significant mean."
+    random = "Yes: in no image do most cells have a significant mean residual."
     if marked:
-        random = f"Not in {listed(marked)}: most cells there have a significant mean."
+        random = f"Not in {listed(marked)}: most cells there have a significant mean residual."
     return f"{random} Colour: size. Thin lines: single residuals. Bold arrows: significant means of cells. {key}"
 
 
@@ -127,7 +132,7 @@ def decisions(summary: Summary) -> list[str]:
     if (test := summary.control_test) is not None:
         found.append(
             f"{test.num_beyond} of {counted(test.num, 'residual')} of control points in the images are significant "
-            f"({figure(test.expected)} expected by chance). The largest is that of {test.point} in {test.image} "
+            f"({two_digits(test.expected)} expected by chance). The largest is that of {test.point} in {test.image} "
             f"(w = {known(test.largest_w):.1f}; limit: {test.critical:.3g})."
         )
     return found
@@ -196,7 +201,7 @@ def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
         yield f"{words} {degree}, as in the earlier run."
     else:
         sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m)
-        yield f"{words} {degree} (1 sigma at the first and last row: {sigma})."
+        yield f"{words} {degree} (1 sigma on the ground at the first and last row: {sigma})."
         if scene.drift_justification is not None:
             yield f"Degree {degree - 1} left {_left(scene.drift_justification)}."
 
@@ -248,7 +253,7 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         yield f"Observations of tie points: {counts}."
     if cut:
         most = max(views, key=lambda view: (view.lost, view.name))
-        yield f"Most were rejected in {most.name}: {figure(100 * most.lost)} % of those used or rejected."
+        yield f"Most were rejected in {most.name}: {two_digits(100 * most.lost)} % of those used or rejected."
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:

@@ -196,5 +196,5 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         yield StepEntry("review", f"Check the files that were left out: {names}.")
     elif summary.reasons:
         of_control = any(gcp.status not in ("used", "not seen") for gcp in summary.gcps)
-        text = f"Review the {counted(len(summary.reasons), 'reservation')} on the scene."
+        text = f"Review the reservation{'s' * (len(summary.reasons) > 1)} on the scene."
         yield StepEntry("review", text, part="gauge" if of_control or value_of(summary, "scene.dem") else "decisions")

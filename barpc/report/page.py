@@ -73,6 +73,7 @@ def page_of(files: RunFiles) -> str:
             shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,
             most=MAX_SHOWN,
+            footer=answers.FOOTER,
         )
     )
 

@@ -74,7 +74,12 @@ def sentences(summary: Summary) -> tuple[list[str], list[str]]:
 def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
     """Return sentences of images of a status, or of files, and why."""
     names = listed([name for name, _ in alike], NAMED)
-    if len(alike) <= NAMED or (status and why not in CAUSES):
+    if status and (len(alike) <= NAMED or why not in CAUSES):
+        same: dict[str, list[str]] = {}
+        for name, text in alike:
+            same.setdefault(text.removeprefix(name), []).append(name)
+        return [listed(named, NAMED) + text for text, named in same.items()]
+    if len(alike) <= NAMED:
         return [text for _, text in alike]
     if not status:
         return [f"{len(alike)} files were left out, {names}: {why}"]

@@ -178,8 +178,7 @@ def test_slopes_that_are_noise_know_no_place():
     assert found.share == pytest.approx(0.8, abs=0.1)
 
 
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("seeds", rest_slow([range(2), range(2, 6)]), ids=str)
 def test_noise_that_neighbours_share_is_no_knowledge(seeds: range):
     """Along twelve tracks a canopy moves stretches of 40 m by a metre or so: said is what is met."""

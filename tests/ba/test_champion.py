@@ -190,8 +190,7 @@ def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: floa
     assert swapped.lies_across() == across
 
 
-@pytest.mark.costs(5)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
 def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = simulate_block(4, 600, seed=1)

@@ -107,7 +107,7 @@ def adjusted(num_views: int, **control: Any) -> tuple[Adjustment, Array]:
     return found, sigmas
 
 
-@pytest.mark.landing(6)
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("dem", [None, *DEMS])
 @pytest.mark.parametrize("num_views", [2, 3])

@@ -87,7 +87,6 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_two_of_them_in_two_images_are_both_found() -> None:
     block, tracks = flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0})
     found = adjusted(block, tracks)
@@ -107,9 +106,7 @@ def test_what_fades_is_named_with_its_length() -> None:
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
 
 
-@pytest.mark.costs(4)
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
 def test_all_images_that_settle_are_explained_together(first: float) -> None:
     """All see the same ground there: their ties agree with each other, as if it moved."""
@@ -197,7 +194,7 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
     assert np.nanmax(found.held_out_rms) < 0.16
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_smaller_part_is_said_to_lie_off() -> None:
     block, tracks = flawed(2, 1500, {**ROWS, "start": 0.15, "view": 1})
     found = adjusted(block, tracks).findings[0]

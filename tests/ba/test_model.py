@@ -159,7 +159,7 @@ def turned() -> SimulatedBlock:
     return replace(made, views=(made.views[0], replace(view, sensor=sensor), made.views[2]))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties(turned) -> None:
     found = adjust_tracks(turned.views, turned.tracks, AdjustOptions(learn_priors=False))
     assert found.cameras.unknowns.model == "affine"

@@ -423,9 +423,7 @@ def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() ->
     assert judged.shape < 0.3
 
 
-@pytest.mark.costs(3)
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("family", "seed"), [("fault", 65), ("glacier", 45)])
 def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int) -> None:
     """A fifth of a scene at 2 + 2 dates: beside a fault no row or column stands out (0.22 px were left), and of a

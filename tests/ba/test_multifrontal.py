@@ -186,7 +186,7 @@ def _square(views: int) -> SimulatedBlock:
     return simulate_block(views, 20 * views, seed=3, num_gcps=5, num_checks=0)
 
 
-@pytest.mark.landing(3)
+@pytest.mark.landing(2)
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("views", "case", "ties", "leaf"),

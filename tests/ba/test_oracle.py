@@ -135,6 +135,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_views", [100, 0])
 def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, sized, dense_views):

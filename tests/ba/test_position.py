@@ -69,6 +69,7 @@ def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() ->
     np.testing.assert_allclose(found.gauge.shift, moved, atol=0.1)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.parametrize("wrong", rest_slow([0.1, 0.0]))
@@ -141,6 +142,7 @@ def stating(block: SimulatedBlock, sensors: list, accuracy: float) -> tuple:
     )
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("count", rest_slow([2, 4, 8]))
 def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:

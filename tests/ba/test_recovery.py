@@ -120,8 +120,7 @@ def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, 
     assert apart < 1e-10 * (tight.residuals**2).sum()
 
 
-@pytest.mark.costs(5)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("views", "bounds", "seeds"),
     [

@@ -74,7 +74,6 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     """With priors as stated; where they learn, that of one image may be wide enough to take up a part of it."""

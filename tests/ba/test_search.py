@@ -92,6 +92,7 @@ def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.Mo
 # --- what is named ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.landing(3)
 @pytest.mark.parametrize("seed", rest_slow([1, 2]))
 @pytest.mark.parametrize(
     ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str
@@ -309,7 +310,7 @@ def placed(kind: str, view: int = 0) -> Term:
     return TERMS[kind](view, none, np.full(2, 0.5), 0.0, (1, 2.0, 5.0, 0.0, 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):

@@ -61,9 +61,7 @@ def height(angle: float, seed: int, **options: float) -> tuple[float, float, Adj
     return float(np.nanmedian(up)), float(found.gauge.sigma[2]), found
 
 
-@pytest.mark.slow
-@pytest.mark.costs(6)
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("angle", [1.0, 0.3, 0.9, 0.95, 0.99, 1.01, 1.05, 1.1])
 def test_what_is_said_of_the_height_holds_on_both_sides_of_the_least_angle(angle: float) -> None:
     """Under priors that are true, over five blocks; with the least angle some tracks are on either side of it."""

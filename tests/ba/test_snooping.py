@@ -125,8 +125,7 @@ def said(scene, gcps):
     return found.control, summarize(run)
 
 
-@pytest.mark.costs(5)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", rest_slow([1, 4], mark=pytest.mark.nightly))
 def test_two_points_that_contradict_each_other_are_never_good(seed):
     scene = scene_of(2, seed)

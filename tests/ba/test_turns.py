@@ -56,9 +56,7 @@ def ended(
     return Ended(found, told.left, float(np.mean((np.array(told.move) / found.gauge.sigma) ** 2)))
 
 
-@pytest.mark.costs(7)
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("turn", "alike"), [(60e-6, False), (-2.5e-3, True)])
 @pytest.mark.parametrize("heavy", [True, False])
 def test_turns_that_ties_see_say_nothing_of_the_place(

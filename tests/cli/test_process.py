@@ -72,10 +72,8 @@ def test_a_stream_that_is_closed_full_or_broken(words: str, how: str) -> None:
     assert_ended(shell(f"{COMMAND} {words} {how}"), how, plain.stdout)
 
 
-@pytest.mark.costs(10)
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @posix
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ENDS)
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_what_is_written_to_files_is_whole_whatever_becomes_of_the_streams(

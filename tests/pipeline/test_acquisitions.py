@@ -87,8 +87,7 @@ def test_an_image_and_its_band_alone_are_nothing_to_adjust(tmp_path: Path) -> No
         barpc.adjust([VIEWS[0], coarse], tmp_path / "run")
 
 
-@pytest.mark.costs(6)
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_band_is_added_with_other_images_and_not_alone(tmp_path: Path) -> None:
     few = {"points_per_image": 500}
     coarse = band(VIEWS[0], tmp_path / "multi.tif")

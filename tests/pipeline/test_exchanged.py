@@ -51,9 +51,7 @@ def test_right_cameras_and_bad_ones_are_not_exchanged(samples: AdjustResult) -> 
     assert exchanged_cameras([views[0], views[1], moved], tracks) is None
 
 
-@pytest.mark.costs(5)
-@pytest.mark.slow
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_a_run_with_exchanged_rpcs_ends_or_leaves_them_out(tmp_path: Path, keep_going: bool) -> None:
     given = [f"{VIEWS[0]},camera={VIEWS[1]}", f"{VIEWS[1]},camera={VIEWS[0]}", str(VIEWS[2])]

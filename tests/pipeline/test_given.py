@@ -134,6 +134,8 @@ def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, c
     assert len(result.run.matched) == 3
 
 
+@pytest.mark.landing(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "content"), [("a.txt", b""), ("a.txt", b"0 0\n"), ("a.match", bytes(16)), ("a.match", b"")]
 )

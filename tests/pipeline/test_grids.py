@@ -170,7 +170,7 @@ def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, vi
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
     """A grid does not hold a step between detectors in the cell that it runs through: said, with how much it is."""
 
@@ -445,7 +445,7 @@ def block(tmp_path_factory):
     return write_block(folder, 3)[1], str(folder / "matches.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
     images, matches = block
     options = RunOptions(matches=matches, matches_only=True, grids=True)

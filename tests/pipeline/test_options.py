@@ -431,6 +431,7 @@ SLOW = (
 """Options that take a run or two of their own: the landing check tries them."""
 
 
+@pytest.mark.landing(5)
 @pytest.mark.parametrize(
     "name",
     [

@@ -29,8 +29,9 @@ def start(shared_data):
     return made
 
 
+@pytest.mark.costs(12)
+@pytest.mark.landing(1)
 @pytest.mark.slow
-@pytest.mark.landing(4)
 @pytest.mark.parametrize(
     ("name", "kind", "size", "view", "seed"),
     [
@@ -57,8 +58,7 @@ def test_what_is_planted_is_followed_and_named(start, tmp_path, name, kind, size
     assert any(found.image in line and where.search(line) for line in found.words), found.line()
 
 
-@pytest.mark.slow
-@pytest.mark.landing(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize(("view", "px"), [(1, 3.0), (0, 3.0), (2, -1.5), (1, -1.5)])
 def test_a_band_of_columns_displaced_along_the_rays_is_one_term_of_its_image(start, tmp_path, view, px) -> None:
     """Terms in the other images explain a step of the middle one as well, but for the correlated noise of matches."""
@@ -93,8 +93,7 @@ def moved(untouched: Clean, box: tuple[int, int, int, int], by: tuple[float, flo
     return views
 
 
-@pytest.mark.slow
-@pytest.mark.landing(3)
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "box", "by", "said"),
     [

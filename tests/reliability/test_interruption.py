@@ -194,7 +194,7 @@ def emptied(path: Path) -> None:
     path.write_bytes(b"")
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", rest_slow([flipped, cut_short, other_content, Path.unlink, emptied]))
 def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):

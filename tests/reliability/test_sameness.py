@@ -180,7 +180,7 @@ def test_the_same_pixels_in_other_dress_are_found(scene, tmp_path, how):
             load_views(order)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_vrt_with_an_rpc_of_its_own_is_the_same_image(scene, tmp_path):
     images = images_of(scene, "")
     twin = tmp_path / "twin.vrt"

@@ -73,10 +73,10 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     )
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
-    assert "as a polynomial of degree 1 (1 sigma at the first and last row: 12 cm)." in plain
+    assert "as a polynomial of degree 1 (1 sigma on the ground at the first and last row: 12 cm)." in plain
     assert "left" not in plain
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
-    assert "as a polynomial of degree 2 (1 sigma at the first and last row: 12 cm, 30 cm)." in more
+    assert "as a polynomial of degree 2 (1 sigma on the ground at the first and last row: 12 cm, 30 cm)." in more
     left = "systematic residuals of 0.31 px in B, and 0.12 px correlated between neighbours."
     assert f"Degree 1 left {left}" in more
     surely = said(
@@ -131,7 +131,7 @@ def test_what_was_cut_and_kept_out_is_counted(record):
     none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
     assert "900 used, 0 check (independent of the adjustment), 0 rejected as outliers." in said(none, num_held_out=0)
     text = said(with_views(none, {"num_moving": 4}, {"num_rejected": 100}), num_held_out=70)
-    most = f"Most were rejected in {record.views[1].name}: 50.0 % of those used or rejected."
+    most = f"Most were rejected in {record.views[1].name}: 50 % of those used or rejected."
     counts = "900 used, 70 check (independent of the adjustment), 100 rejected as outliers, 4 excluded, as they move"
     assert f"Observations of tie points: {counts} together.\n{most}" in text
 

@@ -105,9 +105,7 @@ def expected(summary: Summary) -> dict[str, tuple[float | None, ...]]:
     return {one.source: one.sigma_enu_m for step in summary.next for one in step.expected}
 
 
-@pytest.mark.landing(1)
-@pytest.mark.costs(5)
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_dem_and_control_do_what_was_promised_of_them(case):
     plain, _ = case.adjusted()
     promised = expected(plain)

@@ -72,8 +72,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     assert found.ce90_m == ce90(found.major_m, found.minor_m)
 
 
-@pytest.mark.costs(4)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("model", rest_slow(MODELS, mark=pytest.mark.nightly))
 def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
     run = block_run.run

@@ -134,8 +134,8 @@ def test_columns_that_lie_off_over_all_rows_are_no_clouds():
 @pytest.mark.parametrize(
     ("matched", "cause", "words"),
     [
-        ((), "untied", "No tie points connect it to the main group of images, and its camera"),
-        ((("B", "C"),), "no_overlap", "No pair with it was selected for matching"),
+        ((), "untied", "No tie points lead to the main group of images, and the camera"),
+        ((("B", "C"),), "no_overlap", "No pair was selected for matching"),
         ((("A", "C"), ("B", "C")), "untied", "(1 pair with it tried)"),
         ((("A", "C"), ("A", "B")), "untied", "(2 pairs with it tried)"),
     ],

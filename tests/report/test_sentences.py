@@ -13,6 +13,7 @@ from barpc.ba.constraints.ground import TerrainTest
 from barpc.ba.control.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
+from barpc.base.options import RunOptions
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
 from barpc.report.outcome import Added, Run
@@ -54,7 +55,7 @@ def adjusted(**fields: Any) -> Any:
 
 def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
     usual = {
-        "kind": kind, "adjustment": adjustment or adjusted(), "options": SimpleNamespace(), "reference": None,
+        "kind": kind, "adjustment": adjustment or adjusted(), "options": RunOptions(), "reference": None,
         "copies": {}, "number": {name: k for k, name in enumerate(NAMES)}, "gcps": None, "check_points": None,
         "left_out": (), "after": None, "tracks": [0] * 9, "met_worse": (), "matched": (), "beside": {},
         "datums": (), "whole_pixels": frozenset(), "gaps": {}, "known": frozenset(), "added": None,
@@ -150,8 +151,8 @@ def test_what_is_advised_has_its_figures():
     assert advice(run_of(kind="match"), num_observations=5).startswith("Only 5")
     lacking = run_of(kind="match", gaps={0: Gap(1, 40.0, 157.0, 1, 216)})
     assert advice(lacking) == (
-        "rows 40-157 have 1 of about 216 tie points expected from their detail, so an error there would not show: "
-        "check for clouds, water, change there, or a jump in the image"
+        "Rows 40-157 have 1 of about 216 tie points expected from their detail, so an error there would not show. "
+        "Check for clouds, water, change there, or a jump in the image"
     )
     assert view_status(a_view("B"), lacking)["advice"] == ""
     copies = {"A": "B, moved by 1 columns and 2 rows"}
@@ -187,7 +188,7 @@ def a_fit(largest: float | None, rmse: float = 0.0) -> FitEntry:
     ],
 )
 def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status):
-    run = run_of(options=SimpleNamespace(fit=SimpleNamespace(tolerance=0.01), **options))
+    run = run_of(options=RunOptions(**options))
     found = view_status(a_view(fit=a_fit(largest)), run)
     assert found["status"] == status
     if status == "failed":
@@ -195,7 +196,6 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
             found["advice"]
             == "One RPC does not fit the corrected camera to 0.01 px. Lower --drift, or use its grid (--grids)"
         )
-    assert view_status(a_view(fit=a_fit(9.0)), run_of())["status"] == "adjusted"  # no tolerance was given
 
 
 @pytest.mark.parametrize("more", ["jitter_px", "detector_px", "step_px", "sinusoid_px"])
@@ -209,7 +209,7 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
     ],
 )
 def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, most, options, doubted):
-    run = run_of(options=SimpleNamespace(fit=SimpleNamespace(tolerance=0.01), **options))
+    run = run_of(options=RunOptions(**options))
     waving = a_view(fit=a_fit(most, left), correction=a_correction(**{more: 0.3}))
     found = view_status(waving, run)
     assert found["status"] == ("doubtful" if doubted else "adjusted")

@@ -470,10 +470,8 @@ def test_the_altitudes_of_a_radar_image_are_a_kilometre_around_its_centre(tmp_pa
     assert model.alt_range == pytest.approx((120.0 - 1000.0, 120.0 + 1000.0), abs=1e-3)
     assert model.origin == (340, 460)
     assert model.spacing == (0.8, 0.9)
-    assert model.speed == pytest.approx(7550.0, rel=0.05)
     assert model.accuracy is None
-    position, velocity = model.orbit(np.array([3.0]))
-    assert model.speed == pytest.approx(np.linalg.norm(velocity))
+    position, _ = model.orbit(np.array([3.0]))
     ground = model.localize(np.array([460.0, 340.0]), np.array(120.0))
     np.testing.assert_allclose(model.to_radar(ground), position[:, 0] - ecef_from_ground(ground), atol=1e-3)
 

@@ -238,8 +238,6 @@ def test_the_model_of_a_swath_has_the_numbers_of_its_annotation(first):
     assert model.advice == ""
     assert GRD.model().all_ground is None
     assert "take the SLC of the scene" in GRD.model().advice
-    velocity = IW["IW1"].state(0.5 * model.size[1] * INTERVAL)[1]
-    assert model.speed == pytest.approx(np.linalg.norm(velocity), rel=1e-9)
     for words in ("21576 x 12236 px from 2021-02-16T15:12:07, looks right, for", "-100 to 900 m"):
         assert words in repr(replace(model, alt_range=(-100.0, 900.0)))
 

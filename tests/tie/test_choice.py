@@ -253,6 +253,7 @@ def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None
     assert len(set(looks.compared)) == len(looks.compared) <= 40 * 39 / 2
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "said",

@@ -197,8 +197,7 @@ def test_few_keypoints_are_counted_in_fewer_parts() -> None:
     assert all(one.axis == 1 and one.first >= 440 and one.last <= 840 for one in known)
 
 
-@pytest.mark.costs(4)
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
     scene = render(views=3, size=(300, 300))
     for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):

@@ -50,9 +50,7 @@ def triplet_spread(triplet) -> dict[tuple[int, int], float]:
     return raw_spread(triplet)
 
 
-@pytest.mark.costs(3)
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("i", "j"), PAIRS)
 def test_the_spread_across_epipolar_lines_is_a_twelfth_of_a_pixel_and_under_half_the_detectors(
     triplet, triplet_ties: TieResult, triplet_spread, i: int, j: int

@@ -53,8 +53,7 @@ def test_the_true_error_is_below_a_twelfth_of_a_pixel_in_both_directions(render,
         assert np.abs(bias).max() <= 0.005 * 600 / side
 
 
-@pytest.mark.costs(4)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "conditions",
     [

@@ -71,7 +71,7 @@ class Bands:
         """Return the median (B,) of the finite offsets (5 M,) of every band with enough of them; NaN of others."""
         known = np.flatnonzero(np.isfinite(offsets) & (self.count >= _LEAST)[self.group])
         order = known[np.argsort(offsets[known])]
-        # numbers that sort by band, then by offset: these are sorted in a third of the time of two keys
+        # numbers that sort by band, then by offset: these are sorted in 0.4 of the time of two keys
         number = np.sort(self.group[order] * len(order) + np.arange(len(order)))
         count = np.bincount(self.group[order], minlength=len(self.count))
         many, middle = count >= _LEAST, np.full(len(count), np.nan)

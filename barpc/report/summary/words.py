@@ -79,17 +79,6 @@ def two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def figure(value: float) -> str:
-    """Return a number with one decimal, or with one digit where it would read 0.0.
-
-    Examples
-    --------
-    >>> figure(12.34), figure(0.0234), figure(0)
-    ('12.3', '0.02', '0')
-    """
-    return f"{value:.1f}" if abs(value) >= 0.05 else f"{value:.1g}"
-
-
 def metres(value: float) -> str:
     """Return a length of two digits with a unit that keeps it readable.
 
@@ -121,10 +110,10 @@ _ITS_RPC = "check that the RPC belongs to this image (IMAGE,camera=FILE names an
 _DISTURBED = "check for clouds, water, change"
 CAUSES = {
     "no_overlap": Cause("failed", "in no matched pair",
-        "no pair with it was selected for matching (overlap, angle or list), and its camera was not changed",
+        "no pair was selected for matching (overlap, angle or list), and the camera was not changed",
         "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap in a file given with --options"),
     "untied": Cause("failed", "not connected to the others",
-        "no tie points connect it to the main group of images{tried}, and its camera was not changed",
+        "no tie points lead to the main group of images{tried}, and the camera was not changed",
         "check for clouds, water and other dates, or supply matches (--matches)"),
     "other_rpc": Cause("failed", "RPC does not match the image",
         "its RPC does not match the image: {strangeness}. These were adjusted without it, and its camera was not "
@@ -141,7 +130,7 @@ CAUSES = {
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
         f"{_ITS_RPC}, and for clouds, water, change"),
     "whole_pixels": Cause("weak", "matched at whole pixels",
-        "its tie points were matched at whole pixels, so all may share an error of {shared:.1f} px",
+        "tie points were matched at whole pixels, so all may share an error of {shared:.1f} px",
         "add ground points, an image of another date, or matches (--matches)"),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
