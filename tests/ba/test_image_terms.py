@@ -233,6 +233,18 @@ def test_splines_are_solved_once_and_keep_what_else_was_found(monkeypatch) -> No
     assert (found.findings, again.findings) == ((), (other,))
 
 
+def test_splines_that_spoil_the_check_tracks_in_one_round_are_not_solved_to_the_end(monkeypatch) -> None:
+    one, ended = solved(), []
+    for times, tried in ((1.4, True), (1.6, False)):
+        bad = replace(one.found, after=replace(one.found.after, noise=times * one.found.after.noise))
+        monkeypatch.setattr(Solution, "has_waves", True)
+        monkeypatch.setattr(image_terms, "_solve_with", lambda *_, bad=bad, **__: bad)
+        monkeypatch.setattr(image_terms, "_with_edges", lambda found, *_: ended.append(found) or found)
+        assert with_splines(one.found, replace(one.parts), one.options) is one.found
+        assert bool(ended) is tried
+        ended.clear()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", rest_slow([(3, 300, 8), (5, 700, 13)], mark=pytest.mark.nightly), ids=str)
 def test_splines_are_as_dense_as_what_shakes_the_images_asks_for(case: tuple[int, int, int]) -> None:

@@ -21,7 +21,7 @@ from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.statistics import CRITICAL, FEW, LARGEST, SURE
+from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _DENSER = 1.5  # factor on the number of splines of each further try: 7, 10, 15, 22, 33
@@ -146,7 +146,10 @@ def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solu
         if options.detectors:
             tried = _solve_with(found, parts, options, layout)
         else:
-            tried = _with_edges(_solve_with(found, parts, options, layout, once=True), parts, options)
+            tried = _solve_with(found, parts, options, layout, once=True)
+            # cameras that contradict each other: further rounds do not make good what the first spoils
+            if given or asked or not tried.after.error > MUCH_NOISE * best.after.error:
+                tried = _with_edges(tried, parts, options)
         better = given or (asked and best is found) or is_admitted(tried.after, best.after, parts.outer)
         best, misses = (tried, 0) if better else (best, misses + (best is not found))
     if best is found or not (given or asked or _explains(best, found, block)):
