@@ -37,7 +37,7 @@ from barpc import __version__
 from barpc.base import manifest
 from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
-from barpc.base.fields import given, is_record
+from barpc.base.fields import field_values, is_record
 from barpc.base.identity import Stamp
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.memory import give_back, peak_memory
@@ -86,7 +86,7 @@ def key_of(*parts: object) -> str:
 
 def _key_form(value: object) -> object:
     if is_record(value):
-        return {"type": type(value).__name__, **given(value)}
+        return {"type": type(value).__name__, **field_values(value)}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), list(value.shape), hashlib.sha256(value.tobytes()).hexdigest()]
     if isinstance(value, np.generic):

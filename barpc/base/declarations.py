@@ -20,7 +20,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 from barpc.base.errors import InputError
-from barpc.base.fields import Value, given
+from barpc.base.fields import OfFields, field_values
 
 T = TypeVar("T")
 OptionsRecord = TypeVar("OptionsRecord", bound="Options")
@@ -116,7 +116,7 @@ def _declared(record: Any) -> Mapping[str, Declared]:
 
 
 @dataclass_transform(frozen_default=True)
-class Options(Value):
+class Options(OfFields):
     """Base of the option records: its children are frozen dataclasses, checked when made, short when printed."""
 
     def __init_subclass__(cls) -> None:
@@ -136,7 +136,7 @@ class Options(Value):
 
     def _told(self) -> str:
         known = declared(type(self))
-        return ", ".join(f"{name}={_SHORT.repr(v)}" for name, v in given(self).items() if v != known[name].default)
+        return ", ".join(f"{k}={_SHORT.repr(v)}" for k, v in field_values(self).items() if v != known[k].default)
 
 
 def wanted(kind: Any, rule: Rule) -> str:

@@ -15,19 +15,19 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 
 from barpc.base.errors import BarpcError, InputError, plain
-from barpc.base.fields import Value, field_names, given, is_record
+from barpc.base.fields import OfFields, field_names, field_values, is_record
 from barpc.base.remote import Remote
 from barpc.base.safe_io import ARRAYS, BYTES_PER_NUMBER, Kind, opened
 
 
-class Frozen(Value):
+class Frozen(OfFields):
     """Base of frozen dataclasses (declared with ``eq=False, repr=False``) that hold arrays and plain values.
 
     Arrays are copies of their own and read-only, after unpickling too, and compared by their content.
     """
 
     def __post_init__(self) -> None:
-        for name, value in given(self).items():
+        for name, value in field_values(self).items():
             if isinstance(value, np.ndarray):
                 self._keep(name, value.copy())
 
@@ -61,17 +61,17 @@ class Frozen(Value):
         return value
 
     def _told(self) -> str:
-        return ", ".join(f"{name}={_short(value)}" for name, value in given(self).items())
+        return ", ".join(f"{name}={_short(value)}" for name, value in field_values(self).items())
 
     def _content(self) -> tuple[object, ...]:
-        return tuple(map(_comparable, given(self).values()))
+        return tuple(map(_comparable, field_values(self).values()))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
             self._keep(name, value)
 
 
-def joined(parts: Sequence[Any]) -> dict[str, Any]:
+def join_fields(parts: Sequence[Any]) -> dict[str, Any]:
     """Return the fields of records of one class, each with the arrays or tuples of all, one after the other."""
     columns = {name: [getattr(part, name) for part in parts] for name in field_names(parts[0].__class__)}
     return {k: sum(v, ()) if isinstance(v[0], tuple) else np.concatenate(v) for k, v in columns.items()}
@@ -145,7 +145,7 @@ def _encode(value: Any, arrays: Arrays) -> Any:
     if isinstance(value, Mapping):
         return {"map": [[str(k), _encode(v, arrays)] for k, v in value.items()]}
     if is_record(value) and type(value).__module__.split(".")[0] == "barpc":
-        kept = {name: _encode(held, arrays) for name, held in given(value).items()}
+        kept = {name: _encode(held, arrays) for name, held in field_values(value).items()}
         return {"class": [type(value).__module__, type(value).__qualname__], "fields": kept}
     raise TypeError(f"a {type(value).__name__} cannot be kept")
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.base.errors import visible
-from barpc.base.fields import given, is_record
+from barpc.base.fields import field_values, is_record
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
@@ -82,7 +82,7 @@ def remark(message: str) -> None:
 def tell(data: object, *lines: object) -> None:
     """Print the result of a command on stdout: its lines, or with --json its data; with -q the JSON alone."""
     if wants_json():
-        echo(json.dumps(data, indent=1, default=lambda part: given(part) if is_record(part) else str(part)))
+        echo(json.dumps(data, indent=1, default=lambda part: field_values(part) if is_record(part) else str(part)))
     else:
         for line in () if is_quiet() else lines:
             echo(line)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.fields import given
+from barpc.base.fields import field_values
 from barpc.base.geodesy import Array, parts, wrap_longitude
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
@@ -146,9 +146,9 @@ class RpcFit:
 
     def summary(self) -> dict[str, Any]:
         """Return the certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {name: held for name, held in given(self).items() if name != "rpc"}
+        values = {name: held for name, held in field_values(self).items() if name != "rpc"}
         if (part := values.pop("reason")) is not None:
-            values["reason"] = given(part)
+            values["reason"] = field_values(part)
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:

@@ -27,7 +27,7 @@ import numpy as np
 
 from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError, out_of_memory
-from barpc.base.fields import given, is_record
+from barpc.base.fields import field_values, is_record
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
 from barpc.base.safe_io import MB
@@ -129,7 +129,7 @@ class CachingExecutor(Executor):
         if isinstance(value, np.ndarray):
             return self._digest(value)
         if is_record(value):
-            return [type(value).__qualname__, *map(self._canonical, given(value).values())]
+            return [type(value).__qualname__, *map(self._canonical, field_values(value).values())]
         if isinstance(value, (tuple, list)):
             return [self._canonical(v) for v in value]
         return value
@@ -139,7 +139,7 @@ class CachingExecutor(Executor):
         if isinstance(args, str):
             return (self._inputs[args],) if args in self._inputs else ()
         if is_record(args):
-            args = list(given(args).values())
+            args = list(field_values(args).values())
         if not isinstance(args, (tuple, list)) or not self._inputs:
             return ()
         return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))

@@ -15,7 +15,7 @@ import numpy as np
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.declarations import declared
 from barpc.base.errors import InputError, listed
-from barpc.base.frozen import joined
+from barpc.base.frozen import join_fields
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, fingerprint
 from barpc.base.options import RunOptions
@@ -285,7 +285,7 @@ def load_gcps(
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
     point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
-    columns = joined(parts)
+    columns = join_fields(parts)
     return GroundPoints(**columns | {"point": point, "strangers": tuple(dict.fromkeys(columns["strangers"]))})
 
 
@@ -458,7 +458,7 @@ def load_altimetry(paths: Sequence[str], views: Sequence[View], heights: str | N
     InputError for a file that cannot be read or has no height in the images.
     """
     parts = [_heights_of(path, views, heights) for path in paths]
-    return Altimetry(**joined(parts)) if parts else None
+    return Altimetry(**join_fields(parts)) if parts else None
 
 
 def _heights_of(path: str, views: Sequence[View], heights: str | None) -> Altimetry:

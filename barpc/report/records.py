@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform,
 import msgspec
 import numpy as np
 
-from barpc.base.fields import Value, field_names, is_record
+from barpc.base.fields import OfFields, field_names, is_record
 
 Number = float | None  # A number; None (null) stands for what is not finite
 
@@ -57,7 +57,7 @@ def column(
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(column,))
-class Record(Value):
+class Record(OfFields):
     """A part of the summary: its children are frozen dataclasses whose fields are declared by `column`."""
 
     OWN: ClassVar[Mapping[str, Column]] = {}

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.fields import field_names, given
-from barpc.base.frozen import joined
+from barpc.base.fields import field_names, field_values
+from barpc.base.frozen import join_fields
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import MANY
@@ -55,7 +55,7 @@ class Keypoints:
 
     def select(self, which: IntArray | BoolArray) -> Keypoints:
         """Return the keypoints of a mask or of indices."""
-        return Keypoints(*(column[which] for column in given(self).values()))
+        return Keypoints(*(column[which] for column in field_values(self).values()))
 
     def strongest(self, most: int) -> Keypoints:
         """Return the `most` strongest keypoints."""
@@ -72,7 +72,7 @@ def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     """Join the keypoints of several tiles; an empty set of none."""
     none = np.empty(0)
     parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
-    return Keypoints(**joined(parts))
+    return Keypoints(**join_fields(parts))
 
 
 class Sift:
@@ -275,7 +275,7 @@ def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Su
 
 def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of 148 bytes a keypoint; places count from the tile's corner."""
-    values = given(replace(keypoints, xy=keypoints.xy - np.array(box[:2])))
+    values = field_values(replace(keypoints, xy=keypoints.xy - np.array(box[:2])))
     return {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
 
 

@@ -16,7 +16,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from barpc.base.fields import given
+from barpc.base.fields import field_values
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
@@ -57,7 +57,7 @@ class PatchRegistration:
 
     def put(self, rows: IntArray, found: PatchRegistration) -> None:
         """Add the registration of some rows."""
-        for name, column in given(found).items():
+        for name, column in field_values(found).items():
             getattr(self, name)[rows] = column
 
 
