@@ -10,15 +10,17 @@ import pytest
 
 import barpc
 
-SLOW = {f"barpc.verbs.runs.{verb}" for verb in ("dsm", "export")}
-"""Examples of several whole runs."""
+pytest_plugins = ["pytester", "tests.costs"]
+
+WAITS = {"barpc.verbs.runs.export": ("slow",), "barpc.verbs.runs.dsm": ("slow", "nightly")}
+"""Marks of examples of several whole runs."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Examples that take seconds wait for the landing check."""
+    """Examples that take seconds wait for a slower lane."""
     for item in items:
-        if item.name in SLOW:
-            item.add_marker("slow")
+        for mark in WAITS.get(item.name, ()):
+            item.add_marker(mark)
 
 
 @pytest.fixture(autouse=True)

@@ -28,8 +28,7 @@ from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
 from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical, scene_beside
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, altitude_range
 
 if TYPE_CHECKING:
     from barpc.pointio.correspondences import Correspondences

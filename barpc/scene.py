@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import InputError, RpcError
-from barpc.base.frozen import Frozen, Shown
+from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, HeightDatum
 from barpc.base.geodesy import BoolArray as BoolArray
 from barpc.base.geodesy import IntArray as IntArray
@@ -36,7 +36,7 @@ class Doubt:
 
 
 @dataclass(frozen=True, eq=False)
-class Camera(Shown):
+class Camera:
     """A camera and where it came from."""
 
     model: SensorModel

@@ -8,7 +8,7 @@
     OUT/.barpc/outputs.jsonl the same of the outputs of a run at work
     OUT/.barpc/lock          held while a run is at work
     OUT/.barpc/partial/      files on their way; emptied at the next start
-    OUT/.barpc/cache/<stage>/<key>.npz   results of tasks; a damaged one is made again
+    OUT/.barpc/cache/<stage>/<key>.npz   results of tasks (`barpc.base.tasks.Store`)
 
 Resuming is running the same command again. A run notes the sha256 of an output before the output takes its name: only
 a file with a noted content is ever replaced or taken away. The notes may be anybody's: a name counts only for a regular
@@ -25,21 +25,19 @@ import shutil
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import fields, is_dataclass
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import filelock
 import numpy as np
-import numpy.typing as npt
 
 from barpc import __version__
 from barpc.base import manifest
 from barpc.base.atomic import PARTIAL, STATE, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
-from barpc.base.frozen import Arrays, load_npz
+from barpc.base.fields import given, is_record
 from barpc.base.identity import Stamp
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.memory import give_back, peak_memory
@@ -53,13 +51,15 @@ from barpc.base.sealed import (
     noted_outputs,
     read_state,
 )
-from barpc.rpcio import hidden_by
+from barpc.base.tasks import Store
 
 logger = logging.getLogger(__name__)
 
 LOCK, CACHE = "lock", "cache"
 _FILES = (STATE_FILE, NOTES, LOCK)
 
+SIDECAR_ENDS = ".rpb", ".xml", ".txt", ".rpc", ".geom"
+"""How names of files end that `barpc.rpcio` reads beside an image."""
 KEEP_AFTER = 30.0
 """A run that is refused within so many seconds leaves nothing; after that its stages are kept."""
 
@@ -85,9 +85,8 @@ def key_of(*parts: object) -> str:
 
 
 def _key_form(value: object) -> object:
-    if is_dataclass(value) and not isinstance(value, type):
-        kept = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-        return {"type": type(value).__name__, **kept}
+    if is_record(value):
+        return {"type": type(value).__name__, **given(value)}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), list(value.shape), hashlib.sha256(value.tobytes()).hexdigest()]
     if isinstance(value, np.generic):
@@ -146,6 +145,7 @@ class Workspace:
         self.folder = Path(folder).absolute()
         own = self.folder / STATE
         self.cache, self.partial = own / CACHE, own / PARTIAL
+        self.store = Store(str(self.cache), str(self.partial))
         self._keep = frozenset(path.resolve() for path in keep)
         self._adds = adds
         self.outputs: dict[str, str] = {}
@@ -210,6 +210,10 @@ class Workspace:
 
         For the inputs it does not matter whether barpc wrote such a file before.
         """
+        if not any(name.lower().endswith(SIDECAR_ENDS) for name in names):
+            return
+        from barpc.rpcio import hidden_by  # with GDAL
+
         for path, image, _ in hidden_by(self.folder / name for name in names):
             known = "the input " * (image.resolve() in self._keep)
             if known or not (self.owns(image.name) or os.path.lexists(path)):
@@ -272,28 +276,6 @@ class Workspace:
                 made.rmdir()
             except OSError:
                 return
-
-    def load(self, stage: str, key: str) -> Arrays | None:
-        """Return a kept result, or None; one that is damaged is taken away and counts as missing."""
-        path = self.cache / stage / f"{key}.npz"
-        if path.is_symlink() or not path.is_file():
-            return None
-        try:
-            return load_npz(path)
-        except (OSError, ValueError) as error:
-            logger.warning("%s: a damaged cache file is made again (%s)", path, error)
-            path.unlink(missing_ok=True)
-            return None
-
-    def store(self, stage: str, key: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Keep a result, under a temporary name until it is whole."""
-        path = self.cache / stage / f"{key}.npz"
-        with self.keeping(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-
-    def keeping(self, path: Path) -> AbstractContextManager[Path]:
-        """Return a temporary path for a file among the caches, which can be made again."""
-        return replacing(path, overwrite=True, durable=False, room=self.partial)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -36,7 +36,8 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.errors import BarpcError, BarpcWarning
 from barpc.pipeline import RunOptions
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import altitude_range, camera_center
+from barpc.sensor.geometry import camera_center
+from barpc.sensor.rpc import altitude_range
 from barpc.simulate import simulate_block
 
 HEAD = """# Accuracy

@@ -164,10 +164,8 @@ def arrows(trees: dict[Path, ast.Module]) -> int:
 
 
 def is_private(name: str) -> bool:
-    """A name with one leading _, but for those that namedtuples and notebooks have in public."""
-    return (
-        name.startswith("_") and not name.startswith("__") and name not in ("_", "_replace", "_asdict", "_repr_html_")
-    )
+    """A name with one leading _, but for those that namedtuples have in public."""
+    return name.startswith("_") and not name.startswith("__") and name not in ("_", "_replace", "_asdict")
 
 
 def owner(node: ast.AST) -> str:

@@ -16,8 +16,8 @@ from barpc.base.geodesy import Array
 from barpc.fit import fit_rpc
 from barpc.rpcio import read_rpc
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import altitude_range
 from barpc.sensor.linescan import read_linescan
+from barpc.sensor.rpc import altitude_range
 
 
 def words(values: Array) -> str:

@@ -143,9 +143,9 @@ def kinds(place: Path, shots, arguments):
                 out.write((GAIN * image).astype(np.float32), 1)
         view = View(name, str(path), size, camera.sensor, ALTS)
         fitted.append((view, fit_rpc(camera, size, ALTS, strict=False), camera))
-    wide, out = arguments.dense, place / "out"
+    out = place / "out"
     with Workspace(out) as run:
-        write_grids(run, fitted, RunOptions(grids=True, resample=not wide))
+        write_grids(run, fitted, RunOptions(grids=True))
     if arguments.cars:
         for_cars(place, fitted)
     images = [image for *_, image in shots]
@@ -159,12 +159,6 @@ def kinds(place: Path, shots, arguments):
         "_grid.tif": (images, files("_grid.tif")),
         "_correction.tif": (images, files("_correction.tif")),
     }
-    if not wide:
-        resampled = []
-        for name, *_ in shots:
-            with rasterio.open(out / f"{name}_resampled.tif") as dataset:
-                resampled.append(dataset.read(1) / GAIN)
-        found["_resampled.tif"] = (resampled, files("_resampled.tif"))
     return found | {"truth": (images, [camera for _, camera, _ in shots])}
 
 
@@ -175,7 +169,7 @@ def main() -> None:
     parser.add_argument("--cols", type=int, default=240)
     parser.add_argument("--period", type=float, default=1200.0, help="of the swing [rows]")
     parser.add_argument("--pixels", type=float, default=0.5, help="of the swing")
-    parser.add_argument("--dense", action="store_true", help="every pixel's disparity; none resampled")
+    parser.add_argument("--dense", action="store_true", help="every pixel's disparity")
     parser.add_argument("--cars", type=Path, help="leave files for CARS in this new folder")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")

@@ -80,7 +80,6 @@ SIZES = {
     "front_views": ("barpc.ba.solving.structure.LEAF",),
     "edge_rounds": ("barpc.ba.terms.detectors.ITERATIONS",),
     "cells_read": ("barpc.rasters.dem._MAX_CELLS",),
-    "resampled_block": ("barpc.rpcio.grids.BLOCK_SIZE",),
     "points_together": ("barpc.sensor.rpc.CHUNK",),
     "unknowns_searched": ("barpc.ba.select.search.LARGEST",),
     "observations_searched": ("barpc.ba.select.search.MAX_OBSERVATIONS",),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import product
 from typing import Any
+from zlib import crc32
 
 import pytest
 
@@ -43,6 +44,18 @@ def spread(count: int, few: int) -> set[int]:
     if few >= count:
         return set(range(count))
     return {round(k * (count - 1) / max(few - 1, 1)) for k in range(few)}
+
+
+def in_turn(names: Iterable[str], part: str) -> list[str]:
+    """Those of the test names whose turn it is: one of so many parts, another with each number, in another order.
+
+    >>> names = [f"tests/test_{file}.py::test[{k}]" for file in "ab" for k in range(9)]
+    >>> sorted(name for number in range(3) for name in in_turn(names, f"{number}/3")) == sorted(names)
+    True
+    """
+    number, parts = map(int, part.split("/"))
+    chosen = [name for name in names if crc32(name.encode()) % parts == number % parts]
+    return sorted(chosen, key=lambda name: crc32(f"{number} {name.partition('::')[0]}".encode()))
 
 
 def known(reason: str) -> pytest.MarkDecorator:

@@ -31,8 +31,8 @@ from barpc.rpcio.grids import write_correction
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import open_state
-from barpc.sensor.geometry import altitude_range
 from barpc.sensor.image_corrections import CorrectionGrid
+from barpc.sensor.rpc import altitude_range
 from tests.pipeline.known import part
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 from tests.sensor.conftest import MODELS
@@ -285,6 +285,7 @@ class Own:
         return self.inner.localize(image, alt)
 
 
+@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
     from barpc.pipeline import load_views

@@ -37,7 +37,7 @@ def test_every_listed_mutant_has_its_place_and_its_tests(mutation) -> None:
         assert tests[mutant.part]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mutants_are_programs_that_differ(mutation, every) -> None:
     assert {mutant.part for mutant in every} == set(mutation.parts())
     for mutant in random.Random(0).sample(every, 60):
@@ -46,7 +46,7 @@ def test_mutants_are_programs_that_differ(mutation, every) -> None:
         compile(after, mutant.file, "exec")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_mutants_named_equivalent_are_still_there(mutation, every) -> None:
     listed = mutation.equivalents()
     files = {file for file, _ in listed}

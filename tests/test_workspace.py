@@ -19,7 +19,6 @@ from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
 from barpc.base.memory import peak_memory
 from barpc.base.sealed import noted_outputs
-from barpc.report.runfiles import table_path
 from barpc.workspace import (
     Workspace,
     code_version,
@@ -38,11 +37,11 @@ class Options:
 def test_a_result_is_kept_and_read_back_to_the_bit(tmp_path):
     made = {"x": np.arange(6.0).reshape(2, 3) / 7, "name": np.array("é")}
     with Workspace(tmp_path / "run") as run:
-        assert run.load("detect", key_of("a")) is None
-        run.store("detect", key_of("a"), made)
+        assert run.store.read(f"detect/{key_of('a')}") is None
+        run.store.write(f"detect/{key_of('a')}", made)
     with Workspace(tmp_path / "run", overwrite=True) as run:
-        found = run.load("detect", key_of("a"))
-        assert run.load("detect", key_of("b")) is None
+        found = run.store.read(f"detect/{key_of('a')}")
+        assert run.store.read(f"detect/{key_of('b')}") is None
     np.testing.assert_array_equal(found["x"], made["x"])
     assert str(found["name"]) == "é"
 
@@ -50,18 +49,18 @@ def test_a_result_is_kept_and_read_back_to_the_bit(tmp_path):
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", None])
 def test_a_damaged_result_is_made_again(tmp_path, damage, caplog):
     with Workspace(tmp_path / "run") as run:
-        run.store("detect", "k", {"x": np.zeros(1000)})
+        run.store.write("detect/k", {"x": np.zeros(1000)})
         path = run.folder / ".barpc/cache/detect/k.npz"
         path.write_bytes(path.read_bytes()[:500] if damage is None else damage)
-        assert run.load("detect", "k") is None
+        assert run.store.read("detect/k") is None
         assert "damaged" in caplog.text
-        run.store("detect", "k", {"x": np.ones(3)})
-        np.testing.assert_array_equal(run.load("detect", "k")["x"], np.ones(3))
+        run.store.write("detect/k", {"x": np.ones(3)})
+        np.testing.assert_array_equal(run.store.read("detect/k")["x"], np.ones(3))
 
 
 def test_a_result_with_python_objects_is_refused(tmp_path):
     with Workspace(tmp_path / "run") as run, pytest.raises(ValueError, match="allow_pickle"):
-        run.store("detect", "k", {"x": np.array([{"a": 1}], dtype=object)})
+        run.store.write("detect/k", {"x": np.array([{"a": 1}], dtype=object)})
 
 
 def test_the_key_depends_on_everything_that_goes_in():
@@ -171,7 +170,7 @@ def test_leftovers_of_a_killed_run_are_cleaned_and_its_stages_stay(tmp_path):
         "import os, signal, numpy as np\n"
         "from barpc.workspace import Workspace\n"
         f"run = Workspace({str(tmp_path / 'run')!r})\n"
-        "run.store('detect', 'k', {'x': np.ones(3)})\n"
+        "run.store.write('detect/k', {'x': np.ones(3)})\n"
         "output = run.output('a.vrt')\n"
         "output.__enter__().write_text('half')\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -182,7 +181,7 @@ def test_leftovers_of_a_killed_run_are_cleaned_and_its_stages_stay(tmp_path):
     with Workspace(tmp_path / "run") as run:
         assert [p.name for p in run.folder.iterdir()] == [".barpc"]
         assert not run.partial.exists() or not list(run.partial.iterdir())
-        assert run.load("detect", "k") is not None
+        assert run.store.read("detect/k") is not None
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
@@ -203,7 +202,7 @@ def test_a_run_killed_before_its_first_state_is_gone_on_with(tmp_path):
 
 def test_a_run_that_is_refused_at_once_leaves_nothing(tmp_path):
     with pytest.raises(TiePointError), Workspace(tmp_path / "new/run") as run:
-        run.store("detect", "k", {"x": np.ones(3)})
+        run.store.write("detect/k", {"x": np.ones(3)})
         raise TiePointError
     assert list(tmp_path.iterdir()) == []
 
@@ -211,10 +210,10 @@ def test_a_run_that_is_refused_at_once_leaves_nothing(tmp_path):
 def test_a_run_that_is_refused_late_keeps_its_stages(tmp_path, sized):
     sized(kept_after=0.0)
     with pytest.raises(TiePointError), Workspace(tmp_path / "run") as run:
-        run.store("detect", "k", {"x": np.ones(3)})
+        run.store.write("detect/k", {"x": np.ones(3)})
         raise TiePointError
     with Workspace(tmp_path / "run") as run:
-        assert run.load("detect", "k") is not None
+        assert run.store.read("detect/k") is not None
 
 
 def test_stages_are_timed(tmp_path):
@@ -418,7 +417,7 @@ def test_no_link_is_followed_in_the_place_of_barpc_s_own_files(tmp_path, name, k
 
 def test_a_kept_result_that_is_a_link_or_a_fifo_is_made_again(tmp_path):
     with Workspace(tmp_path / "run") as run:
-        run.store("detect", "a", {"x": np.ones(3)})
+        run.store.write("detect/a", {"x": np.ones(3)})
         place = run.cache / "detect"
         shutil.move(place / "a.npz", tmp_path / "a.npz")
         (place / "a.npz").symlink_to(tmp_path / "a.npz")
@@ -426,9 +425,9 @@ def test_a_kept_result_that_is_a_link_or_a_fifo_is_made_again(tmp_path):
         (place / "b.npz").symlink_to(tmp_path / "thesis")
         os.mkfifo(place / "c.npz")
         for key in "abc":
-            assert run.load("detect", key) is None
-            run.store("detect", key, {"x": np.zeros(3)})
-            np.testing.assert_array_equal(run.load("detect", key)["x"], np.zeros(3))
+            assert run.store.read(f"detect/{key}") is None
+            run.store.write(f"detect/{key}", {"x": np.zeros(3)})
+            np.testing.assert_array_equal(run.store.read(f"detect/{key}")["x"], np.zeros(3))
     assert (tmp_path / "thesis").read_text() == "thesis"
     assert np.load(tmp_path / "a.npz")["x"].sum() == 3
 
@@ -472,12 +471,12 @@ def test_a_run_that_cannot_save_its_first_state_leaves_nothing_and_no_lock(tmp_p
 
 def test_a_refused_run_keeps_the_results_of_a_longer_one_before_it(tmp_path):
     with pytest.raises(RuntimeError), Workspace(tmp_path / "run") as run:
-        run.store("detect", "k", {"x": np.ones(3)})
+        run.store.write("detect/k", {"x": np.ones(3)})
         raise RuntimeError
     with pytest.raises(TiePointError), Workspace(tmp_path / "run"):
         raise TiePointError
     with Workspace(tmp_path / "run") as run:
-        assert run.load("detect", "k") is not None
+        assert run.store.read("detect/k") is not None
 
 
 def test_an_added_file_joins_what_is_there_and_replaces_its_own_only(tmp_path):
@@ -533,6 +532,7 @@ with Workspace(sys.argv[1], overwrite=sys.argv[4] == "overwrite", names=["a", "b
 """
 
 
+@pytest.mark.costs(4)
 @pytest.mark.skipif(os.name != "posix", reason="no SIGKILL here")
 @pytest.mark.parametrize(
     ("mode", "numbers"),
@@ -562,20 +562,6 @@ def test_killed_at_any_rename_the_same_command_finishes(tmp_path, mode, numbers)
                 "c": "new asp/c",
             }
             assert json.loads((folder / ".barpc/state.json").read_text())["status"] == "done"
-
-
-def test_a_table_lies_in_its_folder_and_that_of_an_earlier_run_beside_the_summary(tmp_path):
-    new, old = tmp_path / "tables/pairs.csv", tmp_path / "pairs.csv"
-    assert table_path(tmp_path, "pairs.csv") == new  # a message names the new place
-    old.write_text("old")
-    assert table_path(tmp_path, "pairs.csv") == old
-    new.parent.mkdir()
-    new.write_text("new")
-    assert table_path(tmp_path, "pairs.csv") == new
-    old.unlink()
-    new.unlink()
-    old.symlink_to(tmp_path / "nowhere")
-    assert table_path(tmp_path, "pairs.csv") == old  # to be refused by who opens it
 
 
 def test_a_run_whose_last_state_cannot_be_saved_is_not_taken_for_finished(tmp_path, monkeypatch):
@@ -681,3 +667,11 @@ def test_stages_and_the_place_of_a_run_outlast_what_is_added_to_it(tmp_path):
     with Workspace(tmp_path / "moved", adds=True):
         pass
     assert json.loads((tmp_path / "moved/.barpc/state.json").read_text())["stages"] == []
+
+
+def test_every_name_read_beside_an_image_may_hide_its_rpc():
+    from barpc.rpcio.sources import _sidecar_names
+    from barpc.workspace import SIDECAR_ENDS
+
+    for image in ("a.tif", "IMG_PHR1A_P_001_R1C1.TIF", "IMG-HH-ALPSMW.tif", "10APR-P2AS_R1C1-012_P001.NTF", "noend"):
+        assert all(name.lower().endswith(SIDECAR_ENDS) for _, name, _ in _sidecar_names(image))

@@ -32,7 +32,6 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, RowSpline, Splined
-from barpc.sensor.timing import Timed, Timing
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,11 +202,11 @@ class Adjustment:
         return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
 
     @property
-    def corrections(self) -> tuple[Correction | Timing | ImageAffine, ...]:
+    def corrections(self) -> tuple[Correction | ImageAffine, ...]:
         """The correction of every view."""
         found = []
         for sensor in self.bases:
-            assert isinstance(sensor, Corrected | Timed | ImageCorrected)
+            assert isinstance(sensor, Corrected | ImageCorrected)
             found.append(sensor.correction)
         return tuple(found)
 
@@ -367,7 +366,6 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
         adjustment.cameras.unknowns.center[views],
         None if isinstance(matrix, np.ndarray) or reduced.common is None else reduced.common.by_camera[:, free],
         None if waves is None else waves.select(views),
-        tuple(adjustment.names[v] for v in adjustment.cameras.unknowns.radars if v in views),
         EarlierScene(adjustment.gauge.by_unknown[:, free], adjustment.gauge.own, adjustment.gauge.radius),
         adjustment.told[views],
         adjustment.prior.shown,
@@ -407,12 +405,11 @@ def moved_px(before: BlockPrior, after: BlockPrior, places: Array, pixel: Array)
     up = enu_basis(ground_from_ecef(places))[:, 2]
     # as wide as it is seen, along the line of sight
     side = pixel * np.sqrt(np.abs((sight * up).sum(axis=1)))
-    radar, most = np.isin(before.names, before.radars), np.zeros(n)
+    most = np.zeros(n)
     for row in (-1.0, 0.0, 1.0):
         powers = row ** np.arange(1, before.drift + 1)
         vector = turned + np.einsum("d,ndx->nx", powers, drift)
         moved = np.cross(vector, sight) - shifted
         moved -= (moved * sight).sum(axis=1, keepdims=True) * sight
-        moved = np.where(radar[:, None], vector * [1.0, 1.0, 0.0], moved)
         most = np.maximum(most, np.linalg.norm(moved, axis=1))
     return np.asarray(most / side)

@@ -20,6 +20,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 from barpc.base.errors import InputError
+from barpc.base.fields import Value, given
 
 T = TypeVar("T")
 OptionsRecord = TypeVar("OptionsRecord", bound="Options")
@@ -115,11 +116,11 @@ def _declared(record: Any) -> Mapping[str, Declared]:
 
 
 @dataclass_transform(frozen_default=True)
-class Options:
+class Options(Value):
     """Base of the option records: its children are frozen dataclasses, checked when made, short when printed."""
 
     def __init_subclass__(cls) -> None:
-        dataclass(frozen=True, repr=False)(cls)
+        dataclass(frozen=True, eq=False, repr=False)(cls)
         rows = [str(cls.__doc__), "", "Parameters", "----------"]
         for name, one in declared(cls).items():
             rows += [f"{name} : {wanted(one.kind, _FREE if one.rule.rows else one.rule)}"]
@@ -133,11 +134,9 @@ class Options:
             if not known:  # a default is a row of its table: it is not imported for that
                 object.__setattr__(self, name, checked(name, one.kind, one.rule, value))
 
-    def __repr__(self) -> str:
+    def _told(self) -> str:
         known = declared(type(self))
-        given = {name: getattr(self, name) for name in known}
-        shown = (f"{name}={_SHORT.repr(v)}" for name, v in given.items() if v != known[name].default)
-        return f"{type(self).__name__}({', '.join(shown)})"
+        return ", ".join(f"{name}={_SHORT.repr(v)}" for name, v in given(self).items() if v != known[name].default)
 
 
 def wanted(kind: Any, rule: Rule) -> str:

@@ -6,9 +6,7 @@ import json
 import math
 import sys
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from html import escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,44 +15,19 @@ import numpy.typing as npt
 from numpy.lib import format as npy
 
 from barpc.base.errors import BarpcError, InputError, plain
+from barpc.base.fields import Value, field_names, given, is_record
 from barpc.base.remote import Remote
 from barpc.base.safe_io import ARRAYS, BYTES_PER_NUMBER, Kind, opened
 
 
-def html_table(title: str, rows: Iterable[Sequence[object]], heads: Sequence[object] = ()) -> str:
-    """Return a table as HTML for a notebook, every text escaped.
-
-    Examples
-    --------
-    >>> html_table("a < b", [("size", 3)])
-    '<b>a &lt; b</b><table><tr><th>size</th><td>3</td></tr></table>'
-    """
-    lines = [f"<tr>{''.join(f'<th>{escape(str(head))}</th>' for head in heads)}</tr>"] if heads else []
-    for first, *others in rows:
-        cells = "".join(f"<td>{escape(str(cell))}</td>" for cell in others)
-        lines.append(f"<tr><th>{escape(str(first))}</th>{cells}</tr>")
-    return f"<b>{escape(title)}</b><table>{''.join(lines)}</table>"
-
-
-class Shown:
-    """Base of dataclasses that a notebook shows as a table, a row a field."""
-
-    def _repr_html_(self) -> str:
-        given = [(one.name, getattr(self, one.name)) for one in fields(self) if one.init]  # type: ignore[arg-type]
-        rows = [(name, value if isinstance(value, str | Path) else _short(value)) for name, value in given]
-        return html_table(type(self).__name__, rows)
-
-
-class Frozen(Shown):
+class Frozen(Value):
     """Base of frozen dataclasses (declared with ``eq=False, repr=False``) that hold arrays and plain values.
 
-    Arrays are copies of their own and read-only, after unpickling too; equality and hash go by the content of the
-    fields that are given to the constructor; one line is printed.
+    Arrays are copies of their own and read-only, after unpickling too, and compared by their content.
     """
 
     def __post_init__(self) -> None:
-        for name in self._given():
-            value = getattr(self, name)
+        for name, value in given(self).items():
             if isinstance(value, np.ndarray):
                 self._keep(name, value.copy())
 
@@ -73,13 +46,13 @@ class Frozen(Shown):
         finite: bool = True,
     ) -> Any:
         """Make a field a read-only array of the given shape (None: any length), its numbers `finite` if so asked."""
-        given = getattr(self, name)
+        found = getattr(self, name)
         # of another record, which nobody can write to either
-        kept = isinstance(given, np.ndarray) and given.flags.owndata and not given.flags.writeable
+        kept = isinstance(found, np.ndarray) and found.flags.owndata and not found.flags.writeable
         what = f"{type(self).__name__} {name}"
-        if np.ma.is_masked(given) or np.iscomplexobj(given):
+        if np.any(getattr(found, "mask", False)) or np.iscomplexobj(found):
             raise error(f"{what}: masked or complex numbers; leave them out, or give their real parts")
-        value: npt.NDArray[Any] = np.array(given, dtype=dtype, copy=None if kept else True)
+        value: npt.NDArray[Any] = np.array(found, dtype=dtype, copy=None if kept else True)
         if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
             raise error(f"{what}: shape {value.shape}, expected {shape}")
         if finite and not np.isfinite(value).all():
@@ -87,28 +60,21 @@ class Frozen(Shown):
         self._keep(name, value)
         return value
 
-    def _given(self) -> list[str]:
-        return [field.name for field in fields(self) if field.init]  # type: ignore[arg-type]  # children are dataclasses
-
     def _told(self) -> str:
-        """Return the fields to be printed."""
-        return ", ".join(f"{name}={_short(getattr(self, name))}" for name in self._given())
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self._told()})"
+        return ", ".join(f"{name}={_short(value)}" for name, value in given(self).items())
 
     def _content(self) -> tuple[object, ...]:
-        return tuple(_comparable(getattr(self, name)) for name in self._given())
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and isinstance(other, Frozen) and self._content() == other._content()
-
-    def __hash__(self) -> int:
-        return hash(self._content())
+        return tuple(map(_comparable, given(self).values()))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
             self._keep(name, value)
+
+
+def joined(parts: Sequence[Any]) -> dict[str, Any]:
+    """Return the fields of records of one class, each with the arrays or tuples of all, one after the other."""
+    columns = {name: [getattr(part, name) for part in parts] for name in field_names(parts[0].__class__)}
+    return {k: sum(v, ()) if isinstance(v[0], tuple) else np.concatenate(v) for k, v in columns.items()}
 
 
 def _comparable(value: object) -> object:
@@ -178,8 +144,8 @@ def _encode(value: Any, arrays: Arrays) -> Any:
         return {type(value).__name__: [_encode(v, arrays) for v in value]}
     if isinstance(value, Mapping):
         return {"map": [[str(k), _encode(v, arrays)] for k, v in value.items()]}
-    if is_dataclass(value) and type(value).__module__.split(".")[0] == "barpc":
-        kept = {f.name: _encode(getattr(value, f.name), arrays) for f in fields(value) if f.init}
+    if is_record(value) and type(value).__module__.split(".")[0] == "barpc":
+        kept = {name: _encode(held, arrays) for name, held in given(value).items()}
         return {"class": [type(value).__module__, type(value).__qualname__], "fields": kept}
     raise TypeError(f"a {type(value).__name__} cannot be kept")
 
@@ -201,7 +167,7 @@ def _decode(frame: Any, arrays: Mapping[str, npt.NDArray[Any]], sent: bool = Fal
         return {k: _decode(v, arrays, sent) for k, v in frame["map"]}
     module, name = frame["class"]
     kind = getattr(sys.modules.get(module), name, None)
-    if module.split(".")[0] != "barpc" or not (isinstance(kind, type) and is_dataclass(kind)):
+    if module.split(".")[0] != "barpc" or not (isinstance(kind, type) and hasattr(kind, "__dataclass_fields__")):
         raise ValueError(f"{module}.{name} is not a record of barpc")
     return kind(**{k: _decode(v, arrays, sent) for k, v in frame["fields"].items()})
 

@@ -39,21 +39,18 @@ class RunKeywords(TypedDict, total=False):
     dem_sigma: float
     dem_bias_sigma: float | None
     min_convergence: float
-    solver: Literal["auto", "scipy", "sparse"]
+    solver: Literal["auto", "sparse"]
     method: Literal["auto", "ridge", "gauss-newton", "lcurve-joint"]
     grid: Sequence[int]
     space: Literal["image", "ground"]
     tolerance: float
     pole_margin: float
-    precision: Literal["nitf", "rpcm"] | None
-    localisation: bool
     tie: TieOptions | Mapping[str, Any]
     adjust: AdjustOptions | Mapping[str, Any]
     fit: FitOptions | Mapping[str, Any]
     images: Literal["vrt", "copy", "none"]
     rpc_formats: Sequence[str]
     grids: bool
-    resample: bool
     stop_after: Literal["matching", "adjustment", "all"]
     keep_going: bool
     overwrite: bool
@@ -122,8 +119,6 @@ class RefitKeywords(TypedDict, total=False):
     space: Literal["image", "ground"]
     tolerance: float
     pole_margin: float
-    precision: Literal["nitf", "rpcm"] | None
-    localisation: bool
     alt_range: Sequence[float] | None
     dem: Files
     dem_margin: float

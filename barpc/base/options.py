@@ -126,8 +126,8 @@ class AdjustOptions(Options):
     )
     sigma_position: float | None = option(
         None,
-        """Prior standard deviation of the translation along an axis; of a radar's range and position along the flight.
-        Without: as for the attitude, or the accuracy stated by a radar's orbit and metadata.""",
+        """Prior standard deviation of the translation along an axis. Without: as for the attitude, or the accuracy
+        stated by a radar's orbit and metadata.""",
         unit="m",
         above=0,
     )
@@ -166,10 +166,11 @@ class AdjustOptions(Options):
     min_convergence: float = option(
         1.0, "Tracks with a smaller convergence angle are constrained in height.", unit="deg", least=0, most=180
     )
-    solver: Literal["auto", "scipy", "sparse"] = option(
+    solver: Literal["auto", "sparse"] = option(
         "auto",
-        """scipy's `least_squares` on the compressed problem, or a sparse Levenberg-Marquardt; `auto` takes scipy's for
-        up to 200 camera unknowns (22 views of nine).""",
+        """Up to 200 camera unknowns (22 views of nine) scipy's `least_squares` on the compressed problem, beyond, or
+        with `sparse` always, a sparse Levenberg-Marquardt.""",
+        removed={"scipy": "`auto` takes it for up to 200 unknowns"},
     )
 
     def __post_init__(self) -> None:
@@ -231,12 +232,6 @@ class FitOptions(Options):
         is often better.""",
         least=0,
     )
-    precision: Literal["nitf", "rpcm"] | None = option(None, "Fit coefficients to the few digits of a format.")
-    localisation: bool = option(
-        False,
-        """Fit the localisation RPC, too: lon, lat as quotients of cubics of col, row and altitude; txt, json and vrt
-        files store it.""",
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -260,9 +255,6 @@ class RunOptions(Options):
         False,
         """Write a localisation grid and a correction grid of every image; without, of those whose RPC misses the
         corrected camera by more than 0.02 px. RPCs that miss the fit's tolerance are no failure then.""",
-    )
-    resample: bool = option(
-        False, "Also write every image resampled, so that one RPC represents its camera, and its correction grid."
     )
     stop_after: Literal["matching", "adjustment", "all"] = option(
         "all", "End early: after the tracks, or before RPCs are written."
@@ -380,7 +372,6 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
         "drift": 0,
         "jitter": OFF,
         "learn_priors": False,
-        "solver": "scipy",
     },
     "fit": {"method": "lcurve-joint", "space": "ground", "grid": (20, 20, 10)},
 }

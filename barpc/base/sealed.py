@@ -38,7 +38,7 @@ CAREFUL = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(
 
 @dataclass(frozen=True, eq=False)
 class Sealed:
-    """A finished folder: its root, its layers (without any nothing proves it), and notes of its state.
+    """A finished folder: its root, its layers, and notes of its state.
 
     `noted`: SHA-256 of outputs; `made`: where it was made; `stamps`: of large files, by their paths from the folder.
     """
@@ -55,18 +55,10 @@ class Sealed:
         """Read SHA256SUMS and the state; InputError where SHA256SUMS is missing or damaged."""
         if not os.path.lexists(folder / SUMS):
             raise InputError(
-                f"{folder / SUMS}: missing: the run was interrupted, is of release 0.3 or older, or the file was "
-                "removed; without it nothing can be verified: run the adjustment again"
+                f"{folder / SUMS}: missing: the run was interrupted, or the file was removed; without it nothing "
+                "can be verified: run the adjustment again"
             )
-        return cls._of(folder, *manifest.read(folder))
-
-    @classmethod
-    def unproved(cls, folder: Path) -> Sealed:
-        """Return a folder of a release without SHA256SUMS: its files are as they are."""
-        return cls._of(folder, "", ())
-
-    @classmethod
-    def _of(cls, folder: Path, root: str, layers: Sequence[Layer]) -> Sealed:
+        root, layers = manifest.read(folder)
         state, stamps = read_state(folder), dict[str, Stamp]()
         with suppress(AttributeError, TypeError):
             stamps = {path: Stamp(*values) for path, values in state.get("stamps", {}).items()}
@@ -75,14 +67,14 @@ class Sealed:
     @cached_property
     def listed(self) -> Mapping[str, str]:
         """SHA-256 of every file; of what the first command wrote a later one makes the report again, nothing else."""
-        first = self.layers[0].files if self.layers else {}
+        first = self.layers[0].files
         every = {name: sha for layer in self.layers for name, sha in layer.files.items()}
         return every | {name: sha for name, sha in first.items() if name != REPORT_FILE}
 
     def file(self, name: str) -> Path:
         """Return the path of a file, or of none that was written; InputError where it is not as a command wrote it."""
         path = self.folder / name
-        if not self.layers or (name not in self.listed and not os.path.lexists(path)):
+        if name not in self.listed and not os.path.lexists(path):
             return path
         if self.noted.get(SUMS, self.root) != self.root:
             raise self._edited(self.folder / SUMS, "was changed")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,7 +103,7 @@ def _tell_plan(plan: Plan) -> int:
     cost = f"about {fast:.0f} to {slow:.0f} CPU s and {plan.memory_mb / 1000:.1f} GB"
     pairs = f"{len(plan.pairs)} pair{'s' * (len(plan.pairs) != 1)} to match first"
     head = f"{len(plan.views)} image{'s' * (len(plan.views) != 1)}, {pairs}: {cost}"
-    tell(asdict(plan), head, *rows, *more, *plan.datum)
+    tell(plan, head, *rows, *more, *plan.datum)
     return tell_gate("the input has reservations:", list(plan.doubts)) if plan.doubts else 0
 
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", metavar="RPC", help="Where to write; the name chooses the format. Else measure.")
 @flags_of(RefitOptions, keep_going="Write the RPC although it misses the tolerance; exit 3.")
 @flag("fit.tolerance")
-@flag("fit.localisation")
 @paper
 @click.option("--options", "options_file", metavar="FILE", help="TOML file; its table [fit] counts here.")
 def fit(source: str, output: str | None, **flags: Any) -> int:
@@ -47,8 +46,6 @@ def fit(source: str, output: str | None, **flags: Any) -> int:
     written = [f"written       {output} (read back: these are its figures)"] * done.written
     more = {"verdict": verdict, "output": output if done.written else None}
     tell({**done.fit.summary(), **more} if wants_json() else None, _certificate(done.fit, verdict), *written)
-    if flags["flag_fit_localisation"] and done.written and done.fit.rpc.direct is None:
-        return tell_gate(f"{output} holds no localisation RPC: give a name in _RPC.TXT, .json or .vrt", [])
     if not verdict:
         return 0
     how = "written all the same" if done.written else "nothing written (--keep-going writes it all the same)"
@@ -61,11 +58,6 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
     rows = {"control rmse": fit.rmse_cnp, "control max": fit.max_cnp}
     rows |= {"check rmse": fit.rmse_ckp, "check max": fit.max_ckp}
     beyond = f"beyond        {fit.beyond:.2%} of the image at most may have larger errors (95 % confidence)"
-    more = []
-    if (found := fit.localisation) is not None:
-        again = f"projected again {found.rmse_px:.3g} and {found.max_px:.3g} px"
-        least = f"denominators at least {found.min_denominator:.3g}"
-        more = [f"localisation  rmse {found.rmse_m:.3g} m, max {found.max_m:.3g} m; {again}; {least}"]
     lines = [
         f"method        {fit.method}, {fit.iterations} passes, h {fit.h[0]:.2g} {fit.h[1]:.2g}",
         f"points        {fit.num_cnp} control, {fit.num_ckp} check, {fit.coverage:.0%} of the image covered",
@@ -74,7 +66,6 @@ def _certificate(fit: RpcFit, verdict: str) -> str:
         *([beyond] if fit.beyond < 1 else []),  # given points say nothing of the rest
         f"denominators  at least {fit.min_denominator:.3g} of their value at the centre, over the ground and a margin",
         f"round trip    {fit.roundtrip:.1g} px" + f"; the camera's own {fit.contradiction:.1g}" * (fit.beyond < 1),
-        *more,
         f"verdict       {verdict or 'within tolerance'}",
     ]
     return "\n".join(lines)

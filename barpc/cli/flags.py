@@ -40,7 +40,7 @@ GROUND = (
 )
 ADJUSTMENT = (*CAMERA, *GROUND)
 MATCH = ("overwrite", "keep_going")
-RUN = (*MATCH, "images", "rpc_formats", "grids", "resample")
+RUN = (*MATCH, "images", "rpc_formats", "grids")
 """Fields of RunOptions that have flags, by what their verbs do, with their table before a dot."""
 
 
@@ -183,7 +183,7 @@ paper = click.option(
     "--paper",
     is_flag=True,
     help="The method of Akiki et al. (IGARSS 2021) whole: one rotation and translation about a projective centre, no "
-    "drift, no splines, least_squares, RPCs by the joint L-curve on a grid in lon and lat. Options and flags win.",
+    "drift, no splines, RPCs by the joint L-curve on a grid in lon and lat. Options and flags win.",
 )
 
 
@@ -230,7 +230,7 @@ def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOption
     """Return defaults, or the paper's options, then the options file, then the flags that were given."""
     options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
     options = options if options_file is None else read_options(options_file, options)
-    targets = (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance", "fit.localisation")
+    targets = (*TIE, *ADJUSTMENT, *RUN, REMOTE, "fit.tolerance")
     found = {target.rpartition(".")[2]: flags.get(_parameter(target)) for target in targets}
     return with_keywords(options, given_flags(found), "command line")
 

@@ -20,7 +20,7 @@ from barpc.base.atomic import STATE
 from barpc.base.errors import OutputError
 
 if TYPE_CHECKING:
-    from barpc.tie.tasks import Progress
+    from barpc.base.tasks import Progress
 
 EXIT_INTERRUPTED = 130
 INTERRUPTED = "interrupted"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     edits of a file together with the list. Missing inputs are searched by name beside the run, in it, and in the
     folders given; other hosts are not accessed. --figures measures what the run printed again, by the files on disk as
     another tool reads them, to 0.005 px. Exit code 0: everything is unchanged; 3: something is not; 1: no SHA256SUMS
-    (interrupted, or of release 0.3), or a damaged one.
+    (interrupted), or a damaged one.
 
     \b
     Examples:
@@ -119,7 +118,7 @@ def verify(run_dir: str, places: tuple[str, ...], **flags: Any) -> int:
     kinds = {kind: [f"{n} {now}" for (of, now), n in counts.items() if of == kind] for kind in _VERIFIED}
     if not flags.get("figures"):
         del kinds["figure"]
-    tell(list(map(asdict, found)), *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
+    tell(found, *changed, *(f"{kind}s: {', '.join(told) or 'none'}" for kind, told in kinds.items()))
     if not wrong:
         return 0
     return tell_gate("the run has changed:", list(dict.fromkeys(f"{one.file} {one.now}" for one in wrong)))
@@ -176,7 +175,7 @@ def ortho(images: tuple[str, ...], out_dir: str, **flags: Any) -> int:
     with at_work() as progress:
         done = orthoimages.ortho(images, out_dir, progress=progress, **given_flags(flags))
     lines = (f"{one.path}: {one.size[0]} x {one.size[1]} px of {one.gsd:g} m, {one.crs}, {one.heights}" for one in done)
-    tell([{**asdict(one), "path": str(one.path)} for one in done], *lines)
+    tell(done, *lines)
     doubts = [doubt for one in done for doubt in one.doubts]
     return tell_gate("Cameras may not be those of their images.", doubts) if doubts else 0
 

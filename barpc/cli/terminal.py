@@ -22,13 +22,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from barpc.base.errors import visible
+from barpc.base.fields import given, is_record
 
 if TYPE_CHECKING:
     from click._termui_impl import ProgressBar
 
+    from barpc.base.tasks import Progress
     from barpc.report import Summary
     from barpc.report.summary import StepEntry
-    from barpc.tie.tasks import Progress
 
 
 EXIT_GATE = 3
@@ -81,7 +82,7 @@ def remark(message: str) -> None:
 def tell(data: object, *lines: object) -> None:
     """Print the result of a command on stdout: its lines, or with --json its data; with -q the JSON alone."""
     if wants_json():
-        echo(json.dumps(data, indent=1))
+        echo(json.dumps(data, indent=1, default=lambda part: given(part) if is_record(part) else str(part)))
     else:
         for line in () if is_quiet() else lines:
             echo(line)
@@ -335,9 +336,10 @@ class Lines:
                 return
             self._said = time
             line = f"{self._stage}: {self._done} of {self._total}"
-            if self._total == 1:
-                line = f"{self._stage}: at work for {_minutes(spent)}"
-            elif self._done:
+            if self._total <= 1:
+                at = f"pass {self._done}, " * (self._done > self._total)
+                line = f"{self._stage}: {at}at work for {_minutes(spent)}"
+            elif 0 < self._done < self._total:
                 line += f", about {_minutes(spent / self._done * (self._total - self._done))} left"
         self._say(line)
 
@@ -369,7 +371,7 @@ def _bars() -> Iterator[Progress]:
             finish()
             label = visible(f"{stage:<22}")
             bars[stage] = click.progressbar(length=total, label=label, show_pos=True, file=sys.stderr)
-        bars[stage].length = total
+        bars[stage].length = total or None  # None: the number alone, and no time left
         bars[stage].update(done - bars[stage].pos)
 
     try:

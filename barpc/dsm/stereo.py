@@ -39,8 +39,8 @@ from barpc.report.summary.block import AXES
 from barpc.rpcio.formats import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
+from barpc.sensor.radar import Radar
 from barpc.sensor.rational import monomials
-from barpc.sensor.timing import Clocked
 from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import (
     ACROSS,
@@ -381,7 +381,7 @@ def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = No
     """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:
-        _refuse_radar(view.name, isinstance(view.sensor, Clocked))
+        _refuse_radar(view.name, isinstance(view.sensor, Radar))
     return StereoBlock(views, [_ranked_pairs(views)], ", ".join(view.name for view in views))
 
 

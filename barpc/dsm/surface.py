@@ -30,9 +30,9 @@ from scipy.ndimage import map_coordinates
 from barpc import __version__
 from barpc.base.atomic import refuse_existing, replacing
 from barpc.base.errors import BarpcError, InputError, OutputError
-from barpc.base.frozen import Shown
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import plain_path
+from barpc.base.tasks import Progress, one_by_one
 from barpc.base.verb_options import DsmOptions
 from barpc.cameras import open_camera
 from barpc.dsm.stereo import (
@@ -59,7 +59,6 @@ from barpc.sensor.geometry import ground_sample_distance
 from barpc.tie.pairing.epipolar import common_range
 from barpc.tie.pairing.overlaps import Footprints
 from barpc.tie.pixels import read_pixels, sample_stretch
-from barpc.tie.tasks import Progress, one_by_one
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -77,7 +76,7 @@ _SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west,
 
 
 @dataclass(frozen=True)
-class Surface(Shown):
+class Surface:
     """Result of a surface: its file, its cells, and medians over them [m]; NaN where not known.
 
     `known`: cells with a height; `share`: of the pixels that both images of a pair show so many were matched;

@@ -277,7 +277,7 @@ def _written(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[Fi
     of_view = [one for before in run.lineage for one in before.summary.views if one.name == view.name]
     names = tuple(dict.fromkeys(name for one in of_view for name in one.outputs))
     for one in newest.lineage:
-        files = tuple(name for name in names if name in one.sealed.listed or not one.sealed.layers)
+        files = tuple(name for name in names if name in one.sealed.listed)
         if (rpc := written_rpc(one, files)) is not None:
             return one, files, rpc
     raise InputError(f"{run.folder / 'summary.json'}: names no RPC file of {view.name} that can be read: run it again")

@@ -6,15 +6,15 @@ TYPE_CHECKING = False  # as of `typing`, whose import is most of what `import ba
 
 if TYPE_CHECKING:
     from barpc.base.options import FitOptions
-    from barpc.fit.certificate import Localisation, RpcFit
+    from barpc.fit.certificate import RpcFit
     from barpc.fit.refit import fit_rpc, fit_rpc_points
     from barpc.fit.system import Normalization
 
 _MODULES = {
     "FitOptions": "barpc.base.options",
-    **dict.fromkeys(("Localisation", "RpcFit"), "barpc.fit.certificate"),
+    "RpcFit": "barpc.fit.certificate",
     **dict.fromkeys(("fit_rpc", "fit_rpc_points"), "barpc.fit.refit"),
     "Normalization": "barpc.fit.system",
 }
-__all__ = ["FitOptions", "Localisation", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]
+__all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]
 __getattr__ = used_later(__name__, _MODULES)

@@ -10,13 +10,13 @@ shape is assumed, so that oscillations, bursts and steps count equally.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from barpc.base.frozen import Shown
-from barpc.base.geodesy import Array, metres_per_unit, parts, wrap_longitude
+from barpc.base.fields import given
+from barpc.base.geodesy import Array, parts, wrap_longitude
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -80,46 +80,8 @@ def coverage(image: Array, low: Array, high: Array) -> float:
     return float((cells @ direction.T <= reach + 1e-9).all(axis=1).mean())
 
 
-@dataclass(frozen=True)
-class Localisation:
-    """The certificate of a localisation RPC, on the check points of the fit.
-
-    Parameters
-    ----------
-    rmse_m, max_m : float, root mean square and largest distance on the ground from where the camera localises them [m]
-    rmse_px, max_px : float, the same from where the fitted RPC projects the places found [px]
-    min_denominator : float, as for the RPC, over image and altitudes
-    method : str, the solver whose result this is
-    """
-
-    rmse_m: float
-    max_m: float
-    rmse_px: float
-    max_px: float
-    min_denominator: float
-    method: str
-
-    def verdict(self, tolerance: float) -> str:
-        """Return the faults at a tolerance [px], in words; empty if there are none."""
-        if not self.max_px <= tolerance:
-            return (
-                f"the localisation RPC misses the ground by up to {self.max_m:.3g} m ({self.max_px:.3g} px), wanted "
-                f"{tolerance:g} px: fit a smaller altitude range or a smaller image, raise the tolerance, or do "
-                "without it"
-            )
-        return "" if self.min_denominator > 0 else "the localisation RPC has a pole near the scene: do without it"
-
-
-def localisation_errors(rpc: RPC, found: Array, ground: Array, image: Array) -> Array:
-    """Return the distances (N, 2) of places `found` (N, 3) from ground points [m], and of their projections [px]."""
-    miss = found - ground
-    miss[:, 0] = wrap_longitude(miss[:, 0])
-    metres = np.linalg.norm((miss * metres_per_unit(ground))[:, :2], axis=1)
-    return np.column_stack([metres, np.linalg.norm(rpc.project(found) - image, axis=1)])
-
-
 @dataclass(frozen=True, eq=False)
-class RpcFit(Shown):
+class RpcFit:
     """A fitted RPC and its certificate.
 
     Parameters
@@ -142,7 +104,6 @@ class RpcFit(Shown):
     iterations : int, passes over the points
     num_cnp, num_ckp : int, number of points
     method : str, the solver whose result this is
-    localisation : Localisation or None, the certificate of `rpc.direct`, where it was asked for
     contradiction : float
         Largest distance of a check point from where the model, not the RPC, projects the ground that it localises
         there [px]; 0 for given points. What else projects with the model may err by as much more.
@@ -174,7 +135,6 @@ class RpcFit(Shown):
     num_cnp: int
     num_ckp: int
     method: str
-    localisation: Localisation | None = None
     contradiction: float = 0.0
     axes: str = ""
     reason: Reason | None = None
@@ -186,10 +146,10 @@ class RpcFit(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Return the certificate as plain numbers and lists, col before row, lengths in px."""
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rpc"}
-        for name in ("localisation", "reason"):
-            part = values.pop(name)
-            values |= {} if part is None else {name: asdict(part)}
+        values = given(self)
+        del values["rpc"]
+        if (part := values.pop("reason")) is not None:
+            values["reason"] = given(part)
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
 
     def as_written(self, rpc: RPC) -> RpcFit:
@@ -200,7 +160,6 @@ class RpcFit(Shown):
             rpc=rpc,
             rmse_ckp=self.rmse_ckp + np.sqrt((lost**2).mean(axis=0)),
             max_ckp=self.max_ckp + lost.max(axis=0),
-            localisation=None if rpc.direct is None else self.localisation,
         )
 
     def verdict(self, tolerance: float) -> str:
@@ -231,7 +190,7 @@ class RpcFit(Shown):
                 f"the points determine no height terms: the RPC is valid at their altitudes alone, {low:.6g} to "
                 f"{high:.6g} m, and 100 m beyond errs by {self.height_px:.3g} px or more: add points at other altitudes"
             )
-        return "" if self.localisation is None else self.localisation.verdict(tolerance)
+        return ""
 
 
 # --- causes of misfit -----------------------------------------------------------------------------------------

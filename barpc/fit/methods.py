@@ -29,11 +29,9 @@ from barpc.fit.poles import Region, bounded
 from barpc.fit.system import (
     EPS,
     MAX_PASSES,
-    PRECISIONS,
     TAU,
     FitProblem,
     Normalization,
-    Rounding,
     TriangularSystem,
     expected_size,
     noise_scaled,
@@ -91,7 +89,7 @@ def _curvature(h: Array, s: Array, beta: Array, rest: float) -> Array:
     return np.asarray((rho1 * eta22 - rho22 * eta1) / (rho1**2 + eta1**2) ** 1.5)
 
 
-def _lcurve(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
+def _lcurve(problem: FitProblem) -> SolverResult:
     """Fit col and row with one h: the paper's joint problem of 78 unknowns.
 
     The passes over the points are weighted ones until the RMSE stands still, then from the best such ones of the ICCV
@@ -113,19 +111,12 @@ def _lcurve(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
                 break
             coeffs, solved, last = _solved_coefficients(problem, following), following, rmse
     coeffs, solved = best
-    return (
-        coeffs if quantize is None else _solved_coefficients(problem, solved, quantize),
-        solved,
-        np.full(2, h),
-        passes,
-    )
+    return coeffs, solved, np.full(2, h), passes
 
 
-def _solved_coefficients(
-    problem: FitProblem, systems: list[TriangularSystem], quantize: Rounding | None = None
-) -> Array:
+def _solved_coefficients(problem: FitProblem, systems: list[TriangularSystem]) -> Array:
     """Return the coefficients (4, 20) that solve the systems of col and row."""
-    return np.concatenate([problem.expanded(solution(system, quantize)) for system in systems])
+    return np.concatenate([problem.expanded(solution(system)) for system in systems])
 
 
 def _reweighted(
@@ -199,22 +190,13 @@ def tidy(values: Array) -> Array:
     return np.array([float(f"{value:.12g}") for value in values])
 
 
-def normalization(ground: Array, image: Array, options: FitOptions) -> Normalization:
-    """Return the offsets and scales that take points into [-1, 1], rounded to the options' precision."""
+def normalization(ground: Array, image: Array) -> Normalization:
+    """Return the offsets and scales that take points into [-1, 1]."""
     (low, high), (left, right) = column_ranges(ground), column_ranges(image)
     offset = tidy(0.5 * (low + high))
     scale = tidy(np.maximum(0.5 * (high - low), [1e-9, 1e-9, LEAST_RANGE / 2]))
     middle, half = tidy(0.5 * (left + right)), tidy(np.maximum(0.5 * (right - left), 1e-6))
-    if options.precision is None:
-        return Normalization(offset, scale, middle, half)
-    limits = PRECISIONS[options.precision]
-    if limits.significant:  # from 1 on a coefficient has a decimal less: half of 1e-6 of 20,000 px is 0.01 px
-        # the largest are those of degree one, above 1 where the box of the ground is wider than the image under it;
-        # curvature (cubic terms of 0.03 turn a slope by 3 / 5 of it) and denominators move them by some per cent
-        rows = np.column_stack([np.ones(len(ground)), (ground - offset) / scale])
-        slopes = np.abs(np.linalg.lstsq(rows, (image - middle) / half)[0]).max(axis=0)
-        half = half * np.maximum(1.05 * slopes, 1.0)
-    return limits.normalization(Normalization(offset, scale, middle, half))
+    return Normalization(offset, scale, middle, half)
 
 
 def solve(
@@ -230,7 +212,7 @@ def solve(
     `method` is a row of `METHODS`, weights (N,) are 1 / standard deviation. FitError: too few points, or points that do
     not determine the coefficients.
     """
-    norm = normalization(ground, image, options)
+    norm = normalization(ground, image)
     problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin).screened()
     unknowns = 2 * len(problem.active) - 1
     if len(ground) <= unknowns:
@@ -238,17 +220,11 @@ def solve(
             f"{len(ground)} points are too few: each coordinate has {unknowns} unknowns, "
             f"give {unknowns + 1} points or more"
         )
-    return solve_problem(problem, options, method)
-
-
-def solve_problem(problem: FitProblem, options: FitOptions, method: str) -> FitSolution:
-    """Return the solution of a problem by a method, its numbers rounded to the options' precision."""
-    quantize = None if options.precision is None else PRECISIONS[options.precision].coeffs
-    coeffs, systems, h, passes = METHODS[method](problem, quantize)
+    coeffs, systems, h, passes = METHODS[method](problem)
     return FitSolution(coeffs, problem, systems, h, passes, method)
 
 
-def _ridge(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
+def _ridge(problem: FitProblem) -> SolverResult:
     solved, h, passes = [], np.zeros(2), 1
     expected = expected_size(problem.active)
     for axis in range(2):
@@ -261,11 +237,11 @@ def _ridge(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
                 break
         solved.append(system)
         h[axis] = sigma / TAU
-    return _solved_coefficients(problem, solved, quantize), solved, h, passes
+    return _solved_coefficients(problem, solved), solved, h, passes
 
 
-def _gauss_newton_fit(problem: FitProblem, quantize: Rounding | None) -> SolverResult:
-    start, _, _, passes = _ridge(problem, None)
+def _gauss_newton_fit(problem: FitProblem) -> SolverResult:
+    start, _, _, passes = _ridge(problem)
     parts, solved, region = [], [], region_of(problem)
     for axis in range(2):
         part = start[2 * axis : 2 * axis + 2]
@@ -273,7 +249,7 @@ def _gauss_newton_fit(problem: FitProblem, quantize: Rounding | None) -> SolverR
             denominator = np.eye(20)[0]
             part = problem.expanded(solution(problem.compressed(axis, denominator, free=False)), denominator)
         x, system, steps = _minimised(problem, axis, problem.packed(part), region)
-        parts.append(problem.expanded(x if quantize is None else solution(system.solved_by(x), quantize)))
+        parts.append(problem.expanded(x))
         solved.append(system)
         passes = max(passes, steps)
     return np.concatenate(parts), solved, np.zeros(2), passes
@@ -316,7 +292,7 @@ def _ahead(
     return x
 
 
-METHODS: dict[str, Callable[[FitProblem, Rounding | None], SolverResult]] = {
+METHODS: dict[str, Callable[[FitProblem], SolverResult]] = {
     "ridge": _ridge,
     "gauss-newton": _gauss_newton_fit,
     "lcurve-joint": _lcurve,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -13,9 +12,9 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError
 from barpc.base.geodesy import CHUNK, WGS84_A, Array, ecef_from_ground, metres_per_unit, wrap_longitude
 from barpc.base.options import FitOptions
-from barpc.fit.certificate import Localisation, RpcFit, coverage, localisation_errors, reason, roundtrip
+from barpc.fit.certificate import RpcFit, coverage, reason, roundtrip
 from barpc.fit.few import BETTER, NOISY, WHOLE, fit_few
-from barpc.fit.methods import FitSolution, normalization, solve, solve_problem
+from barpc.fit.methods import FitSolution, normalization, solve
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
     Errors,
@@ -27,16 +26,13 @@ from barpc.fit.points import (
     widened,
 )
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO
-from barpc.fit.system import FitProblem, Normalization
+from barpc.fit.system import FitProblem
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import nodes_of
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
-
-LocalisationCheck = Callable[[RPC, FitSolution], tuple[Errors, Array]]
-"""Errors of a localisation RPC on independent points [m, px], and the largest (2,)."""
 
 _ABOUT = 1.1  # times the error
 _MAX_MISSING_SHARE = 0.1  # part of the image without a ground point, at most
@@ -96,7 +92,6 @@ def _fit_model(
     contradiction = sample.contradiction()
     # the lines of sight of an RPC are cubics' own
     axes = "" if isinstance(innermost(model), RPC) else wrong_axes(model, size, alt_range)
-    given, seen = partial(_points_for_method, model, size, alt_range, options), partial(_missed, sample)
 
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method)
@@ -110,10 +105,7 @@ def _fit_model(
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
-        _accepted(fit, options, strict and not isinstance(model, Splined | Calibrated))
-        return _localised(
-            fit, lambda rpc, method: localisation_problem(rpc, *given(method)), seen, options, strict, exact=True
-        )
+        return _accepted(fit, options, strict and not isinstance(model, Splined | Calibrated))
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -217,21 +209,18 @@ def fit_rpc_points(
     held_out = None if check is None else checked_points(*check)
 
     if len(given[0]) < WHOLE:
-        if options.localisation:
-            raise FitError(f"points: {len(given[0])} are too few for a localisation RPC: give {WHOLE} or more")
         return _accepted(_few_points(given, weight, held_out, size, options), options, strict)
 
     def attempt(method: str) -> RpcFit:
         solution = solve(*given, options, method, weight=weight)
-        return replace(_certified_on_points(solution, held_out, size, options.precision is None), axes=axes)
+        return replace(_certified_on_points(solution, held_out, size), axes=axes)
 
     fit = _best_method(attempt, options, strict and len(given[0]) >= NOISY, exact=False)
     if len(given[0]) < NOISY and options.method == "auto":
         small = replace(_few_points(given, weight, held_out, size, options), axes=axes, few="")
         smaller = float(np.linalg.norm(small.rmse_ckp)) < BETTER * float(np.linalg.norm(fit.rmse_ckp))
         fit = _accepted(small if smaller else fit, options, strict)
-    seen = partial(_check_errors, held_out, *given)
-    return _localised(fit, lambda rpc, _: localisation_problem(rpc, *given, weight), seen, options, strict, exact=False)
+    return fit
 
 
 def _few_points(
@@ -242,13 +231,13 @@ def _few_points(
     options: FitOptions,
 ) -> RpcFit:
     """Return the fit of the largest model that some points, too few for an RPC, carry."""
-    (ground, image), norm = given, normalization(*given, options)
+    (ground, image), norm = given, normalization(*given)
     place = (ground - norm.ground_offset) / norm.ground_scale
     found = fit_few(place, (image - norm.image_offset) / norm.image_scale, weight)
     problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin)
     solution = FitSolution(found.coeffs, problem, [], np.zeros(2), 1, found.model.name)
     left_out = found.left_out * norm.image_scale
-    fit = _certified_on_points(solution, held_out, size, options.precision is None, [left_out])
+    fit = _certified_on_points(solution, held_out, size, [left_out])
     error = np.sqrt((left_out**2).sum(axis=1).mean())
     few = (
         f"{len(ground)} points carry {found.model.name}, which misses points left out by {error:.3g} px (RMS): "
@@ -261,12 +250,11 @@ def _certified_on_points(
     solution: FitSolution,
     held_out: tuple[Array, Array] | None,
     size: tuple[int, int] | None,
-    limited: bool,
     left_out: Iterable[Array] | None = None,
 ) -> RpcFit:
     """Return a fit to given points with its certificate, on check points or on each point, left out (N, 2) [px].
 
-    Its RPC is perhaps `limited` to the altitudes of the points.
+    Its RPC is limited to the altitudes of the points.
     """
     ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
     if held_out is not None:
@@ -276,7 +264,7 @@ def _certified_on_points(
             errors.add(residual)
     loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
     fit = _certified(solution, errors, errors.largest, loop, size)
-    rpc = _limited_to_altitudes(fit.rpc, ground[:, 2]) if limited else fit.rpc
+    rpc = _limited_to_altitudes(fit.rpc, ground[:, 2])
     return replace(fit, rpc=rpc, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
 
 
@@ -385,74 +373,6 @@ def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: 
         for said, fit in zip(wrong, fits, strict=True)
     ]
     return _accepted(fits[rank.index(min(rank))], options, strict)
-
-
-# --- the localisation RPC, from image and altitude to the ground: the same solvers, roles exchanged ------------------
-
-
-def localisation_problem(rpc: RPC, ground: Array, image: Array, weight: Array | None = None) -> FitProblem:
-    """Return the problem of the localisation RPC of an RPC: its normalisation, its points, roles exchanged."""
-    norm = Normalization(
-        np.append(rpc.image_offset, rpc.ground_offset[2]),
-        np.append(rpc.image_scale, rpc.ground_scale[2]),
-        rpc.ground_offset[:2],
-        rpc.ground_scale[:2],
-    )
-    lonlat = np.column_stack([wrap_longitude(ground[:, 0], rpc.ground_offset[0]), ground[:, 1]])
-    return FitProblem(np.column_stack([image, ground[:, 2]]), lonlat, norm, weight=weight).screened()
-
-
-def _missed(sample: Sample, rpc: RPC, _: FitSolution) -> tuple[Errors, Array]:
-    """Return the errors of a localisation RPC on the check points of a model."""
-    return sample.sought(
-        lambda ground, at: localisation_errors(rpc, rpc.localize_direct(at[:, :2], at[:, 2]), ground, at[:, :2])
-    )
-
-
-def _check_errors(
-    held_out: tuple[Array, Array] | None, ground: Array, image: Array, rpc: RPC, found: FitSolution
-) -> tuple[Errors, Array]:
-    """Return the errors of a localisation RPC on given check points, or its leave-one-out errors."""
-    errors, start = Errors(), 0
-    if held_out is not None:
-        errors.add(localisation_errors(rpc, rpc.localize_direct(held_out[1], held_out[0][:, 2]), *held_out))
-        return errors, errors.largest
-    for residual in found.leave_one_out():
-        part = slice(start, start + len(residual))
-        start = part.stop
-        places = ground[part] + np.pad(residual, ((0, 0), (0, 1)))
-        errors.add(localisation_errors(rpc, places, ground[part], image[part]))
-    return errors, errors.largest
-
-
-def _localised(
-    fit: RpcFit,
-    problem: Callable[[RPC, str], FitProblem],
-    seen: LocalisationCheck,
-    options: FitOptions,
-    strict: bool,
-    exact: bool,
-) -> RpcFit:
-    """Return the fit, if asked for with a localisation RPC and its certificate; FitError if `strict` and it misses.
-
-    By a ridge; of a model (`exact`) also by Gauss-Newton, where that is better.
-    """
-    if not options.localisation:
-        return fit
-    found: list[tuple[RPC, Localisation]] = []
-    for method in ("ridge", "gauss-newton") if exact else ("ridge",):
-        solution = solve_problem(problem(fit.rpc, method), options, method)
-        direct = replace(fit.rpc, direct=solution.coeffs)
-        errors, largest = seen(direct, solution)
-        least = solution.region.smallest(solution.coeffs[1::2])
-        (rmse_m, rmse_px), (max_m, max_px) = errors.rmse.tolist(), largest.tolist()
-        found.append((direct, Localisation(rmse_m, max_m, rmse_px, max_px, least, method)))
-        if max_px <= NEGLIGIBLE_FIT_ERROR:
-            break
-    rpc, certificate = min(found, key=lambda each: (not each[1].min_denominator > 0, each[1].rmse_m))
-    if strict and (wrong := certificate.verdict(options.tolerance)):
-        raise FitError(wrong)
-    return replace(fit, rpc=rpc, localisation=certificate)
 
 
 # --- axes of a model ------------------------------------------------------------------------------------

@@ -13,10 +13,9 @@ scales already rounded, and each coefficient rounded while the others can still 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -26,9 +25,6 @@ from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, IntArray, parts
 from barpc.base.statistics import SURELY
 from barpc.sensor.rational import POWERS, monomials
-
-Rounding = Callable[[Array], Array]
-"""Coefficients (...) to the nearest ones that a file can hold."""
 
 _TRIANGLE_ROWS = 1024  # taken into the triangle at a time: what is worked on stays in cache
 _HOUSEHOLDER_COLUMNS = 8  # columns of a Householder block
@@ -101,12 +97,6 @@ class TriangularSystem:
         """Return the sum of squares of M x - y."""
         rest = self.matrix @ solution - self.target
         return float(rest @ rest + self.triangle[-1, -1] ** 2)
-
-    def solved_by(self, solution: Array) -> TriangularSystem:
-        """Return the system that a given solution (k,) solves: y replaced by M x, the residual of the rows kept."""
-        triangle = self.triangle.copy()
-        triangle[:-1, -1] = self.matrix @ solution
-        return TriangularSystem(triangle, self.num_points)
 
     def penalized(self, penalty: Array, toward: Array | float = 0.0) -> TriangularSystem:
         """Return the system with the rows diag(`penalty`) x = `toward` below."""
@@ -231,57 +221,6 @@ def noise_scaled(system: TriangularSystem, expected: Array) -> tuple[TriangularS
     return penalised, sigma
 
 
-def solution(system: TriangularSystem, quantize: Rounding | None = None) -> Array:
-    """Return the least-squares solution (k,), by back substitution.
-
-    Where quantized, each coefficient is rounded in turn and the ones still to come make up for it (Babai's nearest
-    plane).
-    """
-    matrix, target = system.matrix, system.target
-    if quantize is None:
-        return np.asarray(scipy.linalg.solve_triangular(matrix, target))
-    x = np.zeros(len(target))
-    for i in range(len(x) - 1, -1, -1):
-        x[i] = quantize((target[i] - matrix[i, i + 1 :] @ x[i + 1 :]) / matrix[i, i])
-    return x
-
-
-# --- digits ------------------------------------------------------------------------------------------------------
-
-
-def _nitf_normalization(norm: Normalization) -> Normalization:
-    """Return 1e-4 degrees, metres, pixels; 1e-4 is no binary number: what the printed digits read back as."""
-    step = np.array([1e-4, 1e-4, 1.0])
-
-    def up(scale: Array, step: Array | float) -> Array:
-        return np.asarray(np.round(np.sign(scale) * np.ceil(np.abs(scale) / step) * step, 4))
-
-    place = np.round(np.rint(norm.ground_offset / step) * step, 4)
-    return Normalization(place, up(norm.ground_scale, step), np.rint(norm.image_offset), up(norm.image_scale, 1.0))
-
-
-def _nitf_coeffs(coeffs: Array) -> Array:
-    """Return coefficients rounded to seven digits and an exponent of one digit: +d.ddddddE-d."""
-    value = np.asarray(coeffs, dtype=np.float64)
-    exponent = np.clip(np.floor(np.log10(np.maximum(np.abs(value), 1e-300))), -9, 9)
-    text = [f"{v:.{6 + int(e) * -1}f}" for v, e in zip(value.ravel(), exponent.ravel(), strict=True)]
-    return np.array([float(t) for t in text]).reshape(value.shape)
-
-
-def _rpcm_normalization(norm: Normalization) -> Normalization:
-    return Normalization(*(np.round(getattr(norm, name), 12) for name in norm._given()))
-
-
-class Precision(NamedTuple):
-    """The digits of a format: the normalisation that it holds (scales never shrink), the coefficients (...)."""
-
-    normalization: Callable[[Normalization], Normalization]
-    coeffs: Callable[[Array], Array]
-    significant: bool  # a coefficient's digits count from its first one, not from the point
-
-
-PRECISIONS: dict[str, Precision] = {
-    "nitf": Precision(_nitf_normalization, _nitf_coeffs, significant=True),
-    "rpcm": Precision(_rpcm_normalization, lambda coeffs: np.round(coeffs, 12), significant=False),
-}
-"""Format -> its digits: the RPC00B record of NITF, and text files with twelve decimals as rpcm writes them."""
+def solution(system: TriangularSystem) -> Array:
+    """Return the least-squares solution (k,), by back substitution."""
+    return np.asarray(scipy.linalg.solve_triangular(system.matrix, system.target))

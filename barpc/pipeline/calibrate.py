@@ -32,13 +32,13 @@ from barpc.rpcio.line import LinePlace, line_place
 from barpc.scene import BoolArray, Camera, IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, Splined
-from barpc.sensor.timing import Clocked
+from barpc.sensor.radar import Radar
 
 if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import CalibrateKeywords, PathLike
-    from barpc.tie.tasks import Progress
+    from barpc.base.tasks import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -443,7 +443,7 @@ def common_errors(run: Run) -> CommonErrors:
     found = []
     for view, source in zip(run.views, run.sources, strict=True):
         used = run.calibrated.get(view.name)
-        if used is None and not isinstance(view.sensor, Clocked):
+        if used is None and not isinstance(view.sensor, Radar):
             used = Calibration.prior(source.sensor, view.size[0])
         found.append(used)
     return CommonErrors(tuple(found))

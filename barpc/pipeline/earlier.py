@@ -86,7 +86,7 @@ class Earlier:
         """Read a run folder; InputError where it is none, unfinished, of another release, or was changed since."""
         run = FinishedRun.open(folder)
         block, table = run.table(PRIOR_FILE), run.table(IMAGES)
-        if not (run.sealed.layers and block.exists()):
+        if not block.exists():
             raise InputError(f"{block}: missing, or of another release, and later runs start from it: run the "
                              "adjustment again")  # fmt: skip
         prior = BlockPrior.load(block)
@@ -339,7 +339,7 @@ def of_new(tracks: Tracks, is_old: BoolArray) -> Tracks:
 def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], folder: Path, block: BlockPrior) -> str:
     """Return the text of `tables/images.json`: the images of a block, those of an earlier run behind it too."""
     assert run.adjustment is not None
-    hosts = getattr(run.options, "allow_remote", ())
+    hosts = run.options.allow_remote
     choices: dict[str, Mapping[str, str] | None] = {}
     for image in given:
         choices[str(image_path(image, hosts))] = None if isinstance(image, View) else split_spec(image, hosts)[1]

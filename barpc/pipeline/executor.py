@@ -19,7 +19,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -27,10 +27,11 @@ import numpy as np
 
 from barpc import __version__
 from barpc.base.errors import AdjustError, BarpcError, InputError, out_of_memory
+from barpc.base.fields import given, is_record
 from barpc.base.frozen import Arrays, from_arrays, to_arrays
 from barpc.base.identity import Input, guarded
 from barpc.base.safe_io import MB
-from barpc.tie.tasks import Progress, Store, ordered
+from barpc.base.tasks import Progress, Store, ordered
 from barpc.workspace import Workspace, key_of
 
 logger = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ class CachingExecutor(Executor):
         keep: bool = True,
     ) -> None:
         self.workspace, self.executor, self.keep = workspace, executor, keep
-        self.store = Store(str(workspace.cache), str(workspace.partial))
+        self.store = workspace.store
         places = {self.store.folder: "cache", self.store.room: "partial"}  # wherever the run folder lies
         self._inputs = inputs
         self._fingerprints = {**{path: one.key for path, one in inputs.items()}, **places}
@@ -127,9 +128,8 @@ class CachingExecutor(Executor):
             return self._fingerprints.get(value, value)
         if isinstance(value, np.ndarray):
             return self._digest(value)
-        if is_dataclass(value) and not isinstance(value, type):
-            given = [getattr(value, field.name) for field in fields(value) if field.init]
-            return [type(value).__qualname__, *(self._canonical(part) for part in given)]
+        if is_record(value):
+            return [type(value).__qualname__, *map(self._canonical, given(value).values())]
         if isinstance(value, (tuple, list)):
             return [self._canonical(v) for v in value]
         return value
@@ -138,8 +138,8 @@ class CachingExecutor(Executor):
         """Return the hashed inputs that the arguments of a task name."""
         if isinstance(args, str):
             return (self._inputs[args],) if args in self._inputs else ()
-        if is_dataclass(args) and not isinstance(args, type):
-            args = [getattr(args, field.name) for field in fields(args) if field.init]
+        if is_record(args):
+            args = list(given(args).values())
         if not isinstance(args, (tuple, list)) or not self._inputs:
             return ()
         return tuple(dict.fromkeys(one for arg in args for one in self.guards(arg)))
@@ -239,7 +239,7 @@ class _PendingTask(Future[Any]):
     def __init__(self, owner: CachingExecutor, fn: TaskFunction, args: tuple[Any, ...]) -> None:
         super().__init__()
         self._owner, self.fn, self.args = owner, fn, args
-        self._key, self._stage = "", fn.__name__.strip("_")
+        self._name = ""  # of its result in the store
         # a task that is given the store keeps there itself what it makes
         self._kept_here = owner.keep and not (args and isinstance(args[0], Store))
 
@@ -261,7 +261,7 @@ class _PendingTask(Future[Any]):
         self.args = ()
         try:
             if error is None and keep and self._kept_here:
-                self._owner.workspace.store(self._stage, self._key, to_arrays(value))
+                self._owner.store.write(self._name, to_arrays(value))
         except Exception as failed:  # noqa: BLE001  (a full disk: goes to whoever asks for the result)
             error = failed
         if error is None:
@@ -280,8 +280,8 @@ class _PendingTask(Future[Any]):
     def _look_up(self) -> tuple[bool, Any]:
         if not self._kept_here:
             return False, None
-        self._key = self._owner.key(self.fn, self.args)
-        record = self._owner.workspace.load(self._stage, self._key)
+        self._name = f"{self.fn.__name__.strip('_')}/{self._owner.key(self.fn, self.args)}"
+        record = self._owner.store.read(self._name)
         try:
             return record is not None, None if record is None else from_arrays(record)
         except ValueError as error:

@@ -1,4 +1,4 @@
-"""Cameras that one RPC does not hold: grids and resampled images, reopened like every output."""
+"""Cameras that one RPC does not hold: grids, reopened like every output."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from barpc.base.atomic import write_text
 from barpc.base.errors import BarpcError, FitError, OutputError, RpcError
 from barpc.base.geodesy import Array
 from barpc.base.options import RunOptions
+from barpc.base.tasks import Progress, ordered
 from barpc.fit import RpcFit
 from barpc.fit.points import Sample, widened
 from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.proof import REOPENED
 from barpc.pipeline.verify_outputs import verify_grid
-from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
-from barpc.rpcio.grids import read_correction, write_correction, write_grid, write_resampled
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
+from barpc.rpcio.grids import write_correction, write_grid
 from barpc.scene import View
 from barpc.sensor import Behind, SensorModel
 from barpc.sensor.csm import STATE_END as STATE
@@ -31,7 +32,6 @@ from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
-from barpc.tie.tasks import Progress, ordered
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -51,18 +51,16 @@ class GridFiles:
     """Files to be written of a view beside its RPC."""
 
     grids: bool
-    resampled: bool
     state: bool = False
 
     def names(self, view: View) -> list[str]:
         """Return their names."""
-        ends = [STATE] * self.state + [GRID_SUFFIX] * self.grids + [CORRECTION] * (self.grids or self.resampled)
-        return [view.name + end for end in (*ends, *[RESAMPLED] * self.resampled)]
+        return [view.name + end for end in [STATE] * self.state + [GRID_SUFFIX, CORRECTION] * self.grids]
 
 
-def grid_names(view: View, options: RunOptions) -> list[str]:
+def grid_names(view: View) -> list[str]:
     """Return the files that `write_grids` may write for a view, before the misfit of its RPC is known."""
-    return GridFiles(grids=True, resampled=options.resample, state=is_writable(view.sensor)).names(view)
+    return GridFiles(grids=True, state=is_writable(view.sensor)).names(view)
 
 
 def write_grids(
@@ -72,14 +70,14 @@ def write_grids(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> list[Written]:
-    """Write requested grids and resampled images, and grids for RPC misfits above `MISFIT`; reopen every file.
+    """Write requested grids, and those for RPC misfits above `MISFIT`; reopen every file.
 
     OutputError where a file cannot be written, or reads back differently.
     """
     files = []
     for _, fit, model in fitted:
         grids = options.grids or not np.linalg.norm(fit.max_ckp) <= MISFIT
-        files.append(GridFiles(grids, options.resample, is_writable(model)))
+        files.append(GridFiles(grids, is_writable(model)))
     written: list[Written] = [{} for _ in fitted]
     some = [i for i, one in enumerate(files) if one.names(fitted[i][0])]
     if some:
@@ -138,7 +136,7 @@ def _write_grids(
 
 
 def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room: str) -> Misses:
-    """Write the grids of a view, and its image resampled, into a temporary folder; return the errors of each [px]."""
+    """Write the grids of a view into a temporary folder; return the errors of each [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
     sample, errors = Sample.of(model, view.size, alts), Misses()
@@ -147,20 +145,14 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
             text = state_text(model, view.size, alts)
             write_text(place / (view.name + STATE), text, overwrite=True)
             errors[view.name + STATE] = _largest_miss(sample, open_state(place / (view.name + STATE))[0])
-        if not (files.grids or files.resampled):
-            return errors
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
             errors[view.name + GRID_SUFFIX] = _largest_miss(sample, grid)
             write_grid(grid, place / (view.name + GRID_SUFFIX), overwrite=True)
-        rpc, lacking, error = grid_correction(rpc, sample)
-        write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
+            rpc, lacking, errors[view.name + CORRECTION] = grid_correction(rpc, sample)
+            write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
     except (RpcError, FitError) as failure:
         raise OutputError(f"{view.name}: no grid can be made of its camera: {failure}") from failure
-    errors[view.name + CORRECTION] = error
-    if files.resampled:
-        errors[view.name + RESAMPLED] = error
-        write_resampled(rpc, lacking, view.path, place / (view.name + RESAMPLED), overwrite=True)
     return errors
 
 
@@ -213,10 +205,8 @@ def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) ->
     every, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
     for name, (rms, _, where) in errors.items():
         sample = every.also(where)  # the same points as when it was written
-        path, lacking = Path(folder) / name, None
-        if name.endswith(RESAMPLED):
-            lacking = read_correction(Path(folder) / (view.name + CORRECTION))[1]
-        readings = verify_grid(path, sample, lacking)
+        path = Path(folder) / name
+        readings = verify_grid(path, sample)
         for reading in readings:
             same = reading.rms == rms or abs(reading.rms - rms) <= REOPENED  # infinite: rows are lost there
             if reading.consumer in ("barpc", "gdal") and not same:

@@ -15,12 +15,14 @@ import numpy as np
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.declarations import declared
 from barpc.base.errors import InputError, listed
+from barpc.base.frozen import joined
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit, wrap_longitude
 from barpc.base.identity import Input, Stamp, changed, fingerprint
 from barpc.base.options import RunOptions
 from barpc.base.remote import here, located, location
 from barpc.base.safe_io import IMAGE, read_names, versioned
 from barpc.base.statistics import robust_spread
+from barpc.base.tasks import Progress, ordered
 from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
@@ -37,7 +39,6 @@ from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped
 from barpc.tie.pairing.overlaps import reach_of
 from barpc.tie.patches.channels import Sheet
-from barpc.tie.tasks import Progress, ordered
 
 logger = logging.getLogger(__name__)
 
@@ -284,14 +285,8 @@ def load_gcps(
         return None
     starts = np.cumsum([0, *(len(part.names) for part in parts)])[:-1]
     point = np.concatenate([part.point + start for part, start in zip(parts, starts, strict=True)])
-    columns = ("lonlatalt", "sigma", "view", "xy", "xy_sigma")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
-    names = tuple(name for part in parts for name in part.names)
-    strangers = tuple(dict.fromkeys(name for part in parts for name in part.strangers))
-    left_out = tuple(line for part in parts for line in part.left_out)
-    said = tuple(line for part in parts for line in part.said)
-    datums = tuple(one for part in parts for one in part.datums)
-    return GroundPoints(names, point=point, **joined, strangers=strangers, left_out=left_out, said=said, datums=datums)
+    columns = joined(parts)
+    return GroundPoints(**columns | {"point": point, "strangers": tuple(dict.fromkeys(columns["strangers"]))})
 
 
 def _load_control(
@@ -463,11 +458,7 @@ def load_altimetry(paths: Sequence[str], views: Sequence[View], heights: str | N
     InputError for a file that cannot be read or has no height in the images.
     """
     parts = [_heights_of(path, views, heights) for path in paths]
-    if not parts:
-        return None
-    columns = ("lonlatalt", "sigma", "sigma_flat")
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in columns}
-    return Altimetry(**joined, datums=tuple(one for part in parts for one in part.datums))
+    return Altimetry(**joined(parts)) if parts else None
 
 
 def _heights_of(path: str, views: Sequence[View], heights: str | None) -> Altimetry:

@@ -23,6 +23,7 @@ from barpc.base.geodesy import ALTITUDES
 from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import PathOrUrl, here, located
 from barpc.base.safe_io import IMAGE, plain_path, versioned
+from barpc.base.tasks import Progress
 from barpc.cameras import checked, open_split, split_spec
 from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
@@ -30,7 +31,6 @@ from barpc.rasters.raster import open_raster
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.scene import Camera, View
 from barpc.sensor.geometry import LEAST_RANGE, footprint
-from barpc.tie.tasks import Progress
 
 logger = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
 from barpc.base.manifest import LAST, REPORT_FILE, SUMS
 from barpc.base.options import RunOptions
+from barpc.base.tasks import Progress
 from barpc.fit import RpcFit
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import Written, grid_names, made_in_room
@@ -33,7 +34,6 @@ from barpc.scene import View
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
-from barpc.tie.tasks import Progress
 from barpc.workspace import Workspace, own_files
 
 MATCH_FILES = ("matches.csv", "matches.npz")
@@ -122,7 +122,7 @@ def output_names(views: Sequence[View], options: RunOptions, folder: Path) -> li
         return [*names, *MATCH_FILES, *(f"asp/{name}" for name in pairs)]
     if options.stop_after == "all":
         names += [name for view in views for name in file_names(view, options.images, options.rpc_formats)]
-        names += [name for view in views for name in grid_names(view, options)]
+        names += [name for view in views for name in grid_names(view)]
     return [*names, f"{FOLDER}/{IMAGES}", f"{FOLDER}/{PRIOR_FILE}"]
 
 

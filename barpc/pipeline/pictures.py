@@ -14,6 +14,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcError, listed
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.remote import is_url
+from barpc.base.tasks import Work
 from barpc.pipeline.executor import by_groups
 from barpc.report import Run, Summary
 from barpc.report.outcome import PairTies
@@ -23,7 +24,6 @@ from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
 from barpc.tie.patches.channels import picture, ticks
 from barpc.tie.pixels import Stretch, jpeg, thumbnail
-from barpc.tie.tasks import Work
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ def write_pictures(workspace: Workspace, run: Run, summary: Summary, work: Work)
     work : Work
     """
     chosen = [run.views[run.number[view.name]] for view in worst_first(summary.views)[:MAX_PICTURES]]
-    band: int = getattr(getattr(run.options, "tie", None), "band", 1)
+    band = run.options.tie.band
     most = min(_MOST_BYTES, _ALL_BYTES // max(len(chosen), 1))
     found = by_groups(work.executor, thumbnails, chosen, (band, most), "pictures", None)
     images = [one for group in found for one in group if "picture" in one]

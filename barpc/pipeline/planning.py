@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from barpc.base.frozen import Shown
 from barpc.base.geodesy import DEFAULT, HeightDatum
 from barpc.base.options import RunOptions
 from barpc.pipeline.inputs import load_altimetry, load_gcps
@@ -31,7 +30,7 @@ _PROCESS_MB, _VIEW_MB = 350.0, 0.5
 
 
 @dataclass(frozen=True)
-class Plan(Shown):
+class Plan:
     """The plan of `barpc.adjust`; nothing was matched or written.
 
     Parameters

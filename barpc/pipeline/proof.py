@@ -22,10 +22,10 @@ from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import format_for, hidden_by
-from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 
 if TYPE_CHECKING:
-    from barpc.tie.tasks import Progress
+    from barpc.base.tasks import Progress
 
 REOPENED = 1e-5  # px: what a reopened file may differ by from what was written (15-digit printing)
 SAME, MOVED, LATER, NOT_ASKED = "same", "moved", "later", "not asked"
@@ -173,9 +173,7 @@ def _verify_cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
 
 
 def _holds_camera(path: Path) -> bool:
-    """Return whether a file holds the camera of its whole image: a resampled image has its own."""
-    if path.name.endswith(RESAMPLED):
-        return False
+    """Return whether a file holds the camera of its whole image."""
     return path.name.endswith((GRID_SUFFIX, CORRECTION)) or format_for(path) is not None
 
 

@@ -7,21 +7,19 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from barpc.base.errors import BarpcWarning, InputError, plain
-from barpc.base.frozen import html_table, load_npz
+from barpc.base.frozen import load_npz
 from barpc.base.safe_io import GEOJSON, read_json
 from barpc.cameras import open_camera
 from barpc.pipeline.remake import remake_report
 from barpc.report import Summary
 from barpc.report.compare import written_rpc
 from barpc.report.finished import FinishedRun
-from barpc.report.records import json_form, table
+from barpc.report.records import json_form
 from barpc.report.runfiles import MATCHES, RunFiles
-from barpc.report.summary.views import ViewEntry
 from barpc.scene import Tracks, View
 
 
@@ -64,15 +62,6 @@ class RunResult:
         counts = f"{views}, {tracks.num_observations} observations"
         written = f", in {place if len(place) <= 50 else '...' + place[-47:]}" if place else ""
         return f"{type(self).__name__}({self.record.kind}: {counts}, {self.record.status}{written})"
-
-    def _repr_html_(self) -> str:
-        record, adjusted = self.record, self.record.adjusted
-        shown = table("views", record.headline, record.views, ViewEntry, ViewEntry.TERMINAL, adjusted)
-        heads, *rows = shown.texts
-        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in record.reasons)
-        page = Path(record.out_dir) / "report.html" if record.out_dir else None
-        link = f'<a href="{escape(str(page))}">report.html</a>' if page is not None and page.is_file() else ""
-        return html_table(shown.caption, rows, heads) + f"<ul>{reasons}</ul>" * bool(reasons) + link
 
 
 @dataclass(frozen=True, eq=False, repr=False)

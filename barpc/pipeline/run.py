@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations
+from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations, passes_told
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
@@ -25,6 +25,7 @@ from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_optio
 from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.base.sealed import portable
+from barpc.base.tasks import Progress, Work
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.acquisitions import one_each
@@ -68,7 +69,6 @@ from barpc.sensor.rpc import RPC
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.pairing.overlaps import Pair, best_pairs, possible_pairs
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
-from barpc.tie.tasks import Progress, Work
 from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
@@ -186,7 +186,6 @@ def _with_block(
     """Write the block and the list of its images, and with `update` the cameras that move; return what that says."""
     assert run.adjustment is not None
     options = run.options
-    assert isinstance(options, RunOptions)
     with _stage_progress(workspace, "block", work.progress):
         block = block_prior(run.joint or run.adjustment)
         if run.earlier is not None:
@@ -238,7 +237,6 @@ def _portable_run(run: Run, folder: Path) -> Run:
         return tuple(map(at, path)) if isinstance(path, tuple) else portable(os.fspath(path), folder)
 
     options = run.options
-    assert isinstance(options, RunOptions)
     given = {key: getattr(options, key) for key in file_options()}
     return replace(
         run,
@@ -253,6 +251,24 @@ def _portable_run(run: Run, folder: Path) -> Run:
 def _report_progress(progress: Progress | None, stage: str, done: int) -> None:
     if progress is not None:
         progress(stage, done, 1)
+
+
+@contextmanager
+def _passes(progress: Progress | None) -> Iterator[None]:
+    """Report the passes of an adjustment: their total, which residuals decide, is 0 until its end."""
+    last = 0
+
+    def tell(number: int) -> None:
+        nonlocal last
+        last = number
+        if progress is not None:
+            progress("adjustment", number, 0)
+
+    tell(0)
+    with passes_told(tell):
+        yield
+    if progress is not None:
+        progress("adjustment", last, last)
 
 
 @contextmanager
@@ -406,7 +422,7 @@ def _tied_and_adjusted(run: Run, options: RunOptions, dem: Dem | None, workspace
     if dem is not None and options.reference:
         with workspace.stage("reference"):
             run = replace(run, reference=_register_to_reference(run, options, dem, work))
-    with _stage_progress(workspace, "adjustment", work.progress):
+    with workspace.stage("adjustment"), _passes(work.progress):
         return _with_adjustment(run, options, dem)
 
 

@@ -40,7 +40,6 @@ from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.geometry import ground_grids
-from barpc.sensor.image_corrections import CorrectionGrid
 
 READING_TOLERANCE = NEGLIGIBLE_FIT_ERROR  # Largest difference [px] between a file and its model that passes
 
@@ -110,17 +109,16 @@ def verify(
     return [reading for path in map(Path, paths) for reading in _consumer_readings(path, _consumers(path), measured)]
 
 
-def verify_grid(path: Path, sample: Sample, correction: CorrectionGrid | None = None) -> list[Reading]:
+def verify_grid(path: Path, sample: Sample) -> list[Reading]:
     """Open a file of more than an RPC as its consumers do, and find its largest error against a model's sample.
 
-    It is a localisation or correction grid, by the end of its name; else the image, resampled by `correction`.
+    It is a localisation grid, a correction grid or a camera state, by the end of its name.
     """
     model = sample.model
 
     def measured(consumer: Consumer, read: Projection) -> tuple[float, float]:
         def off(ground: Array, at: Array) -> Array:
-            image = model.project(read(at)) if consumer.locates else read(ground)
-            return (image if correction is None else correction.apply(image)) - at[:, :2]
+            return (model.project(read(at)) if consumer.locates else read(ground)) - at[:, :2]
 
         errors, largest = sample.sought(off)
         return float(np.linalg.norm(largest)), float(np.linalg.norm(errors.rmse))

@@ -44,17 +44,16 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: f
             yield _contradicted(one, offset[np.argmin(sigma)])
         elif one.source == "gcps" and _is_undulation(one, adjustment, share):
             yield (
-                f"{one.name} move the scene by {abs(one.otherwise):.0f} m in height, as far as the geoid is from the "
-                "ellipsoid here, and no farther aside than its standard deviation: their altitudes seem to be "
+                f"{one.name} move the scene by {abs(one.otherwise):.0f} m in height, which is the height of the geoid "
+                "here. Their altitudes seem to be "
                 f"{'ellipsoidal' if one.converted else 'above sea level'}. {_cure(one)}"
             )
         elif one.provenance == DEFAULT and not (taken <= fits and other - taken > 2.0 * SURE):
             ellipsoidal, geoid = _FLAGS[one.source == "heights"]
             if shifts := _shifts(one, adjustment, share, lean):
                 yield (
-                    f"The vertical datum of the heights of {one.name} is not stated. They were taken as ellipsoidal; "
-                    f"if they are above sea level, the scene is {shifts}, and neither the cameras nor other heights "
-                    f"show it. Give {ellipsoidal}, or {geoid}."
+                    f"The vertical datum of the heights of {one.name} is not stated. They were taken as ellipsoidal: "
+                    f"if they are above sea level, the scene is {shifts}. Give {ellipsoidal}, or {geoid}."
                 )
 
 
@@ -86,9 +85,8 @@ def _contradicted(one: HeightDatum, offset: float) -> str:
     geoid = f"{metres(abs(one.otherwise))} {'above' if (one.otherwise > 0) != one.converted else 'below'}"
     seems = "ellipsoidal" if one.converted else "above sea level"
     return (
-        f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} the ground by the "
-        f"delivered cameras, or by other heights, and the geoid lies {geoid} the ellipsoid here: they seem to "
-        f"be {seems}. {_cure(one)}"
+        f"The heights of {one.name} lie {metres(abs(offset))} {'above' if offset > 0 else 'below'} those by the "
+        f"cameras or other heights; the geoid lies {geoid} the ellipsoid here. They seem to be {seems}. {_cure(one)}"
     )
 
 

@@ -15,8 +15,6 @@ from barpc.base.keywords import PathLike
 from barpc.base.manifest import LAST, SUMS
 from barpc.base.remote import PathOrUrl, is_url
 from barpc.base.sealed import Sealed
-from barpc.rasters.raster import sources_of
-from barpc.report.renamed import is_old
 from barpc.report.runfiles import (
     FOLDER,
     PAGE_TABLES,
@@ -41,14 +39,12 @@ class FinishedRun:
     def open(cls, folder: PathLike) -> FinishedRun:
         """Open a run folder.
 
-        InputError where it is none, or its summary was changed since. Nothing proves a run of release 0.3: its files
-        are read as they are, with a warning.
+        InputError where it is none, or its summary was changed since.
         """
         folder = Path(folder)
         with recorded({}):  # no inputs of the command: `barpc report` and others add to them
             if not os.path.lexists(folder / SUMS):
-                summary = read_summary(folder)
-                return cls((Sealed.unproved if is_old(folder / LAST) else Sealed.open)(folder), summary)
+                read_summary(folder)  # says what is missing, or of another release
             sealed = Sealed.open(folder)
             sealed.file(LAST)
             return cls(sealed, read_summary(folder))
@@ -61,6 +57,8 @@ class FinishedRun:
         """
         if not (os.path.lexists(folder / LAST) and any(os.path.lexists(folder / name) for name in (SUMS, STATE))):
             return
+        from barpc.rasters.raster import sources_of  # with GDAL: to read no image, none is asked for
+
         run, names = cls.open(folder), {file.name for file in files}
         if of_images:
             outputs = [view.outputs for view in run.summary.views] + [one.outputs for one in run.summary.carried or ()]
@@ -117,6 +115,8 @@ class FinishedRun:
         """
         if (entry := self.inputs.get(path)) is None:
             return self.sealed.input(path, "")
+        from barpc.rasters.raster import sources_of
+
         found = self.sealed.input(path, entry.sha256, entry.bytes, more)
         for source in () if is_url(found) else sources_of(found):
             self.ask(source)
@@ -124,7 +124,7 @@ class FinishedRun:
 
     def ask(self, path: PathOrUrl) -> None:
         """Raise InputError where a file has not the content of the run's input at this place, or else of its name."""
-        if not self.sealed.layers or is_url(os.fspath(path)):
+        if is_url(os.fspath(path)):
             return
         named = [one for one in self.inputs.values() if Path(one.path).name == Path(path).name]
         here = [one for one in named if Path(os.path.abspath(path)) in self.sealed.seen(one.path)]  # noqa: PTH100

@@ -8,8 +8,7 @@ page caps the width.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import SourceFileLoader
@@ -20,7 +19,6 @@ from zlib import crc32
 import numpy as np
 
 from barpc import __version__
-from barpc.base.errors import listed
 from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
 from barpc.report.ranking import TABLE_ROWS_SHOWN, flagged, worst_first
 from barpc.report.records import MAX_SHOWN
@@ -28,7 +26,7 @@ from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import counted, figure, known, metres, two_digits
+from barpc.report.summary.words import two_digits
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
@@ -68,15 +66,8 @@ def template(name: str) -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"n": coordinate, "tally": tally}
-    environment.filters |= {one.__name__: one for one in (counted, figure, known, listed, metres)}
+    environment.filters["n"] = coordinate
     return environment.get_template(name)
-
-
-def tally(rows: Iterable[object], attribute: str, between: str) -> str:
-    """Return how many rows have which value of an attribute, the most frequent first."""
-    found = Counter(value for row in rows if (value := getattr(row, attribute))).most_common()
-    return ", ".join(f"{num}{between}{value}" for value, num in found)
 
 
 def coordinate(value: float) -> str:
@@ -365,7 +356,7 @@ def residual_panels(
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    key = f"Scale bar: {_px(longest)} of a single residual; bold arrows are drawn at twice that scale."
+    key = f"Scale bar: {_px(longest)} of a single residual; bold arrows are drawn twice as long."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
         key += "those that need review, then " * bool(first) + "those with the largest systematic part."
@@ -383,7 +374,11 @@ def panel_box(view: ViewEntry) -> Array:
 
 
 def _panel_note(cells: Cells) -> str:
-    return f"{100 * cells.share:.0f} % systematic" if np.isfinite(cells.rms).any() else "no tie points"
+    return (
+        f"{100 * cells.share:.0f} % of cells with a significant mean"
+        if np.isfinite(cells.rms).any()
+        else "no tie points"
+    )
 
 
 def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, longest: float) -> str:

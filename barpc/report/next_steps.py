@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Mapping
 from functools import partial
 
@@ -27,7 +26,6 @@ _POSITION = slice(0, 3)  # of the scene's motions: east, north, up
 _DEM_MOTIONS = [MOTIONS.index(name) for name in ("up", "tilt east", "tilt north")]  # a DEM's level and slopes
 NEW_ANGLE = 20.0  # deg between a third image and both of a pair: of stereo, and of matching without loss
 _BY_CAMERAS = 0.99  # share of the cameras in the height, above which its uncertainty is that of their directions
-_MOST_CHARACTERS = 160  # characters of a reservation that is not of an image
 
 _REPORT_PARTS = {
     **dict.fromkeys(("no_overlap", "untied", "few", "none", "few_gcps", "gap"), "map"),
@@ -65,7 +63,7 @@ def _use(summary: Summary) -> Iterator[StepEntry]:
     best = ""
     if heights:
         pair = min(heights, key=lambda pair: pair.height_m_per_px or np.inf)
-        best = f" Best pair for heights: {pair.a} - {pair.b} (a pixel is {metres(pair.height_m_per_px or np.nan)})."
+        best = f" Best pair for heights: {pair.a} - {pair.b} (one pixel is {metres(pair.height_m_per_px or np.nan)})."
         commands = ["barpc dsm . -o dsm.tif", "barpc export . s2p --to s2p", *commands]
     start = "Use" if summary.passed else "After review, use"
     yield StepEntry("use", f"{start} {listed(files, NAMED)}.{best}", tuple(commands))
@@ -104,18 +102,18 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         then = _sigma_with(covariance, *_dem_observations(options))
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
-            words.append(f"--dem FILE --geoid NAME would give {metres(then[2])} up")
+            words.append(f"--dem FILE --geoid NAME (height to {metres(then[2])})")
     up = now[2] * _height_ratio(summary, scene)
     if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))
-        words.append(f"a third image {NEW_ANGLE:g} deg from both would give {metres(up)} up")
+        words.append(f"a third image {NEW_ANGLE:g} deg from both (height to {metres(up)})")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
     if (now > LEAST_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
         accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
-        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} would give {lengths(then)}")
+        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} ({lengths(then)})")
     if found:
-        text = f"To improve the position: {'; '.join(words)}."
+        text = f"To improve the position, add {', or '.join(words)}."
         yield StepEntry("improve", text, expected=tuple(found), part="gauge")
 
 
@@ -198,5 +196,5 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         yield StepEntry("review", f"Check the files that were left out: {names}.")
     elif summary.reasons:
         of_control = any(gcp.status not in ("used", "not seen") for gcp in summary.gcps)
-        text = textwrap.shorten(f"Review: {summary.reasons[0]}", _MOST_CHARACTERS, placeholder=" ...")
+        text = f"Review the reservation{'s' * (len(summary.reasons) > 1)} on the scene."
         yield StepEntry("review", text, part="gauge" if of_control or value_of(summary, "scene.dem") else "decisions")

@@ -15,6 +15,7 @@ from barpc.ba import Adjustment
 from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
 from barpc.ba.interior import Calibration
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
+from barpc.base.options import RunOptions
 from barpc.base.statistics import CRITICAL
 from barpc.fit import RpcFit
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
@@ -111,7 +112,7 @@ class Run:
     fits: tuple[RpcFit, ...] = ()
     written: tuple[Mapping[str, Mapping[str, float | str]], ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
-    options: object = None
+    options: RunOptions = field(default_factory=RunOptions)
     stages: Sequence[Mapping[str, Any]] = field(default_factory=list)
     out_dir: str = ""
     gcps: GroundPoints | None = None

@@ -5,8 +5,7 @@ A section is a user's question, its answer, and the charts and tables behind it.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import visible
-from barpc.base.statistics import LARGEST
+from barpc.report import answers
 from barpc.report.maps import doubted, ground_map, largest_miss, residual_panels, template
 from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.ranking import (
@@ -34,16 +33,14 @@ from barpc.report.ranking import (
 from barpc.report.records import MAX_SHOWN, Record, Table, cell_of, flat_options, table, value_of
 from barpc.report.runfiles import RunFiles, read_tables
 from barpc.report.summary import Summary
-from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry, SceneEntry
+from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, HeldOutEntry, LeftEntry
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, largest, metres
+from barpc.report.summary.words import NAMED, counted, largest, metres
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
-_POSITION = "east", "north", "up"  # motions of the scene as a whole
-MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
 REPORT_STAGE = "report"  # the stage that makes the page
 
 
@@ -76,6 +73,7 @@ def page_of(files: RunFiles) -> str:
             shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,
             most=MAX_SHOWN,
+            footer=answers.FOOTER,
         )
     )
 
@@ -139,22 +137,16 @@ _QUESTIONS = {
     "surface": "Which ground do they reconstruct?",
     "moves": "How was each camera corrected?",
     "gauge": "How uncertain are position and shape of the scene?",
-    "decisions": "Which decisions were made, and on which figures?",
+    "decisions": "What was decided, and why?",
     "accuracy": "How accurate is it on the ground?",
     "files": "Do the new RPC files reproduce the corrected cameras?",
     "run": "With which options, and how much data?",
 }
-"""Key of a section -> its question; its answer is the macro of that name in `answers.html.j2`."""
+"""Key of a section -> its question; the answers are those of `barpc.report.answers`."""
 
 
-def _section(key: str, facts: Mapping[str, object], **shown: Any) -> Section:
-    return Section(key, _QUESTIONS[key], _words(key, **facts), **shown)
-
-
-def _words(macro: str, **facts: object) -> Any:
-    """Return the text of a macro for given facts: markup in one line, facts escaped."""
-    text = getattr(template("answers.html.j2").module, macro)(**facts)
-    return type(text)(re.sub("[ \n]+", " ", text).strip())
+def _section(key: str, answer: str, **shown: Any) -> Section:
+    return Section(key, _QUESTIONS[key], answer, **shown)
 
 
 def _images_section(files: RunFiles) -> Section:
@@ -162,8 +154,8 @@ def _images_section(files: RunFiles) -> Section:
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    facts = {"views": views, "agree": adjusted and _num_in_use(files)}
-    return _section("images", facts, tables=[shown], **_panels(image_panels(files)))
+    answer = answers.of_images(views, adjusted and _num_in_use(files) > 0)
+    return _section("images", answer, tables=[shown], **_panels(image_panels(files)))
 
 
 def _num_in_use(files: RunFiles) -> int:
@@ -197,16 +189,10 @@ def _map_section(files: RunFiles) -> Section:
     if num > MAX_SHOWN:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
     lengths = {length: count for length, count in summary.tracks.by_length.items() if count}
-    facts = {
-        "num": sum(lengths.values()),
-        "groups": len(connected_groups(num, links)),
-        "lonely": lonely,
-        "by_length": lengths,
-    }
     charts = [(ground_map(files), caption)] if any(files.outlines) else []
-    if len(lengths) > MAX_LENGTHS_SAID:
+    if len(lengths) > answers.MAX_LENGTHS_SAID:
         charts.append((length_bars(lengths), "Tie points by the number of images that see them."))
-    return _section("map", facts | {"said": len(lengths) <= MAX_LENGTHS_SAID}, charts=charts)
+    return _section("map", answers.of_map(lengths, len(connected_groups(num, links)), lonely), charts=charts)
 
 
 def _randomness_section(files: RunFiles) -> Section | None:
@@ -220,7 +206,7 @@ def _randomness_section(files: RunFiles) -> Section | None:
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
         parts["folds"].append((f"Before the adjustment. {lengths}", before))
-    return _section("random", {"marked": marked, "key": key}, **parts)
+    return _section("random", answers.of_residuals(marked, key), **parts)
 
 
 def _surface_section(files: RunFiles) -> Section | None:
@@ -235,7 +221,7 @@ def _surface_section(files: RunFiles) -> Section | None:
         words = words.format(*(one.image for one in files.draped))
         more = "move over it to swipe, click to flicker. Details at the right height do not move."
         charts.append((picture(words, files.draped), f"{words}: {more}"))
-    return _section("surface", {"before": before, "after": after}, charts=charts)
+    return _section("surface", answers.of_surface(before, after), charts=charts)
 
 
 def _pairs_section(files: RunFiles) -> Section | None:
@@ -245,12 +231,12 @@ def _pairs_section(files: RunFiles) -> Section | None:
     worst = max(pairs, key=offset_of)
     sure = sure_pairs(files.summary.views, pairs)
     heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
-    facts: dict[str, object] = {"worst": worst, "wanted": GOOD_RMSE, "enough": MIN_PAIR_MATCHES}
-    facts["offset"] = None if set(worst.offset_rms) == {None} else offset_of(worst)
-    facts["best"] = min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None)
+    best = min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None)
+    offset = None if set(worst.offset_rms) == {None} else offset_of(worst)
+    answer = answers.of_pairs(worst, offset, GOOD_RMSE, best, MIN_PAIR_MATCHES)
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
-    return _section("pairs", facts, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
+    return _section("pairs", answer, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
 
 
 def _corrections_section(files: RunFiles) -> Section | None:
@@ -263,39 +249,21 @@ def _corrections_section(files: RunFiles) -> Section | None:
     ]
     if len(moves) < len(views):
         return None
-    radars = any(value_of(view, "correction.range_m") is not None for view in views)
-    tables = _tables_of("corrections", views, more=ViewEntry.CLOCKS * radars)
+    tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
-    scene = files.summary.scene
-    moved = float(np.linalg.norm(np.array(scene.shift_enu_m, float))) if scene is not None else 0.0
-    by_cameras = scene is not None and (not scene.datum or _least_share(scene, "cameras") > 0.5)
-    return _section("moves", {"most": max(moves), "moved": moved, "by_cameras": by_cameras}, tables=tables)
-
-
-def _least_share(scene: SceneEntry, *sources: str) -> float:
-    """Return the share of sources in the position of the scene, east, north or up, where it is least."""
-    parts = [one for one in scene.datum if one.part in _POSITION]
-    return min((sum(getattr(one, source) or 0.0 for source in sources) for one in parts), default=0.0)
+    return _section("moves", f"By up to {max(moves):.2f} px at the image centre.", tables=tables)
 
 
 def _decisions_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
-    if not (points := decisions(summary)):
+    if not (points := answers.decisions(summary)):
         return None
     tables = _tables_of("decided", summary.views if summary.adjusted else ())
     if scene is not None:
         tables += _tables_of("explained", scene.explanations) + _tables_of("left", scene.left)
         tables += _tables_of("worse", scene.held_out_places or ())
     tables += _tables_of("again", [pair for pair in summary.pairs if pair.beaten])
-    return _section("decisions", {}, points=points, charts=profile_charts(files), tables=tables)
-
-
-def decisions(summary: Summary) -> list[str]:
-    """Return the decisions of the run: matchers, camera model, priors, rejection."""
-    options = flat_options(summary.options or {})
-    matcher, asked = options.get("tie.matcher"), options.get("adjust.drift")
-    text = _words("decided", summary=summary, matcher=matcher, asked=asked, many=LARGEST)
-    return [type(text)(item.strip()) for item in re.findall("<li>(.*?)</li>", text)]
+    return _section("decisions", "", points=points, charts=profile_charts(files), tables=tables)
 
 
 def _gauge_section(files: RunFiles) -> Section | None:
@@ -308,14 +276,17 @@ def _gauge_section(files: RunFiles) -> Section | None:
     tables += _tables_of("gcps", summary.gcps)
     tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
     tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)
-    held = _least_share(scene, "gcps", "reference") > 0.5
-    facts = {"scene": scene, "held": held, "num": _num_in_use(files)}
-    return _section("gauge", facts, points=points, tables=tables)
+    return _section("gauge", answers.of_scene(scene, _num_in_use(files) > 0), points=points, tables=tables)
 
 
 def _check_points_section(files: RunFiles) -> Section | None:
     points = files.summary.check_points
-    return _section("accuracy", {"num": len(points)}, tables=_tables_of("check-points", points)) if points else None
+    if not points:
+        return None
+    answer = (
+        f"{counted(len(points), 'check point')}, not used in the adjustment. The RMS of residuals is in the verdict."
+    )
+    return _section("accuracy", answer, tables=_tables_of("check-points", points))
 
 
 def _files_section(files: RunFiles) -> Section | None:
@@ -326,16 +297,16 @@ def _files_section(files: RunFiles) -> Section | None:
         rows = [
             [cell_of(file), *(cell_of(found.get(name), ".1e") for name in consumers)] for file, found in outputs.items()
         ]
-        caption = "Files reopened as their readers do: largest difference to the corrected cameras [px]"
+        caption = "Written files, read again by other programs: largest difference from the corrected cameras [px]"
         tables.append(Table("files", caption, ["file", *(f"{consumer} [px]" for consumer in consumers)], rows))
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
-    return _section("files", {"worst": worst}, tables=tables) if tables else None
+    return _section("files", answers.of_files(worst), tables=tables) if tables else None
 
 
 def _run_section(files: RunFiles) -> Section:
     rows = [[cell_of(key), cell_of(str(value))] for key, value in flat_options(files.summary.options or {}).items()]
     options = Table("options", "Options of the run", ["option", "value"], rows)
-    return _section("run", {"summary": files.summary}, tables=[options])
+    return _section("run", answers.of_run(files.summary), tables=[options])
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (

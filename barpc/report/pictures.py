@@ -89,9 +89,8 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
     """Draw the tiles of the worst pair along its epipolar lines, with captions."""
     draw = template("drawings.svg.j2").module.strip
     words = (
-        "{0.image}, the worst pair, at {0.tiles} of its tie points, {0.half_px:.0f} px to every side, resampled along "
-        "epipolar lines. With correct cameras a feature lies at one height in every row; shifts along "
-        "the row are due to terrain height."
+        "{0.image}, the worst pair: {0.tiles} tie points, {0.half_px:.0f} px to every side, resampled along epipolar "
+        "lines. With correct cameras a feature lies on the line in every row; shifts along it come from terrain height."
     )
     told = [(one, words.format(one)) for one in files.strips]
     return [(draw(one, said, WIDTH, WIDTH * one.size[1] / one.size[0]), said) for one, said in told]

@@ -30,10 +30,11 @@ NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher st
 
 _WHOLE = 0.9  # share of the rows or columns that is the whole image
 _CONTROL_WORDS = {
-    "rejected": "{} rejected, as the others contradict {}: check coordinates, axes and image positions",
-    "contradicts": "{} with residuals above 4 standard deviations, used nevertheless: the stated accuracies are too "
-    "optimistic, or more than one GCP is wrong",
+    "rejected": ("{} rejected, as the others contradict {}", "Check coordinates, axes and image positions"),
+    "contradicts": ("{} used, with residuals above 4 standard deviations", "Check coordinates and stated accuracies"),
 }
+
+_CHECK_DEM = "Check its heights, their datum, and the cameras."
 
 PASSED_STATUS = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
@@ -113,9 +114,9 @@ def _failed(view: ViewEntry, run: Run, adjustment: Adjustment) -> Causes:
         yield "no_overlap" if run.matched and not tried else "untied", {"tried": words}
     if apart is not None and apart.placed is None:
         yield "contradicts_all" if apart.look.as_stated else "other_rpc", {"strangeness": strangeness(apart)}
-    tolerance = getattr(getattr(run.options, "fit", None), "tolerance", np.inf)
+    tolerance = run.options.fit.tolerance
     # grids represent the camera where the RPC does not
-    beyond = _follows_more(view, run) or getattr(run.options, "grids", False)
+    beyond = _follows_more(view, run) or run.options.grids
     if view.fit is not None and not beyond and not all(known(v) <= tolerance for v in view.fit.max_px):
         yield "one_rpc_misses", {"tolerance": tolerance}
     # where most contradict the others these are right by majority, and all over it: not as wrong matches do
@@ -194,8 +195,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
 
 def _beyond_one_rpc(view: ViewEntry, run: Run) -> Causes:
     """Yield the misfit of one RPC to a camera with corrections for jitter or detector steps."""
-    told = any(getattr(run.options, name, None) for name in ("grids", "tiles", "resample"))
-    if view.fit is None or view.correction is None or told or not _follows_more(view, run):
+    if view.fit is None or view.correction is None or run.options.grids or not _follows_more(view, run):
         return
     left, most = float(np.linalg.norm([known(v) for v in view.fit.rmse_px])), max(map(known, view.fit.max_px))
     follows = "attitude jitter or detector steps"
@@ -261,12 +261,11 @@ def reference_lines(run: Run) -> Iterator[str]:
         used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
         off = listed([f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched], NAMED)
         pixels = found.step / max(view.gsd for view in matched)
-        told = f" It cannot show distortions of an image below this resolution, {pixels:.2g} px here."
         yield (
-            f"Reference: {used} of {counted(tried, 'point')} matched at {metres(found.step)} in "
-            f"{counted(len(matched), 'image')}, peak {min(view.peak for view in matched):.1f} or more; offset of "
-            f"the delivered cameras: {off}.{told * bool(np.isfinite(pixels))}"
+            f"The reference was matched at {used} of {counted(tried, 'point')} in {counted(len(matched), 'image')}, to "
+            f"{metres(found.step)}" + f" ({pixels:.2g} px)" * bool(np.isfinite(pixels)) + "."
         )
+        yield f"By the reference, the delivered cameras are off by {off}."
     if rest := listed([view.name for view in found.views if not view.points]):
         yield f"No point of the reference was matched in {rest}."
 
@@ -274,7 +273,7 @@ def reference_lines(run: Run) -> Iterator[str]:
 def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
     """Yield the reservations on ground control."""
     status = [tested.status(g) for g in range(len(names))]
-    for word, words in () if tested.torn else _CONTROL_WORDS.items():
+    for word, (words, cure) in () if tested.torn else _CONTROL_WORDS.items():
         wrong = [
             f"{names[g]} ({enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
             if np.isfinite(tested.w[g])
@@ -284,9 +283,9 @@ def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
         ]
         if wrong:
             alike = word == "rejected" and tested.agreed is not None and tested.agreed.alike
-            datum = " They agree with each other: check their datum and heights." * alike
+            datum = " They agree with each other: check their datum and heights, too." * alike
             them = "it" if len(wrong) == 1 else "them"
-            yield f"{words.format(counted(len(wrong), 'GCP'), them)}: {listed(wrong)}.{datum}"
+            yield f"{words.format(counted(len(wrong), 'GCP'), them)}: {listed(wrong)}. {cure}.{datum}"
     if tested.sets:
         one, other = (listed([names[g] for g in np.flatnonzero(points).tolist()], NAMED) for points in tested.sets)
         middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
@@ -294,20 +293,19 @@ def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
         if all(len(residual) for residual in middle):
             apart = f" ({enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))} between them)"
         yield (
-            f"GCPs contradict each other, and no subset outweighs the others: {one} against {other}{apart}. None "
-            "of them was used: check coordinates, axes, datum and image positions, or add a point."
+            f"GCPs contradict each other, {one} against {other}{apart}, and none was used. Check coordinates, axes, "
+            "datum and image positions, or add a point."
         )
     if tested.torn:
         without, held = tested.torn
         yield (
-            f"With the GCPs the images would agree less with each other: the RMS of check tie points rises from "
-            f"{without:.3f} to {held:.3f} px. None of the GCPs was used: check coordinates, image positions and stated "
-            "accuracies."
+            f"With the GCPs the images would agree less: the RMS of check tie points rises from {without:.3f} to "
+            f"{held:.3f} px. None was used. Check coordinates, image positions and stated accuracies."
         )
     if not tested.fits and "contradicts" not in status:
         yield (
-            f"{counted(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated: the "
-            "stated accuracies are too optimistic, or more than one GCP is wrong."
+            f"{counted(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated. Check "
+            "their coordinates and stated accuracies."
         )
 
 
@@ -317,23 +315,22 @@ def reference_reasons(run: Run, stated: float) -> Iterator[str]:
     if found is None:
         return
     if found.control is None:
-        whys = "the DEM under it is of another place, or it is too old or too coarse"
+        whys = "check the place of the DEM under it, or give a newer or finer one"
         if all(view.peak < PEAK for view in found.views):
-            whys = f"another place, too old, without texture, or cameras more than {FAR_RADIUS / 1e3:g} km off"
-        yield f"The reference {found.refusal}: {whys}. It was not used."
+            whys = f"check its place and that cameras are not more than {FAR_RADIUS / 1e3:g} km off, or give another"
+        yield f"The reference {found.refusal} and was not used: {whys}."
     used = [view for view in found.views if view.points]
     if wide := [f"{view.name} ({metres(view.scatter)})" for view in used if view.scatter > found.step]:
         yield (
             f"Points of the reference scatter across the lines of sight by more than the resolution of "
-            f"its matches, {metres(found.step)}, in {listed(wide, NAMED)}: it is distorted, or the images are."
+            f"its matches, {metres(found.step)}, in {listed(wide, NAMED)}. Check it for distortions, and the images."
         )
     if wrong := [view for view in used if view.shows_heights(stated)]:
         named = listed([f"{metres(view.along)} in {view.name}" for view in wrong], NAMED)
         yield (
-            f"The heights of the DEM under the reference are less accurate than stated: its points scatter along the "
+            f"The heights of the DEM under the reference are less accurate than stated: points scatter along the "
             f"lines of sight by {named}, as with height errors of {metres(max(view.heights for view in wrong))} "
-            f"({metres(stated)} stated). An error common to all heights does not show, and shifts the scene: check the "
-            "DEM."
+            f"({metres(stated)} stated). Check the DEM: an error common to all heights would shift the scene unseen."
         )
 
 
@@ -371,9 +368,9 @@ def deformation_reasons(adjustment: Adjustment) -> Iterator[str]:
     if (one := adjustment.deformed) is not None:
         control = listed([CONTROL_WORDS[kind] for kind in one.control])
         yield (
-            f"To follow {control}, the shape of {adjustment.names[one.view]} would change by {one.px:.1f} px at its "
-            f"corners, {one.sigmas:.0f} times the standard deviation of its camera, which tie points alone do not ask "
-            f"for. Drifts were held to what tie points show: check {control}."
+            f"To follow {control}, {adjustment.names[one.view]} would be deformed by {one.px:.1f} px at its corners, "
+            f"{one.sigmas:.0f} times the standard deviation of its camera. Tie points do not ask for that, so it was "
+            f"not. Check {control}."
         )
 
 
@@ -384,30 +381,27 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
         return
     if not terrain.shows:
         yield (
-            f"The DEM does not show the terrain of the tie points: its relief is {terrain.relief:.2g} times theirs. "
-            "Possible causes: another place, other units, constant heights, or camera errors larger than its hills. "
-            "It was not used."
+            f"The DEM was not used: its relief is {terrain.relief:.2g} times that of the tie points. Check its place, "
+            "units and heights, and for camera errors larger than its hills."
         )
         return
     if not terrain.agrees:
         times = round(terrain.relief, 2) + 0.0
         yield (
-            f"The DEM has {times:g} times the relief of the adjusted tie points: their heights and the scene's place "
-            "follow a DEM of another terrain, or without its own (water, filled or smoothed heights). Leave it out, or "
-            "give another."
+            f"The DEM has {times:g} times the relief of the adjusted tie points: of another terrain, water, or filled "
+            "or smoothed heights. Leave it out, or give another."
         )
     (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
     if level > SURELY:
-        why = "check its heights, their datum, and the cameras"
         yield (
             f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points of the delivered cameras, "
-            f"{level:.1f} times the standard deviation of that difference: {why}."
+            f"{level:.1f} times the standard deviation of that difference. {_CHECK_DEM}"
         )
     sides = zip(tilts, rises, ("east", "north"), strict=True)
     if tilted := [f"{abs(tilt):.1f} m to the {side}" for tilt, times, side in sides if times > SURELY]:
         yield (
             f"The DEM is tilted against the tie points of the delivered cameras, by {' and '.join(tilted)} at its "
-            f"edge, more than {SURELY:g} times the standard deviation of that tilt."
+            f"edge, more than {SURELY:g} times the standard deviation of that tilt. {_CHECK_DEM}"
         )
 
 

@@ -8,7 +8,7 @@ from barpc.base.errors import listed
 from barpc.report.summary import Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS
+from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, capital
 
 GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
@@ -74,10 +74,14 @@ def sentences(summary: Summary) -> tuple[list[str], list[str]]:
 def _status_sentences(status: str, why: str, alike: Sequence[tuple[str, str]]) -> list[str]:
     """Return sentences of images of a status, or of files, and why."""
     names = listed([name for name, _ in alike], NAMED)
-    if len(alike) <= NAMED or (status and why not in CAUSES):
+    if status and (len(alike) <= NAMED or why not in CAUSES):
+        same: dict[str, list[str]] = {}
+        for name, text in alike:
+            same.setdefault(text.removeprefix(name), []).append(name)
+        return [listed(named, NAMED) + text for text, named in same.items()]
+    if len(alike) <= NAMED:
         return [text for _, text in alike]
     if not status:
         return [f"{len(alike)} files were left out, {names}: {why}"]
     start = f"{len(alike)} images: {STATUS_WORDS[status]}, {CAUSES[why].label}: {names}"
-    remedy = CAUSES[why].remedy.format(image="IMAGE")
-    return [". ".join(filter(None, (start, remedy[:1].upper() + remedy[1:]))) + "."]
+    return [". ".join(filter(None, (start, capital(CAUSES[why].remedy.format(image="IMAGE"))))) + "."]

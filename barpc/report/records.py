@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field
 from functools import cache, partial
 from inspect import get_annotations
 from types import NoneType
@@ -15,6 +15,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform,
 
 import msgspec
 import numpy as np
+
+from barpc.base.fields import Value, field_names, is_record
 
 Number = float | None  # A number; None (null) stands for what is not finite
 
@@ -55,10 +57,8 @@ def column(
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(column,))
-class Record:
+class Record(Value):
     """A part of the summary: its children are frozen dataclasses whose fields are declared by `column`."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     OWN: ClassVar[Mapping[str, Column]] = {}
     """Columns of tables that are no fields."""
@@ -70,24 +70,7 @@ class Record:
                 kind, meta = (one.metadata[key] for key in ("kind", "meta"))
                 kinds[name] = Annotated[kind or kinds[name], meta]
         cls.__annotations__ = kinds
-        dataclass(frozen=True, eq=False, repr=False)(
-            cls
-        )  # written once, below: for each class they cost 30 % of the import
-
-    def _values(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, name) for name in self.__dataclass_fields__)
-
-    def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
-            return NotImplemented
-        return self._values() == other._values()
-
-    def __hash__(self) -> int:
-        return hash(self._values())
-
-    def __repr__(self) -> str:
-        pairs = zip(self.__dataclass_fields__, self._values(), strict=True)
-        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in pairs)})"
+        dataclass(frozen=True, eq=False, repr=False)(cls)
 
     @classmethod
     def read(cls, found: Any) -> Self:
@@ -118,7 +101,7 @@ def json_form(value: Any) -> Any:
         return value
     if isinstance(value, (list, tuple)):
         return [json_form(item) for item in value]
-    if is_dataclass(value) and not isinstance(value, type):
+    if is_record(value):
         held = ((name, getattr(value, name), optional) for name, optional in _serialized_fields(kind))
         return {name: json_form(item) for name, item, optional in held if item is not None or not optional}
     if isinstance(value, (np.ndarray, np.generic)):
@@ -129,8 +112,8 @@ def json_form(value: Any) -> Any:
 @cache
 def _serialized_fields(kind: Any) -> list[tuple[str, bool]]:
     """Return the fields of a dataclass, and whether they are left out while None."""
-    of_record = issubclass(kind, Record)
-    return [(f.name, of_record and f.default is None) for f in fields(kind) if f.name[0] != "_"]
+    of_record = issubclass(kind, Record)  # a default is an attribute of its class
+    return [(name, of_record and getattr(kind, name, 0) is None) for name in field_names(kind) if name[0] != "_"]
 
 
 def flat_options(options: Mapping[str, Any], before: str = "") -> dict[str, Any]:

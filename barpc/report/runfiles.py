@@ -21,7 +21,6 @@ from barpc.base.manifest import LAST
 from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
 from barpc.pointio.names import from_cell
 from barpc.report.records import Number, Record, column, json_form
-from barpc.report.renamed import with_new_names
 from barpc.report.summary import SCHEMA, Summary
 from barpc.report.summary.words import NAMED, Share, Side
 from barpc.scene import BoolArray, IntArray
@@ -44,9 +43,8 @@ ROWS_TOGETHER = 1 << 13  # rows of a table that are written, or read, at a time:
 
 
 def table_path(folder: Path, name: str) -> Path:
-    """Where a run keeps a table: in its `FOLDER`; runs before release 0.3 beside their summary."""
-    beside, inside = folder / name, folder / FOLDER / name
-    return beside if os.path.lexists(beside) and not os.path.lexists(inside) else inside
+    """Where a run keeps a table: in its `FOLDER`."""
+    return folder / FOLDER / name
 
 
 SURFACE = "surface.json"
@@ -127,13 +125,13 @@ class RunFiles:
 def read_summary(folder: Path) -> Summary:
     """Read the summary.json of a run folder.
 
-    Schema 2 is read under its new names, with a warning; keys of no record are named in one, and passed over.
+    Keys of no record are named in a warning, and passed over.
     InputError where there is none, it does not parse, or has another release's schema.
     """
     path = folder / LAST
     if not path.exists():
         raise InputError(f"{folder}: no {LAST}, so no finished run; give the folder of one")
-    found = with_new_names(read_json(path, SUMMARY), path)
+    found = read_json(path, SUMMARY)
     version = found.get("schema") if isinstance(found, dict) else None
     if version != SCHEMA:
         raise InputError(f"{path}: schema {version!r}, this release reads {SCHEMA}: run the adjustment again")
@@ -188,7 +186,7 @@ def read_tables(summary: Summary, folder: Path, of_page: bool = True) -> RunFile
     made = summary.outputs and os.path.lexists(surface)  # none of a run that is at work: an earlier one's
     of_run = partial(_parse_surface, run=run_key(summary))
     shown = _parsed(surface, read_text(surface, SUMMARY), of_run) if made else ((), ())
-    pictures = table_path(folder, PICTURES)  # none of runs before release 0.4
+    pictures = table_path(folder, PICTURES)
     small = _parsed(pictures, read_text(pictures, SUMMARY), _parse_pictures) if os.path.lexists(pictures) else ((), ())
     return RunFiles(summary, observations, points, tracks, outlines, *shown, *small)
 

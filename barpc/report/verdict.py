@@ -153,16 +153,15 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
     common = _common_scale(found)
     if common > PRIOR_WIDENED and any(is_stated(view, found.options) for view in run.views):
         yield (
-            f"The cameras are {common:.1f} times less accurate than stated: their standard deviations were widened, "
-            "and with them the uncertainty of the scene's position."
+            f"The cameras are {common:.1f} times less accurate than stated, and so is the scene's position. Check the "
+            "stated accuracies, or add GCPs or a DEM."
         )
     yield from _of_image_model(found)
     if found.apart is not None and not found.apart.clear:
         error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"
         yield (
-            f"One of the images {listed([found.names[v] for v in found.apart.views])} has {error}: without any one of "
-            "them the rest agree, with all of them they do not. The tie points do not tell which: check the RPCs, or "
-            "add an image."
+            f"One of the images {listed([found.names[v] for v in found.apart.views])} has {error}: the rest agree "
+            "without any one of them. Check the RPCs, or add an image."
         )
 
 
@@ -172,8 +171,8 @@ def _of_image_model(found: Adjustment) -> Iterator[str]:
         return
     yield (
         f"Rotations and translations leave {found.in_space_rms:.3f} px at check tie points, an affine transform per "
-        f"image {median(found.held_out_rms):.3f} px: the affine is used. This is unusual: was an image resampled, "
-        "or does its RPC belong to another image?"
+        f"image {median(found.held_out_rms):.3f} px: the affine is used. This is unusual: check that no image was "
+        "resampled, and that each RPC belongs to its image."
     )
     (east, north), (*bends,) = (found.gauge.motion_sigma[part] for part in (_SHAPE[:2], _SHAPE[2:]))
     yield (
@@ -192,15 +191,15 @@ def _of_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry]) -> 
     moving = [f"{one.place} of {one.image}" for one in found if one.moving]
     if moving and adjustment.changed > LEAST_MOVED:
         yield (
-            f"Most tie points of {listed(moving)} move together: moving objects, or a displacement of these rows that "
-            "no camera models."
+            f"Most tie points of {listed(moving)} move together: moving objects, or displaced rows. Check for clouds "
+            "and water there."
         )
     yield from _unmet_places(run, adjustment, views, matter=True)
     rivals = [one.runner_up for one in adjustment.findings if one.motion is not None and one.gap < SURE]
     for rival in filter(None, dict.fromkeys(rivals)):
         yield (
-            f"Moving objects explain the tie points that move together hardly better than {TERMS[rival].NOUN}: "
-            "check where these tie points lie."
+            f"Moving objects explain the tie points that move together hardly better than {TERMS[rival].NOUN}. Check "
+            "where these tie points lie."
         )
 
 
@@ -217,7 +216,8 @@ def _unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], 
     regions += [(one, f"{one.sentence}.") for one in held_out_places(run.met_worse, adjustment.names)]
     for region, sentence in sorted(regions, key=lambda row: not matters(row[0])):
         worst.setdefault(region.image, (matters(region), sentence))
-    yield from (line for image, (large, line) in worst.items() if image not in said and large == matter)
+    cure = " Check for clouds, water, change there." * matter
+    yield from (line + cure for image, (large, line) in worst.items() if image not in said and large == matter)
 
 
 def _of_same_ground(run: Run, found: Adjustment) -> Iterator[str]:
@@ -232,8 +232,8 @@ def _of_same_ground(run: Run, found: Adjustment) -> Iterator[str]:
         if first != second and 2.0 * common > max(high, other.last) - min(low, other.first):
             said = " and ".join(f"{each.first:.0f}-{each.last:.0f} of {each.image}" for each in (one, other))
             yield (
-                f"Rows {said} show the same ground: moving objects there (clouds, water) are a likelier cause than "
-                "displaced rows in both images."
+                f"Rows {said} show the same ground: moving objects are likelier than displaced rows in both images. "
+                "Check for clouds and water there."
             )
 
 
@@ -245,13 +245,13 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         ):
             yield (
                 f"Tie points of {found.names[i]} and {found.names[j]} form two groups, {100 * group.share:.0f} % "
-                f"displaced by {group.apart:.2f} px from the others: there are two solutions, and this one lies "
-                "between them. Check for a moving cloud or a repeated pattern, or add an image."
+                f"displaced by {group.apart:.2f} px from the others. The solution lies between them: check for a "
+                "moving cloud or a repeated pattern, or add an image."
             )
     if found.noise > NOISE_LIMIT:
         yield (
-            f"Tie points scatter {found.noise:.1f} times as much as stated: wrong matches, or camera errors that "
-            "the model cannot represent."
+            f"Tie points scatter {found.noise:.1f} times as much as stated: wrong matches, or camera errors beyond the "
+            "model. Check for repeated patterns, or supply matches (--matches)."
         )
     with np.errstate(all="ignore"):
         moved = np.abs(found.gauge.shift) / found.gauge.delivered_sigma
@@ -265,7 +265,7 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         which = "check that the heights are of this place, or add GCPs" if by_heights else "add GCPs or a DEM"
         yield (
             f"The scene moved by {enu(found.gauge.shift)}, more than {SURELY:g} times the standard deviation expected "
-            f"from the stated accuracies: one of them is wrong; {which}."
+            f"from the stated accuracies. One of them is wrong: {which}."
         )
 
 
@@ -292,7 +292,10 @@ def _ground_reasons(run: Run) -> Iterator[str]:
         yield from reference_reasons(run, adjustment.options.dem_sigma)
         if (heights := adjustment.altimetry) is not None and heights.why_not:
             counts = f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
-            yield f"The altimetry was not used: {heights.why_not} ({counts})."
+            yield (
+                f"The altimetry was not used: {heights.why_not} ({counts}). Check its positions and vertical datum, or "
+                "leave it out."
+            )
         if gcps is not None and adjustment.control is not None:
             yield from control_reasons(gcps.names, adjustment.control)
     for points in (gcps, run.check_points):
@@ -315,16 +318,14 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     if len(run.tracks) or gcps is not None:
         yield f"The scene as a whole moved by {enu(gauge.shift)}."
     yield from _known_lines(run, run.adjustment, views)
-    if radars := [_clocks(view) for view in views if view.correction and view.correction.timing_sigma]:
-        yield f"Radar timing corrections: {listed(radars, NAMED)}."
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
     if many := [view.name for view in unsaid if anywhere(view, run)]:
         # errors in one image reject tie points of the others, too
         alike = [view.name for view in unsaid if view.name not in many]
-        why = f"but in {listed(alike)} in the same direction" if alike else "as of mismatches"
+        why = f"but in {listed(alike)} in the same direction" if alike else "as mismatches do"
         yield (
-            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected, with "
-            f"neighbouring errors in random directions, {why}."
+            f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected; neighbours err "
+            f"in random directions, {why}."
         )
     found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
@@ -400,7 +401,7 @@ def _of_earlier(added: Added | None) -> Iterator[str]:
         name, held, free = added.contradicted
         yield (
             f"Check tie points of {name} have residuals of {held:.3f} px with the cameras of {added.run} as they are "
-            f"written, and of {free:.3f} px with all cameras free: they contradict each other. --update adjusts all."
+            f"written, and of {free:.3f} px with all cameras free. Run again with --update, which adjusts all."
         )
 
 
@@ -415,13 +416,6 @@ def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Ite
         yield f"With the DEM, {known}."
     else:
         yield f"Without ground control, {known}."
-
-
-def _clocks(view: ViewEntry) -> str:
-    by_range, azimuth, sigma = (
-        value_of(view, f"correction.{name}") for name in ("range_m", "azimuth_ms", "timing_sigma")
-    )
-    return f"{view.name}: range {by_range:+.2f} ± {sigma[0]:.2f} m, azimuth {azimuth:+.3f} ± {sigma[1]:.3f} ms"
 
 
 def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:

@@ -52,8 +52,8 @@ def _has(*patterns: str, markup: bool = False) -> Callable[[str], bool]:
 _MARKUP = re.compile(r"\s*+<")
 
 
-GRID_SUFFIX, CORRECTION, RESAMPLED = "_grid.tif", "_correction.tif", "_resampled.tif"
-"""Ends of the names of localisation and correction grids, and of images resampled by these."""
+GRID_SUFFIX, CORRECTION = "_grid.tif", "_correction.tif"
+"""Ends of the names of localisation and correction grids."""
 SIGN = "image point = that of the RPC in this file + (dcol, drow)"  # in a correction grid
 _TEXT_ENDS = ("_RPC.TXT", ".rpc", ".txt", ".rpc_adj")  # the last: of SAT-BA, beside the .rpc that it adjusted
 _BESIDE = "gdal, beside an image"

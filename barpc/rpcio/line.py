@@ -13,8 +13,8 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.scene import Camera
+from barpc.sensor.radar import Radar
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import Clocked
 
 LEAST_LINE = 2000
 """Columns: the shortest lines and frames of sensors with RPCs have 2560 (SkySat, PlanetScope); parts are often less."""
@@ -40,7 +40,7 @@ def line_place(camera: Camera, size: tuple[int, int]) -> LinePlace:
     known.
     """
     width, model = size[0], camera.model
-    if isinstance(model, Clocked):
+    if isinstance(model, Radar):
         raise InputError("a radar has no line of detectors")
     for doubt in camera.doubts:
         raise InputError(f"its camera may not be its own ({doubt.sentence})")

@@ -23,8 +23,6 @@ from barpc.sensor.rpc import RPC, RPCM_NAMES
 OFFSETS = ("LINE_OFF", "SAMP_OFF", "LAT_OFF", "LONG_OFF", "HEIGHT_OFF")
 SCALES = ("LINE_SCALE", "SAMP_SCALE", "LAT_SCALE", "LONG_SCALE", "HEIGHT_SCALE")
 COEFFICIENTS = ("LINE_NUM_COEFF", "LINE_DEN_COEFF", "SAMP_NUM_COEFF", "SAMP_DEN_COEFF")
-DIRECT = ("LON_NUM_COEFF", "LON_DEN_COEFF", "LAT_NUM_COEFF", "LAT_DEN_COEFF")  # rpcm's: of a localisation RPC
-LISTS = COEFFICIENTS + DIRECT
 ERROR_FIELDS = ("ERR_BIAS", "ERR_RAND")
 SINGLE = ERROR_FIELDS + OFFSETS + SCALES
 KEYS = SINGLE + COEFFICIENTS  # GDAL's names of all fields, in the order of the GeoTIFF tag
@@ -40,7 +38,7 @@ Size = tuple[int, int]  # width, height [px]
 Fields = dict[str, list[float]]
 """Field name -> its numbers: one, or twenty for the four lists of coefficients (RPC00B order)."""
 
-_INDEXED = re.compile(rf"({'|'.join(LISTS)})_(\d+)")
+_INDEXED = re.compile(rf"({'|'.join(COEFFICIENTS)})_(\d+)")
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?")
 
 
@@ -184,20 +182,18 @@ def rpc_from_fields(
     """
     if options is not None and options.first_pixel is not None:
         first_pixel = options.first_pixel
-    lists = LISTS if fields.keys() & set(DIRECT) else COEFFICIENTS
-    _require_fields(fields, lists, name)
+    _require_fields(fields, name)
     single = np.array([fields[key][0] for key in OFFSETS + SCALES])
     single[:2] -= first_pixel
     bias, rand = (next(iter(fields.get(key, ())), None) for key in ERROR_FIELDS)
     try:
-        direct = np.array([fields[key] for key in DIRECT]) if lists is LISTS else None
-        return RPC.of_numbers([*single, *(fields[key] for key in COEFFICIENTS)], bias, rand, direct)
+        return RPC.of_numbers([*single, *(fields[key] for key in COEFFICIENTS)], bias, rand)
     except RpcError as error:
         raise RpcFormatError(f"{name}: {error}") from error
 
 
-def _require_fields(fields: Mapping[str, Sequence[float]], lists: Sequence[str], name: str) -> None:
-    for key, count in (dict.fromkeys(OFFSETS + SCALES, 1) | dict.fromkeys(lists, 20)).items():
+def _require_fields(fields: Mapping[str, Sequence[float]], name: str) -> None:
+    for key, count in (dict.fromkeys(OFFSETS + SCALES, 1) | dict.fromkeys(COEFFICIENTS, 20)).items():
         found = len(fields.get(key, ()))
         if found != count:
             what = "is missing" if not found else f"has {found} numbers, expected {count}"
@@ -208,16 +204,11 @@ def _require_fields(fields: Mapping[str, Sequence[float]], lists: Sequence[str],
             raise RpcFormatError(f"{name}: of {axis}_OFF and {axis}_SCALE one states a unit, the other none")
 
 
-def fields_from_rpc(rpc: RPC, direct: bool = False) -> Fields:
-    """Return the fields of an RPC, in the order that files give them; unknown accuracies are left out.
-
-    Those of its localisation RPC come last, in files that hold them (`direct`).
-    """
+def fields_from_rpc(rpc: RPC) -> Fields:
+    """Return the fields of an RPC, in the order that files give them; unknown accuracies are left out."""
     fields = {key: [value] for key, value in zip(ERROR_FIELDS, (rpc.err_bias, rpc.err_rand), strict=True) if value}
     keys = OFFSETS + SCALES + COEFFICIENTS
-    fields |= {k: v if k in LISTS else [v] for k, v in zip(keys, rpc.numbers(), strict=True)}
-    held = rpc.direct.tolist() if direct and rpc.direct is not None else []
-    return fields | dict(zip(DIRECT, held, strict=False))
+    return fields | {k: v if k in COEFFICIENTS else [v] for k, v in zip(keys, rpc.numbers(), strict=True)}
 
 
 # --- names and numbers, a line each ----------------------------------------------------------------------
@@ -242,7 +233,7 @@ def _numbered_lines(fields: Fields, separator: str, indices: Sequence[str]) -> l
     """Return a line for every number; the coefficients of a list have these indices."""
     lines = []
     for key, values in fields.items():
-        names = [f"{key}_{index}" for index in indices] if key in LISTS else [key]
+        names = [f"{key}_{index}" for index in indices] if key in COEFFICIENTS else [key]
         lines += [f"{k}{separator}{format_number(value)}" for k, value in zip(names, values, strict=True)]
     return lines
 
@@ -277,9 +268,9 @@ def _fields_of_lines(lines: Iterable[tuple[str, str]], name: str) -> Fields:
     pairs: list[tuple[str, float]] = []
     for word, value in lines:
         key = _GEOM_ERRORS.get(word, word)
-        if key in LISTS:
+        if key in COEFFICIENTS:
             pairs += [(f"{key}_{i}", one) for i, one in enumerate(listed_numbers(value, name, key), 1)]
-        elif key in SINGLE or key.rpartition("_")[0] in LISTS:
+        elif key in SINGLE or key.rpartition("_")[0] in COEFFICIENTS:
             pairs.append((key, number(value, name, key)))
     return collect_numbered(pairs, name)
 
@@ -289,8 +280,8 @@ def write_txt(rpc: RPC) -> str:
 
     The first ninety lines are those of readers that go by the line alone; what only some RPCs have stands behind.
     """
-    fields = fields_from_rpc(rpc, direct=True)
-    order = (*OFFSETS, *SCALES, *LISTS, *ERROR_FIELDS)
+    fields = fields_from_rpc(rpc)
+    order = (*OFFSETS, *SCALES, *COEFFICIENTS, *ERROR_FIELDS)
     lines = _numbered_lines({key: fields[key] for key in order if key in fields}, ": ", [str(i) for i in range(1, 21)])
     return "\n".join(lines) + "\n"
 
@@ -432,7 +423,6 @@ def read_bare(text: str, name: str, options: ReadOptions) -> RPC:
 
 _LOWER_KEYS = {key: key.lower() for key in KEYS}
 _RPCM_KEYS = _LOWER_KEYS | dict(zip(KEYS[2:], RPCM_NAMES, strict=True))  # the errors are not rpcm's own
-_RPCM_KEYS |= {key: key.removesuffix("_COEFF").lower() for key in DIRECT}
 _VISSAT_WORDS = (
     "rowoff coloff latoff lonoff altoff rowscale colscale latscale lonscale altscale rownum rowden colnum colden"
 )

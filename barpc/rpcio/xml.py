@@ -15,7 +15,6 @@ from barpc.base.safe_io import parse_xml
 from barpc.rasters.vrt import vrt_from_xml
 from barpc.rpcio.text import (
     COEFFICIENTS,
-    DIRECT,
     ERROR_FIELDS,
     KEYS,
     MAXAR,
@@ -182,7 +181,7 @@ def read_gdal(text: str, name: str, options: ReadOptions) -> RPC:
 
 def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -> RPC:
     """Return the RPC in GDAL's metadata domain; other keys are passed over."""
-    fields = {key: listed_numbers(value, name, key) for key, value in items.items() if key in KEYS + DIRECT}
+    fields = {key: listed_numbers(value, name, key) for key, value in items.items() if key in KEYS}
     rpc = rpc_from_fields(fields, name, options)
     if _HEIGHT_DEFAULT not in items:
         return rpc
@@ -192,7 +191,7 @@ def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -
 
 def rpc_domain(rpc: RPC) -> str:
     """Return the `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
-    fields = fields_from_rpc(rpc, direct=True)
+    fields = fields_from_rpc(rpc)
     fields |= {} if rpc.height_default is None else {_HEIGHT_DEFAULT: [rpc.height_default]}
     rows = [
         f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>' for key, values in sorted(fields.items())

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from barpc.base.frozen import Frozen, Shown
+from barpc.base.frozen import Frozen
 from barpc.base.geodesy import Array, as_ground, as_image, pointwise
 
 ITERATION_TOLERANCE = 1e-7
@@ -80,7 +80,7 @@ class Pointwise(Frozen):
 
 
 @dataclass(frozen=True)
-class Behind(Shown):
+class Behind:
     """Base of models that are another one, `sensor`, behind a correction."""
 
     sensor: Any

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import RpcError
+from barpc.base.fields import field_names
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
     NEWTON_STEPS,
@@ -196,7 +197,7 @@ class Corrections(Correction):
     def of(cls, corrections: Sequence[Correction], view: IntArray) -> Corrections:
         """Return the motion of point n by the correction of camera `view[n]`; their drifts are of one degree."""
         rows: dict[str, Any] = {
-            name: np.array([getattr(one, name) for one in corrections])[view] for name in corrections[0]._given()
+            name: np.array([getattr(one, name) for one in corrections])[view] for name in field_names(Correction)
         }
         return cls(**rows | {"drift": np.moveaxis(rows["drift"], 0, -1)})
 

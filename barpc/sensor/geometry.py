@@ -25,8 +25,8 @@ from barpc.base.geodesy import (
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Corrections
 from barpc.sensor.curve import cross
-from barpc.sensor.rpc import RPC, RpcStack, localize_stack
-from barpc.sensor.timing import Clocked
+from barpc.sensor.radar import Radar
+from barpc.sensor.rpc import RpcStack, localize_stack
 
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
 
@@ -35,12 +35,6 @@ LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an
 NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
 GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
-
-
-def altitude_range(rpc: RPC) -> tuple[float, float]:
-    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
-    offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
-    return offset - scale, offset + scale
 
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
@@ -127,7 +121,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
     """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
-    if isinstance(sensor, Clocked):
+    if isinstance(sensor, Radar):
         return np.asarray((enu_basis(ground) @ sensor.to_radar(ground)[..., None])[..., 0])
     return sight_enu(sensor, ground)
 
@@ -275,7 +269,7 @@ def camera_centers(
     how: Literal["line", "projective"] = "line",
 ) -> list[CameraCenter]:
     """Estimate the centres of cameras: `camera_center` of each, in one go."""
-    number = [i for i, sensor in enumerate(sensors) if not isinstance(sensor, Clocked)]
+    number = [i for i, sensor in enumerate(sensors) if not isinstance(sensor, Radar)]
     ecef = np.full((len(sensors), 3), np.nan)
     if how == "line":
         some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
@@ -287,7 +281,7 @@ def camera_centers(
     found = []
     for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
         low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
-        if isinstance(sensor, Clocked):
+        if isinstance(sensor, Radar):
             found.append(_center_stated(sensor, size, alt_range))
         elif low <= altitude[i] <= high:
             found.append(CameraCenter(ecef[i], altitude[i], how))
@@ -296,7 +290,7 @@ def camera_centers(
     return found
 
 
-def _center_stated(sensor: Clocked, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
+def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
     point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
     ecef = ecef_from_ground(point) + sensor.to_radar(point)
     if not np.isfinite(ecef).all():

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, pointwise, wrap_longitude
+from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array, BoolArray, IntArray, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, TRUSTED_REACH, Rational, monomials
 
@@ -26,7 +26,6 @@ RPCM_NAMES = [
     *(f"{axis}_{part}" for part in ("offset", "scale") for axis in ("row", "col", "lat", "lon", "alt")),
     *(f"{axis}_{part}" for axis in ("row", "col") for part in ("num", "den")),
 ]
-_RPCM_DIRECT = ["lon_num", "lon_den", "lat_num", "lat_den"]
 _ACCURACIES = ["err_bias", "err_rand"]
 _AXIS_ORDER, _POLYNOMIALS = (
     [1, 0, 3, 2, 4],
@@ -51,9 +50,6 @@ class RPC(Pointwise):
     image_offset, image_scale : (2,), col, row [px]; (0, 0) is the centre of the top-left pixel
     err_bias, err_rand : float or None
         Stated accuracy [m], RMS per horizontal axis: common to the image, of each point; None where unknown.
-    direct : (4, 20), optional
-        The localisation RPC: numerator and denominator of the longitude, then of the latitude, in RPC00B order with the
-        column for L and the row for P, normalised alike. `localize` inverts `coeffs` instead, which is exact.
     height_default : float or None, altitude of the ground [m], where the file states it (HEIGHT_DEFAULT of GDAL)
 
     Raises
@@ -77,7 +73,6 @@ class RPC(Pointwise):
     image_scale: Array
     err_bias: float | None = None
     err_rand: float | None = None
-    direct: Array | None = None
     height_default: float | None = None
     _map: Rational = field(init=False, repr=False)
     _memory: ClassVar[int] = 27  # monomials, normalised coordinates, polynomials
@@ -88,12 +83,8 @@ class RPC(Pointwise):
             value = self._array(name, shape, RpcError)
             if name.endswith("scale") and (value == 0).any():
                 raise RpcError(f"RPC {name}: a scale is zero")
-        if self.direct is not None:
-            self._array("direct", (4, 20), RpcError)
-        for name in ("coeffs", "direct"):
-            held = getattr(self, name)
-            if held is not None and not held[1::2].any(axis=1).all():
-                raise RpcError(f"RPC {name}: a denominator is zero everywhere")
+        if not self.coeffs[1::2].any(axis=1).all():
+            raise RpcError("RPC coeffs: a denominator is zero everywhere")
         self._keep("_map", Rational(self.coeffs, _ACCURACY / np.abs(self.image_scale)))
 
     def _told(self) -> str:
@@ -103,17 +94,15 @@ class RPC(Pointwise):
         return words.format(*np.column_stack([offset - scale, offset + scale]).ravel())
 
     @classmethod
-    def of_numbers(
-        cls, values: Sequence[Any], bias: float | None = None, rand: float | None = None, direct: Array | None = None
-    ) -> RPC:
-        """Return the RPC of fourteen values in the order of `numbers`, accuracies and a localisation RPC.
+    def of_numbers(cls, values: Sequence[Any], bias: float | None = None, rand: float | None = None) -> RPC:
+        """Return the RPC of fourteen values in the order of `numbers`, and accuracies.
 
         An accuracy of zero and below means that nobody knows it, not that it is perfect.
         """
         offset, scale = (np.array(values[i : i + 5], dtype=np.float64)[_AXIS_ORDER] for i in (0, 5))
         bias, rand = (float(error) if error and 0 < error < np.inf else None for error in (bias, rand))
         coeffs = np.array(values[10:], dtype=np.float64)[_POLYNOMIALS]
-        return cls(coeffs, offset[2:], scale[2:], offset[:2], scale[:2], bias, rand, direct)
+        return cls(coeffs, offset[2:], scale[2:], offset[:2], scale[:2], bias, rand)
 
     def numbers(self) -> list[Any]:
         """Return fourteen values in the order of RPC files.
@@ -146,10 +135,8 @@ class RPC(Pointwise):
 
     @classmethod
     def from_rpcm(cls, model: Any) -> RPC:
-        """Return the RPC of an ``rpcm.RPCModel``, its localisation RPC with it; RpcError where it lacks a number."""
-        direct = [getattr(model, name, None) for name in _RPCM_DIRECT]
-        rpc = cls._of_attributes(model, RPCM_NAMES)
-        return rpc if None in direct else replace(rpc, direct=np.array(direct, dtype=np.float64))
+        """Return the RPC of an ``rpcm.RPCModel``; RpcError where it lacks a number."""
+        return cls._of_attributes(model, RPCM_NAMES)
 
     def to_rpcm_dict(self) -> dict[str, Any]:
         """Return the dictionary for ``rpcm.RPCModel(d, dict_format="rpcm")``; known accuracies stand at its end.
@@ -162,8 +149,6 @@ class RPC(Pointwise):
         True
         """
         named = dict(zip(RPCM_NAMES, self.numbers(), strict=True))
-        if self.direct is not None:
-            named |= dict(zip(_RPCM_DIRECT, self.direct.tolist(), strict=True))
         return named | {key: value for key in _ACCURACIES if (value := getattr(self, key))}
 
     @classmethod
@@ -190,19 +175,6 @@ class RPC(Pointwise):
         places = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
         image, seen = (rpc.project(self.ground_offset + places * self.ground_scale) for rpc in (self, other))
         return np.where(np.isnan(image) & np.isnan(seen), 0.0, np.abs(seen - image))
-
-    def localize_direct(self, image: Array, alt: Array) -> Array:
-        """Localise image points by the localisation RPC: without iteration, as exact as that was fitted."""
-        return pointwise(self._localize_direct, [(3,)], image, alt, rows=20)[0]
-
-    def _localize_direct(self, image: Array, alt: Array, work: Array) -> list[Array]:
-        if self.direct is None:
-            raise RpcError("this RPC comes without a localisation RPC")
-        x = np.vstack([image.T, alt]) - np.append(self.image_offset, self.ground_offset[2])[:, None]
-        x /= np.append(self.image_scale, self.ground_scale[2])[:, None]
-        poly = self.direct @ monomials(x, work)
-        lonlat = poly[::2] / poly[1::2] * self.ground_scale[:2, None] + self.ground_offset[:2, None]
-        return [np.vstack([lonlat, alt]).T]
 
     def _project(self, ground: Array, work: Array) -> Array:
         value = self._map.value(self.normalize(ground, work[20:23]), work[:20], work[23:])
@@ -270,6 +242,12 @@ class RPC(Pointwise):
 
 
 # --- many cameras at once ----------------------------------------------------------------------------------
+
+
+def altitude_range(rpc: RPC) -> tuple[float, float]:
+    """Return the altitudes [m] that an RPC states: its offset -/+ its scale."""
+    offset, scale = float(rpc.ground_offset[2]), abs(float(rpc.ground_scale[2]))
+    return offset - scale, offset + scale
 
 
 class RpcStack:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, ClassVar, Literal, NamedTuple
@@ -34,7 +34,7 @@ from barpc.base.geodesy import (
 from barpc.base.safe_io import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
 from barpc.sensor.document import RELIEF_AROUND, XmlFields, padded
-from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
+from barpc.sensor.radar import Radar, aside, dot, on_circle
 
 _DIFFERENCE_STEP = 1.0  # m: central differences over so much are exact to 1e-9
 _VALIDITY_MARGIN = 1.0  # sides of the image around it that its polynomials are believed for
@@ -172,7 +172,7 @@ class ImagePlane(Formation):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Monostatic(Clocked):
+class Monostatic(Radar):
     """A SICD image: itself a `SensorModel`.
 
     Rows of the image go on in range (x), columns along the flight (y), so that `image` is (column, row) as ever.
@@ -186,7 +186,6 @@ class Monostatic(Clocked):
     size : (width, height) [px]
     alt_range : (low, high), altitudes that the image is used for [m above the ellipsoid]
     look : "right" or "left", side of the track; a point on the other side projects to NaN
-    timing : Timing or None, of the clocks, by y [m]: the antenna is where the orbit had it earlier, the range less
     accuracy : (float, float) or None, standard deviations of range and of the place along the flight [m]
     """
 
@@ -197,28 +196,14 @@ class Monostatic(Clocked):
     size: tuple[int, int]
     alt_range: tuple[float, float]
     look: Literal["right", "left"] = "right"
-    timing: Timing | None = None
     accuracy: tuple[float, float] | None = None
 
-    azimuth_axis: ClassVar[int] = 0
     _kind: ClassVar[str] = "SICD"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not min(self.spacing) > 0:
             raise RpcError(f"SICD: spacing {self.spacing} m")
-
-    @property
-    def speed(self) -> float:
-        """Speed of the flight in the middle of the collection [m/s]."""
-        _, velocity = self.orbit(np.array([np.mean(self.orbit.knots)]))
-        return float(np.linalg.norm(velocity))
-
-    def timed(self, timing: Timing) -> Monostatic:
-        """Return the model with a timing by the column [px] in place of its own."""
-        pixel, zero = self.spacing[1], self.origin[1]
-        timing = replace(timing, offset=(timing.offset - zero) * pixel, scale=timing.scale * pixel)
-        return replace(self, timing=timing)
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:
@@ -233,19 +218,9 @@ class Monostatic(Clocked):
         row, col = plane / np.array(self.spacing)[:, None] + np.array(self.origin)[:, None]
         return np.column_stack([col, row])
 
-    def _seen(self, plane: Array) -> Aperture:
-        """Return range and range rate of the pixels (2, N), clocks corrected."""
-        seen = self.formation.at(plane[0], plane[1], self.orbit)
-        if self.timing is None:
-            return seen
-        far, late = self.timing.at(plane[1])
-        position, velocity = self.orbit(seen.time - late)
-        distance, time = seen.distance - far, seen.time - late
-        return seen._replace(position=position, velocity=velocity, distance=distance, time=time)
-
     def _miss(self, plane: Array, point: Array) -> tuple[Array, Aperture, Array, Array]:
         """Return pixel - point in range and rate (2, N), the aperture, the point's sight (3, N), distance (N,)."""
-        seen = self._seen(plane)
+        seen = self.formation.at(plane[0], plane[1], self.orbit)
         sight = seen.position - point
         distance = np.sqrt(dot(sight, sight))
         sight = sight / distance
@@ -282,7 +257,7 @@ class Monostatic(Clocked):
         _, _, sight, distance = self._miss(self._solve(point)[0], point)
         return (sight * distance).T
 
-    def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, Array]:
         point = ecef_from_ground(ground).T
         plane, slope = self._solve(point)
         _, seen, sight, distance = self._miss(plane, point)
@@ -290,20 +265,13 @@ class Monostatic(Clocked):
         by_point = np.stack([sight, (seen.velocity - toward * sight) / distance])  # (2, 3, N)
         moved = -np.stack([_solve_systems(slope, by_point[:, k]) for k in range(3)], axis=1)  # d(x, y)/dX
         by_ground = np.einsum("ikn,nkj->nij", moved, ecef_from_ground_jacobian(ground))
-        acceleration = self.orbit.states(seen.time)[2]
-        turning = dot(acceleration, sight) + (dot(seen.velocity, seen.velocity) - toward**2) / distance
-        zero = np.zeros_like(toward)
-        by_late = np.array([[-zero - 1.0, toward], [zero, turning]])  # of the miss, by range and time
-        by_timing = -np.stack([_solve_systems(slope, by_late[:, k]) for k in range(2)], axis=1)
-        image, pixel = self._image(plane), np.array(self.spacing)[:, None]
-        timing = np.moveaxis(by_timing, -1, 0) / pixel
-        return image, (by_ground / pixel)[:, ::-1], timing[:, ::-1], image[:, 0]
+        return self._image(plane), (by_ground / np.array(self.spacing)[:, None])[:, ::-1]
 
     def _localize(self, image: Array, alt: Array) -> Array:
         low, high = self._bounds
         plane = ((image[:, ::-1] - np.array(self.origin)) * np.array(self.spacing)).T
         plane[:, ~((plane > low) & (plane < high)).all(axis=0)] = np.nan
-        seen = self._seen(plane)
+        seen = self.formation.at(plane[0], plane[1], self.orbit)
         ahead = -seen.rate / np.sqrt(dot(seen.velocity, seen.velocity))
         ground, _ = on_circle(seen.position, seen.velocity, seen.distance, alt, self.look == "right", ahead)
         return ground

@@ -19,6 +19,7 @@ import numpy as np
 from barpc.base.geodesy import NEWTON_STEPS, Array, metres_per_unit
 from barpc.base.options import TieOptions
 from barpc.base.statistics import MAD, SURELY, robust_spread
+from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, GroundPoints, IntArray, Reference, View
 from barpc.sensor.geometry import footprint, ground_sample_distance, sight_enu
 from barpc.tie.matchers.structural import GRID_POINTS
@@ -27,7 +28,6 @@ from barpc.tie.pairing.overlaps import Terrain
 from barpc.tie.patches.channels import INVALID_MARGIN, Patch, Sheet, correlation, of_image, of_reference, picture_share
 from barpc.tie.patches.oriented import HALF, PatchTile
 from barpc.tie.pixels import CELL, SPAN, FloatImage
-from barpc.tie.tasks import HERE, Work
 
 VOTE_RADIUS, FAR_RADIUS = 150.0, 1000.0  # m: how far a camera may be off; where nothing is found within the first
 PEAK = 6.5  # a vote whose peak has fewer standard deviations is none: other places reach 5.1

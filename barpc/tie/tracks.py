@@ -14,6 +14,7 @@ from barpc.base.errors import TiePointError
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, kd_tree
+from barpc.base.tasks import Progress, Work, store_of
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude, row_pairs
 from barpc.sensor.geometry import triangulate
 from barpc.tie.detail import Seen, seen_detail
@@ -42,7 +43,6 @@ from barpc.tie.pairing.resolution import Looks, finer
 from barpc.tie.patches.oriented import MAX_PATCH_SHIFT
 from barpc.tie.patches.register import refine
 from barpc.tie.pixels import sample_stretch
-from barpc.tie.tasks import Progress, Work, store_of
 
 logger = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ import shapely
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
 from barpc.base.safe_io import plain_path
+from barpc.base.tasks import Progress
 from barpc.base.verb_options import ConvertOptions
 from barpc.cameras import ImageLike, open_camera
 from barpc.fit import FitOptions
@@ -45,7 +46,6 @@ from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
 from barpc.tie import read_area
-from barpc.tie.tasks import Progress
 from barpc.verbs.images import every, place_of
 from barpc.verbs.moving import moved, refitted
 from barpc.verbs.points import altitude_of, exchanged, terrain_of

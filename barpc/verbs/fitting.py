@@ -13,6 +13,7 @@ from barpc.base.atomic import replacing
 from barpc.base.declarations import declared
 from barpc.base.errors import FitError, Remark
 from barpc.base.options import FitOptions, RunOptions
+from barpc.base.tasks import Progress
 from barpc.base.verb_options import RefitOptions
 from barpc.cameras import ImageLike, file_of, open_camera, read_points, split_spec
 from barpc.fit import RpcFit, fit_rpc, fit_rpc_points
@@ -20,7 +21,6 @@ from barpc.fit.points import terrain_range
 from barpc.rpcio import read_rpc, write_camera
 from barpc.scene import Camera, Doubt
 from barpc.sensor import SensorModel
-from barpc.tie.tasks import Progress
 from barpc.verbs.converting import check_target
 from barpc.verbs.images import place_of
 from barpc.verbs.options import OptionsLike, run_options

@@ -53,9 +53,7 @@ def moved(cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str 
             what = "a matrix of other coordinates than ECEF?" if transform else "give metres"
             file, ends = transform or "--move", f"{low:.0f} to {high:.0f} m"
             raise InputError(f"{file}: takes the ground of {camera.path} to altitudes of {ends}: {what}")
-        direct = isinstance(camera.model, RPC) and camera.model.direct is not None
-        options = replace(FitOptions(), localisation=direct)
-        out.append(_refitted(camera, correction_of(matrix, middle), (low, high), options))
+        out.append(_refitted(camera, correction_of(matrix, middle), (low, high), FitOptions()))
     _tell_motion(matrix, middle)
     return out
 

@@ -21,9 +21,9 @@ from rasterio.windows import Window
 from barpc import __version__
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, Remark
-from barpc.base.frozen import Shown
 from barpc.base.geodesy import parts as chunks
 from barpc.base.geodesy import wrap_longitude
+from barpc.base.tasks import Progress
 from barpc.base.verb_options import OrthoOptions
 from barpc.cameras import ImageLike, open_camera
 from barpc.export.shots import read_scene
@@ -35,7 +35,6 @@ from barpc.rasters.vertical import WORDS, geoid_places
 from barpc.report.finished import FinishedRun
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
-from barpc.tie.tasks import Progress
 from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder
@@ -58,7 +57,7 @@ _WGS84 = CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True)
-class Ortho(Shown):
+class Ortho:
     """An orthoimage: its file, CRS, side of a pixel [m], width and height [px], and the heights it was made with.
 
     `doubts`: reasons why the camera is not that of its image, in sentences.

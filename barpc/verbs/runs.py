@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import DsmKeywords, ExportKeywords, PathLike, RunKeywords, VerifyKeywords
+    from barpc.base.tasks import Progress
     from barpc.cameras import ImageLike
     from barpc.dsm.surface import Surface
     from barpc.pipeline import AdjustResult, Plan
     from barpc.pipeline.proof import Verification
     from barpc.pipeline.results import OpenedRun
-    from barpc.tie.tasks import Progress
 
 
 def adjust(
@@ -53,7 +53,7 @@ def adjust(
     executor : concurrent.futures.Executor, optional, works on images, tiles, pairs, fits; results do not depend on it
     jobs : int or str, without an executor: number of processes (a script that asks for several has its work behind
         ``if __name__ == "__main__":``), or the address of a dask.distributed cluster
-    progress : callable, optional, `progress(stage, done, total)`
+    progress : callable, optional, `progress(stage, done, total)`; total 0: unknown, as of an adjustment's passes
     **keywords : any option by its name, as the flags of `barpc adjust`: ``gcp="points.csv"``, ``dem=["a.tif"]``
 
     Returns

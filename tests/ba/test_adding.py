@@ -149,6 +149,7 @@ def sixty() -> tuple[SimulatedBlock, IntArray, IntArray, BlockPrior, Adjustment]
     return made, have, new, prior, adjust_tracks(made.views, made.tracks, hold_out=False)
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore:.*constrained in height")
 def test_an_image_more_is_adjusted_as_with_the_whole_block(sixty) -> None:
     """Its camera, what is known of it and of its neighbours, and the block of all; by the neighbours alone."""
@@ -196,6 +197,7 @@ def test_old_views_need_no_tie_points_and_new_ones_do(sixty) -> None:
         adjust_tracks(*part(made, far, new), prior=prior)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*constrained in height")
 @pytest.mark.parametrize("seed", range(12))

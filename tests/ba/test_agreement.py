@@ -23,7 +23,7 @@ from barpc.ba.solution import Solution
 from barpc.base.geodesy import enu_basis
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.report.page import decisions
+from barpc.report.answers import decisions
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from benchmarks import worlds_families as families
@@ -273,7 +273,7 @@ def flown(kind: str, times: int = 0) -> Any:
     return world, one, summarize(run), adjust_tracks(world.views, world.tracks)
 
 
-@pytest.mark.landing(4)
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("times", rest_slow(range(3), mark=pytest.mark.nightly))
 @pytest.mark.parametrize("kind", [name for name, _ in CONTROL])
@@ -331,8 +331,7 @@ def believing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("barpc.ba.solution.agreement", lambda _, told: Agreement(np.ones(len(told), dtype=bool)))
 
 
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", ["two of six up", "a wave", "all of them marked beside it in one image"])
 def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, monkeypatch) -> None:
     block = simulate_block(3, 400, seed=5, num_gcps=6)
@@ -430,7 +429,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
         return make("controlled", seed)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("worlds", "most"), [(6, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0

@@ -109,7 +109,7 @@ def test_a_surface_finds_its_place_with_the_right_sign_and_says_how_well(wrong: 
     assert 0.4 < np.sqrt(np.mean(np.square(ratio))) < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_heights_that_mostly_disagree_agree_on_nothing():
     rng = np.random.default_rng(1)
     assert not registered(rng, given(rng, 150, [5.0, -7.0, 90.0], wrong=0.8)).is_most
@@ -153,7 +153,7 @@ def test_two_groups_of_equal_weight_are_no_majority():
     np.testing.assert_allclose(found.motion[:3], [5.0, -7.0, 90.0], atol=0.6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_plain_tells_heights_and_no_place():
     """Slopes of a plain are its noise: they do not know where it is."""
     rng = np.random.default_rng(2)
@@ -178,8 +178,7 @@ def test_slopes_that_are_noise_know_no_place():
     assert found.share == pytest.approx(0.8, abs=0.1)
 
 
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("seeds", rest_slow([range(2), range(2, 6)]), ids=str)
 def test_noise_that_neighbours_share_is_no_knowledge(seeds: range):
     """Along twelve tracks a canopy moves stretches of 40 m by a metre or so: said is what is met."""

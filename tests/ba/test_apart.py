@@ -139,6 +139,7 @@ def test_a_view_of_wrong_matches_is_no_foreign_one() -> None:
     assert found.inlier[(made.tracks.view == 2) & ~wrong & ~found.held_out].mean() > 0.9
 
 
+@pytest.mark.landing(2)
 @pytest.mark.few(2)
 @pytest.mark.parametrize("num", [14, 20, 30])
 @pytest.mark.parametrize("views", [3, 5])
@@ -310,7 +311,7 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
         assert judge(world, found.sensors).rms[odd] < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_detectors_that_lie_off_make_a_camera_no_other_images() -> None:
     """Eight of a pixel each: more than half of its ties contradict the others wherever it is, but its columns do it."""
     world = make("plane", 6)
@@ -360,7 +361,7 @@ def test_an_image_of_the_place_may_be_distorted(
     assert foreign_camera.ForeignCamera(views, 9.0, 9.0, None, 0.6, look, placed).may_be_distorted == own
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("family", "seed"),
     [

@@ -93,7 +93,7 @@ def found(sensor: Sensor) -> Learnt:
     return learn(scenes(10, sensor, 7))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_curve_steps_and_what_is_said_of_them_are_right(found: Learnt, sensor: Sensor) -> None:
     wrong, said = off(found, sensor, SIZE[0])
     assert np.linalg.norm(wrong) < 0.03
@@ -106,7 +106,7 @@ def test_curve_steps_and_what_is_said_of_them_are_right(found: Learnt, sensor: S
     assert found.change[1] < 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["polynomials", "waves"])
 def test_heavy_tails_and_curves_of_another_model_are_met(kind: str) -> None:
     line = Sensor.made(kind, 8, chips=3, size=SIZE)
@@ -115,7 +115,7 @@ def test_heavy_tails_and_curves_of_another_model_are_met(kind: str) -> None:
     assert 0.3 < np.linalg.norm(wrong) / np.linalg.norm(said) < 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_curve_that_changes_is_dated(sensor: Sensor) -> None:
     other = Sensor(lambda col: sensor.curve(col) + 0.2 * np.cos(col[:, None] / 700.0), sensor.edges)
     at, nats = learn([*scenes(5, sensor, 1), *scenes(4, other, 2)]).change
@@ -123,6 +123,7 @@ def test_a_curve_that_changes_is_dated(sensor: Sensor) -> None:
     assert nats > 20.0
 
 
+@pytest.mark.costs(5)
 @pytest.mark.slow
 def test_a_block_shows_its_own_curve_whole_and_none_of_another(found: Learnt, sensor: Sensor) -> None:
     for seed in range(3):
@@ -217,7 +218,7 @@ def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:
     np.testing.assert_allclose(first.covariance.variances().ravel(), np.diag(first.covariance.full), rtol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_shorter_products_find_their_place_on_the_line() -> None:
     """Cut off somewhere within 88 columns: 25 px is where their middle would put them."""
     rng, sensor, blocks, true = np.random.default_rng(3), Sensor.made("polynomials", 3, chips=4, size=SMALL), [], []

@@ -38,6 +38,7 @@ def adjusted(edges: Edges, views: int = 3, seed: int = 11, only: int = -1) -> tu
     return found, np.sqrt([(left[exact.view == v] ** 2).sum(axis=1).mean() for v in range(views)])
 
 
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     "edges",

@@ -78,7 +78,7 @@ def test_heights_hold_as_much_as_they_take_from_the_variance_of_the_place():
     assert found.datum["heights"][2] == pytest.approx(taken, abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_views_that_are_fixed_hold_it():
     names = [view.name for view in BLOCK.views]
     found = solved(fixed=(names[0], names[1]))

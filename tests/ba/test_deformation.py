@@ -107,6 +107,7 @@ def adjusted(num_views: int, **control: Any) -> tuple[Adjustment, Array]:
     return found, sigmas
 
 
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("dem", [None, *DEMS])
 @pytest.mark.parametrize("num_views", [2, 3])
@@ -132,7 +133,7 @@ def test_no_gcps_deform_an_image_and_those_of_another_shape_are_not_used(num_vie
     assert found.control.used.all() if whole else not found.control.used.all(), kind
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_drift_that_heights_alone_ask_for_is_held_to_what_tie_points_show(tmp_path) -> None:
     """A pair sees nothing of a drift about its base: a flat DEM would deform images of hills by 130 px, 229 sigma."""
     pair, dem = sorted(SAMPLES.glob("view_0[01].tif")), tmp_path / "flat.tif"

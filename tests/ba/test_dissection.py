@@ -80,7 +80,7 @@ def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
     _parts_nothing_that_is_tied(order, pairs, n)
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", rest_slow(range(25), mark=pytest.mark.nightly))
 @pytest.mark.parametrize("kind", KINDS[:8])

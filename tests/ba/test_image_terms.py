@@ -154,7 +154,7 @@ def test_terms_that_check_tracks_contradict_are_refused_and_those_not_asked_for_
     assert found.outcome is off.found.outcome
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() -> None:
     one = solved(STEP, step(1.5, 0, 0.1, 0.25), step(1.5, 2, 0.7, 0.85))
     found = one.with_terms()
@@ -221,6 +221,16 @@ def test_splines_and_detectors_that_are_asked_for_are_taken_and_none_in_a_sound_
         assert edges == 0 or waves.edges.tolist() == [[2499.5, 8999.5]] * 3  # between pixels
         assert found.asked["jitter"] is one.found.outcome.smooth
         assert found.after.error < 1.02 * one.found.after.error
+
+
+def test_splines_are_solved_once_and_keep_what_else_was_found(monkeypatch) -> None:
+    """Terms have splines as a rival; where these win, the solution without the terms is asked for them again."""
+    one = solved(jitter="2000")
+    found, other = one.with_splines(), Finding("step", 0, None, np.zeros(2), 9.0, 1.0, "", np.zeros(2))
+    monkeypatch.setattr(image_terms, "_solve_with", None)
+    again = with_splines(replace(one.found, findings=(other,)), one.parts, one.options)
+    assert again.outcome is found.outcome
+    assert (found.findings, again.findings) == ((), (other,))
 
 
 @pytest.mark.slow

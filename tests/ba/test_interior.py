@@ -176,8 +176,7 @@ def with_prior(made: Scene) -> Adjustment:
     return adjust_tracks(made.views, made.tracks, common=CommonErrors((prior,) * len(made.views)))
 
 
-@pytest.mark.landing(2)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["polynomials", "waves"])
 @pytest.mark.parametrize("looks", [in_track, crossing])
 def test_heights_that_a_distortion_bends_are_within_what_is_said(kind: str, looks: object) -> None:

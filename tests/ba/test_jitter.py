@@ -58,7 +58,7 @@ def shaken(made, view, wave):
     return replace(made, tracks=moved(made.tracks), check=moved(made.check))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("seeds", "tracks"), [SHAKEN[0], pytest.param(SEEDS, 3000, marks=[pytest.mark.nightly, SHARED])]
 )
@@ -138,7 +138,6 @@ def test_what_robust_rounds_would_let_go_is_followed():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", rest_slow([3, 18], mark=pytest.mark.nightly))
 def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed(seed):
     found, after = solved("all", seed)  # flown: 2.1 m, of degree 2 1.0 m
@@ -157,7 +156,7 @@ def test_detectors_of_one_focal_plane_are_found_where_single_views_do_not_show_t
     assert 0.01 < after.across < 0.04
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "tracks",
     [
@@ -187,7 +186,7 @@ def test_steps_that_are_not_followed_stay(tracks):
     assert solved("steps 0.1 px", 1, jitter="off", tracks=tracks)[1].across > 0.1
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seeds"),
@@ -203,7 +202,7 @@ def test_nothing_is_found_where_nothing_is(name, seeds):
         np.testing.assert_array_equal(found.params, solved(name, seed, jitter="off")[0].params)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_splines_that_are_asked_for_cost_a_clean_block_little():
     for seed in SEEDS[:2]:
         found, after = solved("no drift", seed, jitter="4000")
@@ -214,7 +213,6 @@ def test_splines_that_are_asked_for_cost_a_clean_block_little():
 
 @known("0.87 px across, 0.62 without; along 1.1 for 4.5, heights 1.7 for 7.4 m: turns have a prior of their own")
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_knots_are_no_denser_than_the_observations_hold():
     few, after = solved("jitter 0.5 at 1 Hz", 0, tracks=250)
     off = solved("jitter 0.5 at 1 Hz", 0, tracks=250, jitter="off")[1]
@@ -244,7 +242,7 @@ def test_one_view_of_three_with_jitter_is_the_one_that_is_corrected():
     assert judge(made, sensors).across < 0.02 < 0.2 < judge(made, solve(made, AdjustOptions(jitter="off"))[0]).across
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("name", "tracks"), FOUND)
 def test_the_same_tracks_give_the_same_bytes(name, tracks):
     first, again = solved(name, 1, tracks=tracks)[0], solve(scene(name, 1, tracks=tracks))[1]
@@ -321,7 +319,8 @@ def swings(rows: int, size: float, count: int, rng: np.random.Generator):
     return lambda row: size / largest * shape(row)
 
 
-@pytest.mark.landing(2)
+@pytest.mark.costs(10)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 0, 2, 3])
 @pytest.mark.parametrize(

@@ -53,6 +53,7 @@ MIDDLE = {"view": 1, "axis": 1, "start": 0.4, "stop": 0.6, "px": 0.8}
 DETECTOR = {"view": 2, "axis": 0, "start": 0.25, "stop": 0.375, "px": 1.0}
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("where", rest_slow([MIDDLE, ROWS, DETECTOR]), ids=["middle", "end", "detector"])
 def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) -> None:
@@ -86,7 +87,6 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_two_of_them_in_two_images_are_both_found() -> None:
     block, tracks = flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0})
     found = adjusted(block, tracks)
@@ -94,7 +94,7 @@ def test_two_of_them_in_two_images_are_both_found() -> None:
     assert all(one.share < 0.1 and one.off < 0.03 for one in found.left)  # ties beside an end
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_fades_is_named_with_its_length() -> None:
     where = {"view": 1, "axis": 1, "start": 0.0, "stop": 1.1, "px": 4.0, "length": 0.05}
     block, tracks = flawed(3, 2500, where)
@@ -106,8 +106,7 @@ def test_what_fades_is_named_with_its_length() -> None:
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
 
 
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("first", [0.0, 1.0], ids=["beginning", "end"])
 def test_all_images_that_settle_are_explained_together(first: float) -> None:
     """All see the same ground there: their ties agree with each other, as if it moved."""
@@ -195,7 +194,7 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
     assert np.nanmax(found.held_out_rms) < 0.16
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_smaller_part_is_said_to_lie_off() -> None:
     block, tracks = flawed(2, 1500, {**ROWS, "start": 0.15, "view": 1})
     found = adjusted(block, tracks).findings[0]
@@ -213,7 +212,7 @@ def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
     assert not found.left
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_that_wander_are_not_taken_for_strips() -> None:
     block = simulate_block(3, 1000, seed=3, attitude=10e-6, position=2.0)
     xy, rows = block.tracks.xy.copy(), block.views[1].size[1]
@@ -230,7 +229,7 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
     assert max(size[0], size[2]) < 0.4 * size[1]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("options", rest_slow([{"jitter": "off"}, {"drift": 0}], mark=pytest.mark.nightly), ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
     block, tracks = flawed(3, 600, MIDDLE)
@@ -263,7 +262,7 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
     assert {one.view for one in found.left} == {1}  # and what stands out is still said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -> None:
     """More unknowns than all views may have together, so that explanations are tried on parts of the block."""
     jump = {"view": 30, "axis": 1, "start": 0.5, "stop": 1.1, "px": 3.0}

@@ -74,7 +74,7 @@ def test_a_failing_decomposition_inside_scipy_is_survived(block, adjusted, monke
         raise la.LinAlgError("SVD did not converge")
 
     monkeypatch.setattr("scipy.optimize.least_squares", fails)
-    found = adjust(block, solver="scipy")
+    found = adjust(block)
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
 
 

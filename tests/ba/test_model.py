@@ -159,7 +159,7 @@ def turned() -> SimulatedBlock:
     return replace(made, views=(made.views[0], replace(view, sensor=sensor), made.views[2]))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties(turned) -> None:
     found = adjust_tracks(turned.views, turned.tracks, AdjustOptions(learn_priors=False))
     assert found.cameras.unknowns.model == "affine"
@@ -167,7 +167,7 @@ def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties
     assert (found.inlier | found.held_out).mean() > 0.97
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("view", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_step_beside_an_image_that_was_turned_is_the_only_one_found_and_is_followed(turned, view) -> None:
     """Beside a model in space what the turn leaves looks like steps, too."""

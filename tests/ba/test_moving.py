@@ -297,8 +297,7 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     assert [len(part.view) for part in asked[1::2]] == [0, 0]  # no control points
 
 
-@pytest.mark.few(1)
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", [0, 1])
 def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
     """Their places are of another date than some of their images: named, and the scene stands by the others."""
@@ -353,6 +352,7 @@ CASES = [
 ]
 
 
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("case", rest_slow(CASES, keep=2, mark=pytest.mark.nightly), ids=str)
@@ -394,7 +394,7 @@ def test_vehicles_are_no_group(seed: int) -> None:
     assert not found.moving.any()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("axis", rest_slow([1, 0], mark=pytest.mark.nightly))
 def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
     block = simulate_block(3, 700, seed=7, attitude=10e-6, position=2.0)
@@ -411,7 +411,7 @@ def test_least_squares_that_were_asked_for_have_no_group() -> None:
     assert not adjust_tracks(block.views, tracks, AdjustOptions(loss="linear")).moving.any()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() -> None:
     """A pair of which 42 % moves by 2.6 m: a drift of degree 2 leaves 20 m of the scene's shape, and no group."""
     world = make("glacier", 22)
@@ -423,7 +423,7 @@ def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() ->
     assert judged.shape < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("family", "seed"), [("fault", 65), ("glacier", 45)])
 def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int) -> None:
     """A fifth of a scene at 2 + 2 dates: beside a fault no row or column stands out (0.22 px were left), and of a
@@ -436,8 +436,8 @@ def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: i
     assert judged.shape < 0.15
 
 
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
-@pytest.mark.landing(2)
 @pytest.mark.parametrize("seed", [41, 60, 40])
 def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
     world = make("biased", seed)

@@ -186,6 +186,7 @@ def _square(views: int) -> SimulatedBlock:
     return simulate_block(views, 20 * views, seed=3, num_gcps=5, num_checks=0)
 
 
+@pytest.mark.landing(2)
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("views", "case", "ties", "leaf"),
@@ -270,6 +271,7 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(sized: S
     assert np.abs(both[0][0].reshape(48, 9, 48, 9)[2, :, 45]).max() > 1.0
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "n"),

@@ -258,7 +258,7 @@ def test_the_largest_group_goes_on_alone_where_asked(dirty):
 
 @pytest.mark.slow
 def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
-    for asked, runs in (("scipy", ["scipy"]), ("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
+    for asked, runs in (("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
         caplog.clear()
         with caplog.at_level(logging.INFO, logger="barpc.ba.solving.solve"):
             found = run(dirty, solver=asked)
@@ -336,6 +336,8 @@ def test_views_turn_about_the_centre_that_is_asked_for(dirty):
         assert np.linalg.norm(far.center - near.center) > 1e4
 
 
+@pytest.mark.costs(3)
+@pytest.mark.slow
 def test_no_terms_is_the_plain_model_and_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     block = simulate_block(3, 1500, seed=21)
 

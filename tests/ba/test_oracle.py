@@ -135,6 +135,7 @@ def _assert_close(found: np.ndarray, expected: np.ndarray, rtol: float = 1e-5) -
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * np.abs(expected).max())
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize("dense_views", [100, 0])
 def test_the_reduced_system_is_the_schur_complement_of_the_whole_differenced_problem(case, sized, dense_views):
@@ -616,6 +617,7 @@ def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(cas
     assert asked == [np.count_nonzero((case.problem.structure.point == 11) & (case.weight > 0))]
 
 
+@pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(("known", "fixed"), diagonal([12, 11], [(), (1,)]))  # the last point: a GCP, a reference's
 def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fixed, known):

@@ -69,6 +69,7 @@ def test_gcps_that_hold_the_scene_move_it_as_far_as_its_rays_meet_elsewhere() ->
     np.testing.assert_allclose(found.gauge.shift, moved, atol=0.1)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
 @pytest.mark.parametrize("wrong", rest_slow([0.1, 0.0]))
@@ -141,6 +142,7 @@ def stating(block: SimulatedBlock, sensors: list, accuracy: float) -> tuple:
     )
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("count", rest_slow([2, 4, 8]))
 def test_adjusting_what_was_adjusted_makes_its_place_no_better_known(count: int) -> None:
@@ -192,6 +194,7 @@ def test_accuracies_that_are_shared_are_in_the_summary() -> None:
     assert json_form(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)
 
 
+@pytest.mark.costs(5)
 @pytest.mark.slow
 def test_what_delivered_cameras_let_the_scene_be_off_by_is_what_it_is_off_by_held_or_not() -> None:
     """GCPs find where it was; the points that they hold do not make delivered cameras better."""

@@ -26,7 +26,7 @@ def truth_sensors(block):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["sparse", "scipy"])
+@pytest.mark.parametrize("solver", ["sparse", "auto"])
 def test_without_noise_the_held_out_points_are_met_to_a_millionth_of_a_pixel(solver):
     exact = simulate_block(6, 500, seed=2, noise=0.0)
     found = solve(exact, **L2, sigma_attitude=1e4, sigma_position=1e3, solver=solver)
@@ -75,7 +75,7 @@ MODELS = ("rotation", "translation", "rotation+translation")
 )
 def test_both_solvers_reach_the_same_minimum(request, size, model):
     block = request.getfixturevalue(size)
-    first, second = (solve(block, **L2, model=model, solver=solver) for solver in ("scipy", "sparse"))
+    first, second = (solve(block, **L2, model=model, solver=solver) for solver in ("auto", "sparse"))
     tight = solve(block, **L2, model=model, solver="sparse", tolerance=1e-14)
     assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     assert second.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
@@ -94,7 +94,7 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
     for lon, lat in places:
         there = simulate_block(views, tracks, seed=4, lon=lon, lat=lat)
         costs = [
-            solve(there, **L2, solver="scipy").cost_history[-1],
+            solve(there, **L2, solver="auto").cost_history[-1],
             solve(there, **L2, solver="sparse", tolerance=1e-14).cost_history[-1],
         ]
         assert costs[0] == pytest.approx(costs[1], rel=1e-6), (lon, lat)
@@ -105,14 +105,14 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
 @pytest.mark.parametrize(
     ("size", "solver"),
     [
-        ("small", "scipy"),
-        *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("scipy", "sparse")),
+        ("small", "auto"),
+        *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse")),
     ],
 )
 def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
     found = solve(block, **L2, solver=solver)
-    assert found.steps <= {"scipy": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
+    assert found.steps <= {"auto": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
     assert found.cost_history[0] > 100 * found.cost_history[-1]
     tight = solve(block, **L2, solver=solver, tolerance=1e-14)
     # not of costs, which rounding alone moves by a billionth
@@ -120,7 +120,7 @@ def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, 
     assert apart < 1e-10 * (tight.residuals**2).sum()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("views", "bounds", "seeds"),
     [
@@ -151,6 +151,7 @@ def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
     assert block.held_out_rms(list(found.sensors)) < 0.02
 
 
+@pytest.mark.costs(6)
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([(3,), (1, 2, 3)], mark=pytest.mark.nightly))
 def test_drift_is_corrected_as_if_there_were_none(seeds):

@@ -74,7 +74,6 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     """With priors as stated; where they learn, that of one image may be wide enough to take up a part of it."""
@@ -86,7 +85,7 @@ def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     assert 3.0 * drifting < learnt < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_drift_is_learnt_as_large_as_it_is():
     sizes = {name: [solve(make(replace(TABLE[name], seed=s), hills))[1].prior.drift_sigma[0] for s in SEEDS]
              for name in ("no drift", "drift 1", "drift 3")}  # fmt: skip
@@ -96,6 +95,7 @@ def test_the_drift_is_learnt_as_large_as_it_is():
     assert 1.5 < three < 6.0
 
 
+@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_priors_three_times_too_narrow_are_widened_and_the_stated_place_with_them():
     found = verdicts("3 x the prior")
@@ -104,7 +104,7 @@ def test_priors_three_times_too_narrow_are_widened_and_the_stated_place_with_the
     assert median(found, lambda v: v.nees) < 0.5 * median(told, lambda v: v.nees)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_priors_that_hold_are_left_as_they_are():
     true = Case("as stated", Errors(attitude=5e-6, position=1.0))
     scales = [solve(make(replace(true, seed=seed), hills))[1].prior.scale for seed in range(6)]
@@ -112,7 +112,7 @@ def test_priors_that_hold_are_left_as_they_are():
     assert np.max(scales) < 1.5
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong",
@@ -142,7 +142,7 @@ def test_two_views_that_contradict_each_other_are_both_widened_and_none_is_named
     assert (found.prior.scale > 3).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_forty_percent_of_a_view_moved_together_is_left_out():
     found = verdicts("40 % moved")
     assert median(found, lambda v: v.after.across) < 0.05
@@ -165,6 +165,7 @@ def test_a_pair_whose_tie_points_fall_into_two_groups_says_so(seeds):
         assert groups.apart == pytest.approx(0.4, abs=0.05)
 
 
+@pytest.mark.landing(2)
 @pytest.mark.parametrize("seeds", ONE_OR_ALL)
 @pytest.mark.parametrize(
     "name",
@@ -175,7 +176,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
         assert not solve(make(replace(TABLE[name], seed=seed), hills))[1].two_groups
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "status", "word"),
@@ -216,8 +217,8 @@ def heights_of(scenes, dem=None):
     return np.array(errors), np.array([f.gauge.sigma[2] for f in found])
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", rest_slow([1.1, 0.5, 0.9, 1.3, 1.5], mark=pytest.mark.nightly))
 def test_what_is_stated_of_weak_heights_is_as_large_as_it_is(angle):
     true, said = heights_of([weak_pair(angle, seed) for seed in range(12)])

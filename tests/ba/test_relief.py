@@ -255,8 +255,7 @@ def test_bends_are_a_level_two_slopes_and_what_is_curved() -> None:
 # --- whole blocks, flown by other cameras ---------------------------------------------------------------------------
 
 
-@pytest.mark.landing(1)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("hills", "seeds"),
     [(False, (4, 6, 20)), (False, range(0, 24, 2)), (True, range(1, 24, 2))],
@@ -283,6 +282,8 @@ def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool, s
     assert np.sqrt(np.mean(np.square(off))) < (0.7 if hills else 0.85) * np.sqrt(np.mean(np.square(delivered)))
 
 
+@pytest.mark.costs(9)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "kind"),

@@ -50,7 +50,7 @@ def test_seconds_are_those_of_the_adjustment(made) -> None:
     assert 0.0 < found.seconds <= time.process_time() - start
 
 
-@pytest.mark.parametrize("asked", ["sparse", "scipy"])
+@pytest.mark.parametrize("asked", ["sparse", "auto"])
 def test_what_did_not_settle_is_told_of_the_last_solve_alone(made, monkeypatch, caplog, asked) -> None:
     """On the way to it solves of wrong views, wrong starts and wider priors may fail, which nobody needs to know."""
     real, made_first = rounds.minimise, list[bool]()

@@ -208,6 +208,7 @@ def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
     assert passes == [6, 2]  # no more than six, and never less than two
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
     """Their smooth part is chance: weights that took it for the views' misfit moved when they were cut."""
@@ -220,6 +221,7 @@ def test_scattered_wrong_observations_ask_for_no_third_pass(seed: int) -> None:
     assert found.inlier[~wrong].mean() > 0.88  # a tenth is held out
 
 
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_accuracies_stated_far_too_well_leave_no_trace_once_they_are_learnt(seed: int) -> None:
     """What views could not follow under them weighed down their ties, and nothing else may go by it at the end."""
@@ -398,3 +400,35 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     np.testing.assert_array_equal(first.counted, tied(use & block.use))
     assert first.problem.camera_prior is problem.camera_prior
     assert first.smooth._tells.all()
+
+
+@pytest.mark.parametrize("waves", [0.0, 6.0])
+def test_of_many_views_outliers_are_looked_for_on_a_sample(monkeypatch, waves) -> None:
+    """Each view has its hundred, and what is right and wrong is as by all of them; by all where one loses its own."""
+    block, rng = simulate_block(10, 2000, seed=3, num_checks=0, size=(4000, 4000)), np.random.default_rng(3)
+    wrong = rng.random(len(block.tracks)) < 0.02
+    xy = block.tracks.xy + wrong[:, None] * rng.uniform(10.0, 30.0, block.tracks.xy.shape)
+    xy[:, 1] += waves * np.sin(xy[:, 1] / 100.0) * (block.tracks.view == 4)
+    options = AdjustOptions(min_convergence=0.01)
+    ties = join(block.views, replace(block.tracks, xy=xy), None, options)
+    problem, calls = make_problem(ties, options, None, None), seen(monkeypatch, rounds, "_robust")
+    found = []
+    for fewest in (10, 11):
+        monkeypatch.setattr(rounds, "_SAMPLED_VIEWS", fewest)
+        found.append(rounds.Rounds(problem, ties, *first_state(problem, ties, options, None), ties.use))
+        found[-1]._search()
+    one, whole = found
+    counts = [np.bincount(start.structure.view) for start, *_ in calls]
+    assert counts[0].min() >= 100
+    assert counts[0].sum() < 0.25 * len(xy)
+    assert [count.sum() for count in counts[1:]] == [len(xy)] * (2 if waves else 1)
+    if waves:
+        np.testing.assert_array_equal(one.state.params, whole.state.params)
+        return
+    wrong = wrong[ties.order]
+    assert one.noise == pytest.approx(whole.noise, rel=0.15)  # these have smooth parts
+    assert one.counted[wrong].mean() < whole.counted[wrong].mean() + 0.01 < 0.1
+    assert one.counted[~wrong].mean() > whole.counted[~wrong].mean() - 0.03 > 0.75
+    right = ~wrong & (one.counted > 0.5) & (whole.counted > 0.5)
+    rms = [np.sqrt((each.residual[:, right] ** 2).mean()) for each in (one, whole)]
+    assert rms[0] == pytest.approx(rms[1], rel=0.1)

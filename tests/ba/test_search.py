@@ -70,6 +70,7 @@ class Fan(Term):
         return [cls(interval.view, columns, np.ones(2), SIZE_PRICE + np.log(residuals.linear.choices))]
 
 
+@pytest.mark.slow
 def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is proposed, beats those that resemble it and is recorded; without it they are taken in its place."""
 
@@ -91,6 +92,7 @@ def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.Mo
 # --- what is named ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.landing(3)
 @pytest.mark.parametrize("seed", rest_slow([1, 2]))
 @pytest.mark.parametrize(
     ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str
@@ -127,7 +129,7 @@ def test_a_decay_is_found_with_its_origin_length_and_sign(view, origin, length, 
     np.testing.assert_allclose(one.size, 3.0 * DIRECTION[:, 0], rtol=0.06)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("length", [0.05, -0.05])
 def test_a_transient_of_all_images_is_one_term_of_its_rate_and_a_record_a_view(length) -> None:
     seen = residuals_of(transient(6.0, length), views=4, tracks=200)
@@ -176,6 +178,7 @@ WORLDS: dict[str, tuple[tuple[Displacement, ...], int, dict[tuple[str, int], flo
 """What is displaced, the seed of the block, and what is to be named, with its size [px]."""
 
 
+@pytest.mark.landing(2)
 @pytest.mark.parametrize("world", rest_slow(WORLDS))
 def test_terms_are_named_that_together_explain_most_though_another_does_by_itself(sized, world: str) -> None:
     """They are found among rivals of the best: without rivals other images are named."""
@@ -195,8 +198,10 @@ def test_terms_are_named_that_together_explain_most_though_another_does_by_itsel
     assert sum(one.gain for one in alone.findings) < sum(one.gain for one in found.findings)
 
 
+@pytest.mark.slow
+@pytest.mark.costs(7)
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
-@pytest.mark.landing(2)
 @pytest.mark.parametrize("seed", [41, 43, 5, 9, 13])
 def test_lines_lost_in_two_of_four_views_are_given_back_to_both(seed: int) -> None:
     """Tens of pixels of two images, with cameras of other code: rows of two others would explain most ties as well."""
@@ -222,7 +227,7 @@ def test_errors_that_neighbours_share_are_no_term_and_hide_none() -> None:
     assert kinds(searched(residuals_of(STEP, cell_errors(0.2, 0), tracks=300))) == [("step", 1)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sinusoid_or_a_motion_is_taken_from_two_and_a_half_floors_on() -> None:
     """The same residuals, of a sinusoid of 0.16 px and of ground that moved, and floors below and above."""
     seen = residuals_of(sinusoid(0.16, 1, 20.0), tracks=400)
@@ -305,6 +310,7 @@ def placed(kind: str, view: int = 0) -> Term:
     return TERMS[kind](view, none, np.full(2, 0.5), 0.0, (1, 2.0, 5.0, 0.0, 0.0))
 
 
+@pytest.mark.nightly
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):
@@ -423,7 +429,7 @@ def test_a_block_is_searched_where_rows_or_else_a_period_stand_out_and_up_to_a_s
         assert search_terms(one.outcome, one.block, FLOOR).findings == ()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_large_block_is_searched_among_the_neighbours_of_each_view_that_stands_out(sized) -> None:
     """The same terms as of the whole block, under its numbers, and nothing of views far away."""
     one = solved(step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 4, 20.0), views=6, tracks=300)

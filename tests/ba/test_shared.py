@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from barpc.ba import adjust_tracks
 from barpc.ba.evidence import correlated_noise
 from barpc.ba.evidence.correlated_noise import shared_errors
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
+from tests.distributions import multivariate_normal
 
 SIZE = np.array([[1000.0, 800.0], [500.0, 900.0]])  # cols, rows of two views
 
@@ -64,7 +64,7 @@ def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) 
         col, row = (place[:, mine] / SIZE[:, [v]] * 2).astype(int)
         same = (col[:, None] == col) & (row[:, None] == row)
         cov = 0.6 * same + 0.4 * np.eye(mine.sum())
-        both = [multivariate_normal(np.zeros(len(cov)), c, allow_singular=False) for c in (cov, np.eye(len(cov)))]
+        both = [multivariate_normal(np.zeros(len(cov)), c) for c in (cov, np.eye(len(cov)))]
         gain = sum(both[0].logpdf(one) - both[1].logpdf(one) for one in values)
         assert found[v] == pytest.approx(max(gain, 0.0), rel=1e-9)
 
@@ -100,7 +100,7 @@ def test_matches_that_are_biased_place_by_place_bend_no_camera(size: float, side
     assert judge(world, found.sensors).left < size
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_jump_is_told_among_matches_that_are_biased_place_by_place() -> None:
     world = make("local", 0)
     found = adjust_tracks(world.views, biased(world, 0.05, 8, 1).tracks)

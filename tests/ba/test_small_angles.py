@@ -61,8 +61,7 @@ def height(angle: float, seed: int, **options: float) -> tuple[float, float, Adj
     return float(np.nanmedian(up)), float(found.gauge.sigma[2]), found
 
 
-@pytest.mark.few(2)
-@pytest.mark.landing(4)
+@pytest.mark.nightly
 @pytest.mark.parametrize("angle", [1.0, 0.3, 0.9, 0.95, 0.99, 1.01, 1.05, 1.1])
 def test_what_is_said_of_the_height_holds_on_both_sides_of_the_least_angle(angle: float) -> None:
     """Under priors that are true, over five blocks; with the least angle some tracks are on either side of it."""
@@ -74,6 +73,7 @@ def test_what_is_said_of_the_height_holds_on_both_sides_of_the_least_angle(angle
     assert (0.02 < held < 0.98) if angle == 1.0 else held == (0.0 if angle > 1.0 else pytest.approx(0.9, abs=0.1))
 
 
+@pytest.mark.nightly
 def test_what_is_said_of_the_height_goes_on_smoothly_through_the_least_angle() -> None:
     for options in ({}, TRUE_PRIORS):
         said = [height(angle, 0, **options)[1] for angle in (0.9, 0.95, 0.99, 1.0, 1.01, 1.05, 1.1)]
@@ -82,6 +82,7 @@ def test_what_is_said_of_the_height_goes_on_smoothly_through_the_least_angle() -
         assert (steps < 1.35).all()  # above it the range of altitudes, 1000 m here, is not what tells: sqrt(1 + 0.85^2)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("angle", [0.02, 0.2])
 def test_images_of_one_direction_are_known_within_the_range_of_their_altitudes(angle: float) -> None:
     """Rays tell nothing there, and nobody else does: not that tracks lie in the middle of that range."""

@@ -80,7 +80,7 @@ def test_points_that_hold_are_all_used(seed):
     assert (tested.redundancy <= 1).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_residual_is_the_one_that_leaving_the_point_out_shows():
     scene = scene_of(6, 1)
     gcps = scene.gcps
@@ -125,7 +125,7 @@ def said(scene, gcps):
     return found.control, summarize(run)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", rest_slow([1, 4], mark=pytest.mark.nightly))
 def test_two_points_that_contradict_each_other_are_never_good(seed):
     scene = scene_of(2, seed)
@@ -143,6 +143,7 @@ def test_two_points_that_contradict_each_other_are_never_good(seed):
     assert not any("Nothing checks" in line for line in summary.verdict)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", ONE)
 @pytest.mark.parametrize(("times", "good"), [(1.0, True), (3.5, False)])

@@ -56,8 +56,7 @@ def ended(
     return Ended(found, told.left, float(np.mean((np.array(told.move) / found.gauge.sigma) ** 2)))
 
 
-@pytest.mark.slow
-@pytest.mark.landing(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize(("turn", "alike"), [(60e-6, False), (-2.5e-3, True)])
 @pytest.mark.parametrize("heavy", [True, False])
 def test_turns_that_ties_see_say_nothing_of_the_place(
@@ -83,8 +82,7 @@ def test_turns_that_ties_see_say_nothing_of_the_place(
     assert alike or 0.2 < np.mean(turned) < 2.0  # as large as they are: but a move along the line is none
 
 
-@pytest.mark.slow
-@pytest.mark.landing(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize("times", [8.0, 25.0])
 @pytest.mark.parametrize("turns", [True, False])
 def test_cameras_that_are_all_worse_than_stated_are_said_to_be_and_none_is_blamed(times: float, turns: bool) -> None:
@@ -99,6 +97,7 @@ def test_cameras_that_are_all_worse_than_stated_are_said_to_be_and_none_is_blame
     assert 0.15 < np.mean(nees) < 3.0
 
 
+@pytest.mark.landing(1)
 @pytest.mark.few(1)
 @pytest.mark.parametrize("views", [4, 6, 12])
 def test_one_that_is_far_off_among_others_that_hold_is_named(views: int) -> None:

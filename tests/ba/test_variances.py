@@ -182,6 +182,7 @@ def told(n: int, stated: float, off: dict[int, float], seed: int = 0) -> PriorTe
     ).prior  # fmt: skip
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "wrong"), [(9, 4), (40, 17), (72, 33)])  # dense, by blocks, and of 432 unknowns
 def test_what_is_said_of_views_does_not_depend_on_how_many_there_are(n: int, wrong: int) -> None:

@@ -335,7 +335,6 @@ def test_what_nobody_chose_is_as_the_manual_says() -> None:
 def test_the_model_of_the_paper_is_constant_of_all_observations() -> None:
     assert PAPER["adjust"] == {
         "model": "rotation+translation", "center": "projective", "drift": 0, "jitter": "off", "learn_priors": False,
-        "solver": "scipy",
     }  # fmt: skip
 
 

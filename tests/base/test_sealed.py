@@ -76,7 +76,7 @@ def test_a_file_of_a_later_command_that_was_ended_is_its_own_and_no_result_of_th
 
 def test_without_sums_there_is_no_finished_folder(made) -> None:
     (made / "SHA256SUMS").unlink()
-    with pytest.raises(InputError, match=r"SHA256SUMS: missing: the run was interrupted, is of release 0\.3"):
+    with pytest.raises(InputError, match=r"SHA256SUMS: missing: the run was interrupted, or"):
         Sealed.open(made)
 
 

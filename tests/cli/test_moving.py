@@ -138,6 +138,7 @@ def test_an_image_beyond_what_its_rpc_states_is_held_too():
         assert (ends[1] >= np.array(size) - 0.5).all()
 
 
+@pytest.mark.landing(3)
 @pytest.mark.few(2)
 @pytest.mark.parametrize("length", [1.0, 30.0, 1000.0])
 @pytest.mark.parametrize("turn", [0.0, 1e-4])

@@ -59,6 +59,7 @@ def assert_ended(said: subprocess.CompletedProcess[str], how: str, whole: str) -
     assert said.stdout == (whole if out else "")
 
 
+@pytest.mark.landing(5)
 @posix
 @pytest.mark.parametrize("how", rest_slow(ENDS))
 @pytest.mark.parametrize(
@@ -71,9 +72,8 @@ def test_a_stream_that_is_closed_full_or_broken(words: str, how: str) -> None:
     assert_ended(shell(f"{COMMAND} {words} {how}"), how, plain.stdout)
 
 
+@pytest.mark.nightly
 @posix
-@pytest.mark.slow
-@pytest.mark.landing(3)
 @pytest.mark.parametrize("how", ENDS)
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_what_is_written_to_files_is_whole_whatever_becomes_of_the_streams(
@@ -100,6 +100,7 @@ def test_what_is_written_to_files_is_whole_whatever_becomes_of_the_streams(
     assert made == other
 
 
+@pytest.mark.landing(3)
 @posix
 @pytest.mark.parametrize("how", ["2>&-", pytest.param("2>/dev/full", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("words", "code"), [("info nothing.tif", 1), ("info --nonsense", 2), ("", 2)])
@@ -217,9 +218,8 @@ def test_what_an_interruption_makes_of_other_code_is_no_error(monkeypatch, capsy
     assert capsys.readouterr().err == TOLD
 
 
+@pytest.mark.nightly
 @posix
-@pytest.mark.slow
-@pytest.mark.landing(1)
 @pytest.mark.parametrize("jobs", [2, 1])
 def test_ctrl_c_pressed_again_is_one_line_and_loses_nothing(tmp_path: Path, jobs: int) -> None:
     """Whenever the second comes, and to the workers too, as from a terminal."""

@@ -111,6 +111,23 @@ def test_a_time_is_told_in_its_unit(seconds: float, text: str) -> None:
     assert told.said == [f"adjustment: at work for {text}"]
 
 
+def test_passes_of_an_unknown_number_are_told_without_a_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = Told()
+    for done in range(3):
+        told.lines("adjustment", done, 0)
+        told.now += 20.0
+    told.lines.look(now=True)
+    assert told.said == ["adjustment: pass 2, at work for 1.0 min"]
+    monkeypatch.setattr(sys, "stderr", Window())
+    with progress_told(False, 0) as progress:
+        for done, total in ((0, 0), (1, 0), (12, 0)):
+            progress("adjustment", done, total)
+        text = sys.stderr.getvalue()  # type: ignore[attr-defined]
+        assert text.rstrip().endswith("12")
+        assert not {"/", "%"} & {*text}
+        progress("adjustment", 12, 12)
+
+
 def test_who_watches_looks_each_second_until_it_is_over() -> None:
     told, waits = Told(), list[float]()
     told.lines("adjustment", 0, 1)

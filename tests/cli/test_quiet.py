@@ -52,6 +52,7 @@ def test_every_verb_does_or_answers_something():
     assert {verb.split()[0] for verb in (*DONE, *ASKED)} == set(COMMANDS) - {"calibrate"}
 
 
+@pytest.mark.landing(7)
 @pytest.mark.parametrize("verb", [pytest.param(verb, marks=[pytest.mark.slow] * (verb in SLOW)) for verb in DONE])
 def test_a_verb_that_does_something_says_nothing_when_quiet(verb, places):
     said = barpc(*words(verb, DONE[verb], places), "-q")

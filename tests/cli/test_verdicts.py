@@ -28,7 +28,7 @@ def a_fit(**changes: Any) -> Any:
     usual = {
         "method": "ridge", "iterations": 4, "h": (1e-6, 0.25), "num_cnp": 1000, "num_ckp": 500, "coverage": 0.985,
         "rmse_cnp": (1e-3, 2e-3), "max_cnp": (3e-3, 4e-3), "rmse_ckp": (5e-3, 6e-3), "max_ckp": (7e-3, 8e-3),
-        "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9, "localisation": None,
+        "beyond": 0.0123, "min_denominator": 0.9, "roundtrip": 1e-9,
         "contradiction": 3e-9, "few": "",
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **changes})
@@ -51,10 +51,6 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
     given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
     assert not any(line.startswith("beyond") for line in given)
     assert given[-1] == "verdict       it misses"
-    found = SimpleNamespace(rmse_m=0.1, max_m=0.2, rmse_px=0.3, max_px=0.4, min_denominator=0.5)
-    assert _certificate(a_fit(localisation=found), "").split("\n")[-2] == (
-        "localisation  rmse 0.1 m, max 0.2 m; projected again 0.3 and 0.4 px; denominators at least 0.5"
-    )
 
 
 @pytest.fixture

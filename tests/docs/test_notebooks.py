@@ -44,7 +44,7 @@ def numbers(line: str, text: str) -> list[float]:
     return [float(number) for number in re.findall(r"[-+]?\d+\.\d+", rest)]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore")
 def test_the_first_run(tmp_path, monkeypatch):
     said = printed("first_run", tmp_path, monkeypatch)
@@ -57,7 +57,7 @@ def test_the_first_run(tmp_path, monkeypatch):
     assert (tmp_path / "notebooks" / "first_run" / "report.html").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore")
 def test_two_dates_with_control(tmp_path, monkeypatch):
     said = printed("dates_with_control", tmp_path, monkeypatch)

@@ -84,7 +84,7 @@ def test_the_first_pages_run_on_parts_of_the_images(small, monkeypatch):
     assert len(codes) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "page",
     [pytest.param(page, marks=pytest.mark.nightly if page.stem in LATE else ()) for page in RUN],

@@ -68,6 +68,7 @@ def phrases(folder: Path) -> list[tuple[str, str]]:
     return [(place, phrase) for place, text in texts(folder) for phrase in found(text)]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("folder", FREE)
 def test_no_sentence_or_docstring_of_a_folder_is_in_the_old_dialect(folder: str) -> None:
     assert phrases(PACKAGE / folder) == []
@@ -91,6 +92,7 @@ def test_no_help_is_in_the_old_dialect(verb: str) -> None:
     assert [phrase for text in helps for phrase in found(text or "")] == []
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("folder", FREE)
 def test_first_sentences_of_docstrings_have_nouns(folder: str) -> None:
     vague = []

@@ -91,7 +91,7 @@ def tallest(after, before):
     return chosen
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_building_that_grew_is_the_change_and_the_rest_is_none(two_dates, tmp_path):
     scene, folder, chosen = two_dates
     with pytest.raises(SystemExit) as stop:
@@ -125,7 +125,7 @@ def test_a_building_that_grew_is_the_change_and_the_rest_is_none(two_dates, tmp_
     assert shared < whole.datum / 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_that_are_not_one_block_are_refused(two_dates, tmp_path, capsys):
     folder = two_dates[1]
     for one, other in (("first", "both"), ("both", "both")):

@@ -241,8 +241,7 @@ KINDS = {
 }
 
 
-@pytest.mark.landing(2)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", rest_slow(list(KINDS), 2, pytest.mark.nightly))
 def test_few_cells_are_grossly_wrong_and_hardly_any_is_lost(kind, tmp_path, monkeypatch):
     """Beside the median of all pairs; a height is wrong that is more than 5 m off all ground within a cell."""

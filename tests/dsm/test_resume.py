@@ -53,6 +53,7 @@ def run(*args: object) -> int:
     return int(stop.value.code or 0)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("times", rest_slow([(0, 2), (0, 1, 2, 4)], mark=pytest.mark.nightly))
 def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path, times):
     whole = tmp_path / "whole" / "dsm.tif"

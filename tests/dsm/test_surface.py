@@ -14,6 +14,7 @@ import pytest
 import rasterio
 
 from barpc.base.errors import BarpcError, InputError, OutputError
+from barpc.base.manifest import Layer
 from barpc.base.sealed import Sealed
 from barpc.base.verb_options import DsmOptions
 from barpc.cli import main
@@ -469,7 +470,8 @@ def test_the_report_shows_the_tile_with_most_heights_by_both_kinds_of_cameras(tm
     folder = tmp_path / "run"
     with Workspace(folder):
         pass
-    given = (FinishedRun(Sealed.unproved(folder), run), SimpleNamespace(views=views), tiles, tmp_path / "dsm.tif", 3)
+    sealed = Sealed(folder, "", [Layer("")], {}, folder, {})
+    given = (FinishedRun(sealed, run), SimpleNamespace(views=views), tiles, tmp_path / "dsm.tif", 3)
     show_in_report(*given)
     told = json.loads((folder / "tables/surface.json").read_text())
     assert told["run"] == run_key(run)

@@ -78,6 +78,8 @@ def test_both_folders_move_together(runs: Path, tmp_path: Path) -> None:
     assert len(read_scene(tmp_path / "moved/february").shots) == 3
 
 
+@pytest.mark.landing(1)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("harm", ["gone", "another", "camera"])
 def test_an_earlier_run_that_is_not_what_it_was_is_named(tmp_path: Path, harm: str) -> None:
     pair_and_one(tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import tempfile
@@ -15,6 +16,7 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.base.manifest import Layer
 from barpc.base.sealed import Sealed
 from barpc.base.verb_options import ExportOptions
 from barpc.export import files as made_of
@@ -169,7 +171,8 @@ def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, sou
     names = [f"{image}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
     for name in names:
         (tmp_path / name).write_text("x")
-    run = replace(south.run, sealed=Sealed.unproved(tmp_path))
+    listed = dict.fromkeys(names, hashlib.sha256(b"x").hexdigest())
+    run = replace(south.run, sealed=Sealed(tmp_path, "", [Layer("", listed)], {}, tmp_path, {}))
     assert scene._carrier(run, image, {"x"}) is None  # the run says nothing of it
     for name in names:
         assert scene._carrier(run, image, {name}) == tmp_path / name

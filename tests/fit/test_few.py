@@ -115,8 +115,3 @@ def test_the_verb_writes_it_and_ends_with_3(tmp_path):
     done = CliRunner().invoke(cli, words, standalone_mode=False, obj={"quiet": False})
     assert done.return_value == 3
     assert error(barpc.read_rpc(out)) < 0.5
-
-
-def test_few_points_make_no_localisation_rpc():
-    with pytest.raises(FitError, match="16 are too few for a localisation RPC: give 40 or more"):
-        barpc.fit_rpc_points(*points(16), options=barpc.FitOptions(localisation=True), strict=False)

@@ -12,7 +12,6 @@ import pytest
 from barpc.base.errors import FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
-from barpc.fit.system import PRECISIONS
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly
@@ -130,19 +129,6 @@ def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> N
     fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(method="lcurve-joint"))
     assert fit.rmse_ckp.max() <= 2e-4
     assert fit.h[0] == fit.h[1]
-
-
-@pytest.mark.slow
-def test_numbers_fitted_for_nitf_survive_it(some_vendors: list[Camera]) -> None:
-    """Copying a good RPC into that format costs whole pixels."""
-    limits = PRECISIONS["nitf"]
-    for camera in some_vendors:
-        fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(precision="nitf"))
-        rpc = fit.rpc
-        assert np.array_equal(limits.coeffs(rpc.coeffs), rpc.coeffs)
-        assert np.array_equal(np.round(rpc.ground_offset, 4), rpc.ground_offset)
-        assert np.array_equal(np.round(rpc.image_scale), rpc.image_scale)
-        assert fit.max_ckp.max() <= 0.002, camera.name
 
 
 def test_an_rpc_that_misses_the_tolerance_is_refused_or_handed_out_with_its_verdict(camera: Camera) -> None:

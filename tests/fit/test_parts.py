@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,19 +11,18 @@ import pytest
 from scipy.optimize import least_squares
 
 from barpc.base.errors import BarpcWarning, FitError
-from barpc.base.geodesy import Array, ecef_from_ground
+from barpc.base.geodesy import Array
 from barpc.fit import FitOptions, Normalization, RpcFit, fit_rpc, fit_rpc_points
 from barpc.fit import methods as solve_module
 from barpc.fit import refit as fit_module
-from barpc.fit.certificate import Localisation, localisation_errors
 from barpc.fit.methods import normalization, solve, tidy
 from barpc.fit.points import SAMPLE_CELLS, Errors, Sample, control_points
 from barpc.fit.poles import Region
-from barpc.fit.refit import _plainer, innermost, localisation_problem
-from barpc.fit.system import PRECISIONS, FitProblem, solution
+from barpc.fit.refit import _plainer, innermost
+from barpc.fit.system import FitProblem
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
-from tests.fit.cameras import Camera, random_points, synthetic, synthetic_rpc
+from tests.fit.cameras import Camera, random_points, synthetic
 from tests.fit.models import made
 
 # --- the least squares of a quotient -------------------------------------------------------------------------
@@ -72,14 +70,14 @@ def test_gauss_newton_ends_where_no_neighbour_is_better(camera: Camera, weighted
     ground, image, norm = wavy(camera)
     weight = np.random.default_rng(1).uniform(0.2, 1.0, len(ground)) if weighted else None
     problem = FitProblem(ground, image, norm, weight=weight)
-    coeffs, solved, h, passes = solve_module.METHODS["gauss-newton"](problem, None)
+    coeffs, solved, h, passes = solve_module.METHODS["gauss-newton"](problem)
     squares = (left(problem, coeffs) ** 2).sum(axis=0)
     for axis in range(2):
         assert squares[axis] <= 1.01 * best(problem, axis, coeffs)
     assert (h == 0).all()
     assert len(solved) == 2
     assert 2 <= passes <= 20
-    ridge = solve_module.METHODS["ridge"](problem, None)[0]
+    ridge = solve_module.METHODS["ridge"](problem)[0]
     assert squares.sum() < (left(problem, ridge) ** 2).sum()
 
 
@@ -114,8 +112,8 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
         return whole(problem, axis, x, region)
 
     monkeypatch.setattr(solve_module, "_minimised", seen)
-    plain, *_ = solve_module._gauss_newton_fit(problem, None)
-    ridge = solve_module._ridge(problem, None)
+    plain, *_ = solve_module._gauss_newton_fit(problem)
+    ridge = solve_module._ridge(problem)
     np.testing.assert_array_equal(starts[0], np.concatenate([ridge[0][0], ridge[0][1, 1:]]))
     basis = monomials(((ground - norm.ground_offset) / norm.ground_scale).T)
     reach = -solve_module.region_of(problem).least(-np.eye(20)[1])  # of L: the image, and a tenth around it
@@ -126,7 +124,7 @@ def test_a_ridge_with_a_pole_makes_way_for_a_polynomial(camera: Camera, monkeypa
         poles[1::2] = 0.0
         poles[1::2, 0], poles[1::2, 1] = 1.0, -slope
         monkeypatch.setattr(solve_module, "_ridge", lambda *_, poles=poles: (poles, *ridge[1:]))
-        found, *_ = solve_module._gauss_newton_fit(problem, None)
+        found, *_ = solve_module._gauss_newton_fit(problem)
         for axis in range(2):
             y = (image[:, axis] - norm.image_offset[axis]) / norm.image_scale[axis]
             polynomial = np.append(np.linalg.lstsq(basis.T, y, rcond=None)[0], np.zeros(19))
@@ -153,16 +151,6 @@ def test_a_step_that_makes_things_worse_is_not_taken(camera: Camera) -> None:
         assert (error**2).sum() == pytest.approx(system.squares(x), rel=1e-9)
 
 
-def test_coefficients_rounded_for_a_format_are_what_the_format_holds(camera: Camera) -> None:
-    ground, image, norm = wavy(camera)
-    problem, rounding = FitProblem(ground, image, norm), PRECISIONS["nitf"].coeffs
-    for method, solver in solve_module.METHODS.items():
-        coeffs, *_ = solver(problem, rounding)
-        np.testing.assert_array_equal(rounding(coeffs), coeffs)
-        free, *_ = solver(problem, None)
-        assert np.abs(left(problem, coeffs) - left(problem, free)).max() < 40.0, method
-
-
 def test_numbers_are_tidied_to_twelve_digits() -> None:
     assert tidy(np.array([1.23456789012345, 1e-7 / 3, -2e5 / 3])).tolist() == [
         1.23456789012, 3.33333333333e-8, -66666.6666667,
@@ -172,36 +160,14 @@ def test_numbers_are_tidied_to_twelve_digits() -> None:
 def test_offsets_and_scales_are_the_middle_and_the_half_of_the_points() -> None:
     ground = np.array([[4.0, 42.0, 100.0], [6.0, 45.0, 900.0], [5.0, 44.0, 300.0]])
     image = np.array([[10.0, -20.0], [30.0, 60.0], [15.0, 0.0]])
-    norm = normalization(ground, image, FitOptions())
+    norm = normalization(ground, image)
     assert norm.ground_offset.tolist() == [5.0, 43.5, 500.0]
     assert norm.ground_scale.tolist() == [1.0, 1.5, 400.0]
     assert norm.image_offset.tolist() == [20.0, 20.0]
     assert norm.image_scale.tolist() == [10.0, 40.0]
-    flat = normalization(ground * [0, 0, 0] + [5.0, 43.0, 7.0], image * 0, FitOptions())
+    flat = normalization(ground * [0, 0, 0] + [5.0, 43.0, 7.0], image * 0)
     assert flat.ground_scale.tolist() == [1e-9, 1e-9, 50.0]
     assert flat.image_scale.tolist() == [1e-6, 1e-6]
-    nitf = normalization(ground + 1e-6, image + 0.3, FitOptions(precision="nitf"))
-    assert nitf.ground_offset.tolist() == [5.0, 43.5, 500.0]
-    assert nitf.image_offset.tolist() == [20.0, 20.0]
-
-
-def test_coefficients_of_significant_digits_stay_below_one_where_the_box_is_wider_than_the_image() -> None:
-    """A square image turned by 22.5 degrees: its slope over its box is cos^2 + cos sin = 1.207."""
-    corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1], [0, 0]]) * 20_000.0
-    cos, sin = np.cos(np.pi / 8), np.sin(np.pi / 8)
-    ground = np.column_stack([corners @ [[cos, -sin], [sin, cos]] * 1e-5, [0.0, 0, 0, 0, 500]]) + [5.0, 43.0, 0.0]
-    for precision, least, most in (("nitf", 20_000 * 1.2071, 20_000 * 1.2071 * 1.08), ("rpcm", 20_000, 20_000)):
-        scale = normalization(ground, corners, FitOptions(precision=precision)).image_scale
-        assert least <= scale.min() <= scale.max() <= most, precision
-
-
-def test_what_rpcm_prints_has_twelve_decimals() -> None:
-    held = PRECISIONS["rpcm"]
-    assert held.coeffs(np.array([1.23456789012345, 4e-13, 6e-13])).tolist() == [1.234567890123, 0.0, 1e-12]
-    norm = held.normalization(Normalization([1 / 3] * 3, [2 / 3] * 3, [1e3 / 3] * 2, [1e3 / 3] * 2))
-    assert norm.ground_offset.tolist() == [0.333333333333] * 3
-    assert norm.ground_scale.tolist() == [0.666666666667] * 3
-    assert norm.image_offset.tolist() == [333.333333333333] * 2
 
 
 # --- which fit is taken ----------------------------------------------------------------------------------------
@@ -259,16 +225,12 @@ def test_behind_a_spline_the_calmer_fit_is_taken_where_it_is_a_tenth_worse_at_mo
 
 
 def test_what_a_file_lost_is_added_to_the_errors() -> None:
-    fit = made(localisation=Localisation(1.0, 2.0, 3.0, 4.0, 0.5, "ridge"))
+    fit = made()
     written = fit.as_written(fit.rpc.crop(3.0, -4.0))
     np.testing.assert_allclose(written.rmse_ckp, [3.003, 4.003], atol=1e-9)
     np.testing.assert_allclose(written.max_ckp, [3.005, 4.005], atol=1e-9)
-    assert written.localisation is None
     np.testing.assert_array_equal(written.rmse_cnp, fit.rmse_cnp)
-    direct = replace(fit.rpc, direct=np.eye(4, 20) + np.eye(20)[0])
-    assert fit.as_written(direct).localisation is fit.localisation
     told = json.loads(json.dumps(fit.summary()))
-    assert told["localisation"]["max_px"] == 4.0
     assert told["rmse_ckp"] == [3e-3, 3e-3]
     assert "rpc" not in told
 
@@ -388,45 +350,3 @@ def test_errors_of_nothing_and_of_no_number() -> None:
     errors.add(np.array([[1.0, np.nan]]))
     assert errors.rmse[0] == 1.0
     assert np.isnan(errors.rmse[1])
-
-
-# --- the localisation RPC ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("largest", "least", "words"),
-    [(0.01, 0.5, ""), (0.0101, 0.5, "misses the ground by up to 7 m"), (0.01, 0.0, "has a pole"), (0.01, 1e-6, ""),
-     (np.nan, 0.5, "misses the ground")],
-)  # fmt: skip
-def test_a_localisation_rpc_misses_or_has_a_pole_or_nothing_is_wrong(largest, least, words) -> None:
-    said = Localisation(1.0, 7.0, 0.001, largest, least, "ridge").verdict(0.01)
-    assert words in said
-    assert bool(said) == bool(words)
-
-
-def test_off_are_metres_on_the_ground_and_pixels_in_the_image() -> None:
-    rpc = synthetic_rpc(lon=179.999)
-    ground = rpc.localize(np.array([[9000.0, 4000.0], [12000.0, 9000.0]]), np.array([300.0, 700.0]))
-    found = ground + [[-360.0 + 1e-5, 0.0, 0.0], [0.0, -2e-5, 0.0]]
-    image = rpc.project(ground) + [[0.0, 0.0], [3.0, 4.0]]
-    metres, pixels = localisation_errors(rpc, found, ground, image).T
-    expected = np.linalg.norm(ecef_from_ground(found) - ecef_from_ground(ground), axis=1)
-    np.testing.assert_allclose(metres, expected, rtol=1e-5)
-    np.testing.assert_allclose(pixels, np.linalg.norm(rpc.project(found) - image, axis=1), rtol=1e-9)
-
-
-def test_the_inverse_problem_exchanges_ground_and_image() -> None:
-    camera = synthetic(lon=179.99)
-    ground, image = random_points(camera, 200, np.random.default_rng(1))
-    turned = ground + np.where(np.arange(200) % 2, 360.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    problem = localisation_problem(camera.rpc, turned, image, weight=np.full(200, 0.5))
-    rpc = camera.rpc
-    np.testing.assert_array_equal(problem.ground, np.column_stack([image, ground[:, 2]]))
-    np.testing.assert_allclose(problem.image, ground[:, :2], rtol=0, atol=1e-12)
-    assert problem.norm.ground_offset.tolist() == [*rpc.image_offset, rpc.ground_offset[2]]
-    assert problem.norm.ground_scale.tolist() == [*rpc.image_scale, rpc.ground_scale[2]]
-    np.testing.assert_array_equal(problem.norm.image_offset, rpc.ground_offset[:2])
-    np.testing.assert_array_equal(problem.norm.image_scale, rpc.ground_scale[:2])
-    assert (problem.weight == 0.5).all()
-    x = [solution(problem.compressed(axis)) for axis in range(2)]
-    assert max(np.abs(residuals(problem, axis, x[axis])).max() for axis in range(2)) < 1e-6

@@ -69,7 +69,7 @@ def test_noise_neither_makes_poles_nor_costs_more_than_the_unknowns_do(
         assert abs(rms(fit.rmse_ckp) - 0.3) <= 0.3 * max(0.1, 12 / np.sqrt(count))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_leave_one_out_residuals_are_those_of_fits_without_the_point(camera: Camera) -> None:
     rng = np.random.default_rng(8)
     ground, image = random_points(camera, 60, rng)

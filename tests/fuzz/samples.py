@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import tempfile
 import warnings
 import zipfile
@@ -34,7 +35,7 @@ from barpc.pointio.gcps import read_gcps
 from barpc.rasters.dem import Dem
 from barpc.report.compare import compare_runs
 from barpc.report.page import report_html
-from barpc.report.runfiles import read_summary, table_path
+from barpc.report.runfiles import read_summary
 from barpc.rpcio import FORMATS, read_rpc, write_rpc_copy
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.formats import SIGN
@@ -133,11 +134,9 @@ def _tiff() -> bytes:
 
 
 def _nitf() -> bytes:
-    from barpc.fit import FitOptions, fit_rpc
     from tests.rpcio.conftest import nitf_record
 
-    fitted = fit_rpc(make_rpc(), (2000, 1900), (50.0, 290.0), options=FitOptions(precision="nitf"), strict=False).rpc
-    return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(fitted).encode() + b" " * 50
+    return b"NITF02.10" + b" " * 100 + b"RPC00B01041" + nitf_record(make_rpc()).encode() + b" " * 50
 
 
 # --- rasters ----------------------------------------------------------------------------------------------
@@ -288,9 +287,12 @@ def _run() -> Path:
 
 
 def _beside_run(folder: Path) -> None:
-    for path in (*_run().iterdir(), *(_run() / "tables").iterdir()):  # where earlier releases put them
-        if path.is_file():
-            (folder / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(_run(), folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".barpc"))
+
+
+def _folder_of(path: Path) -> Path:
+    """The run's folder of a file in it, or in that of its tables."""
+    return path.parent.parent if path.parent.name == "tables" else path.parent
 
 
 def _compare(path: Path) -> object:
@@ -312,21 +314,22 @@ def _in_state(folder: Path) -> None:
 
 
 def _run_sample(name: str, read: Callable[[Path], object], *mutations: Mutate, share: float = 1.0) -> Sample:
-    return Sample(name, read, lambda: table_path(_run(), name).read_bytes(), mutations, _beside_run, share)
+    return Sample(name, read, lambda: (_run() / name).read_bytes(), mutations, _beside_run, share)
 
 
 def _report(path: Path) -> object:
-    return report_html(read_summary(path.parent), path.parent)
+    folder = _folder_of(path)
+    return report_html(read_summary(folder), folder)
 
 
 _NOON = ExportOptions(time=("2020-06-01T11:30:00",))
 
 
 def _export(path: Path) -> object:
-    seal(path.parent)
+    seal(_folder_of(path))
     with tempfile.TemporaryDirectory() as folder:
         for target in ("satnerf", "cars", "stac", "points"):
-            export_run(path.parent, target, Path(folder) / target, _NOON)
+            export_run(_folder_of(path), target, Path(folder) / target, _NOON)
     return None
 
 
@@ -588,10 +591,10 @@ SAMPLES: dict[str, Sample] = {
     "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),
     "comparison": _run_sample("summary.json", _compare, mutate_json, mutate_values, mutate_values, share=0.6),
     "exported": _run_sample("summary.json", _export, mutate_json, mutate_values, mutate_values, share=0.3),
-    "exported residuals": _run_sample("residuals.csv", _export, mutate_text, share=0.1),
-    "observations": _run_sample("observations.csv", _report, mutate_text, share=0.1),
-    "residuals": _run_sample("residuals.csv", _report, mutate_text, share=0.1),
-    "footprints": _run_sample("footprints.geojson", _report, mutate_json, mutate_values, share=0.2),
+    "exported residuals": _run_sample("tables/residuals.csv", _export, mutate_text, share=0.1),
+    "observations": _run_sample("tables/observations.csv", _report, mutate_text, share=0.1),
+    "residuals": _run_sample("tables/residuals.csv", _report, mutate_text, share=0.1),
+    "footprints": _run_sample("tables/footprints.geojson", _report, mutate_json, mutate_values, share=0.2),
     "compared RPC": _run_sample("view_0000_RPC.TXT", _compare, mutate_text, share=0.1),
     "state": Sample(
         ".barpc/state.json",

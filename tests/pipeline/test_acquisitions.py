@@ -32,6 +32,7 @@ def band(view: Path, path: Path, step: int = 4, *, turned: bool = False) -> Path
     return path
 
 
+@pytest.mark.nightly
 def test_a_band_gets_the_correction_of_its_image(tmp_path: Path) -> None:
     coarse = band(VIEWS[0], tmp_path / "multi.tif")
     alone = barpc.adjust(VIEWS, tmp_path / "alone", points_per_image=500)
@@ -86,6 +87,7 @@ def test_an_image_and_its_band_alone_are_nothing_to_adjust(tmp_path: Path) -> No
         barpc.adjust([VIEWS[0], coarse], tmp_path / "run")
 
 
+@pytest.mark.nightly
 def test_a_band_is_added_with_other_images_and_not_alone(tmp_path: Path) -> None:
     few = {"points_per_image": 500}
     coarse = band(VIEWS[0], tmp_path / "multi.tif")

@@ -125,8 +125,7 @@ def refused(work: Callable[[], object], *words: str) -> bool:
     return False
 
 
-@pytest.mark.few(1)
-@pytest.mark.landing(4)
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(50))
 def test_a_chain_of_runs_refuses_nothing_without_cause_and_says_nothing_false(
     seed: int, archive: Path, tmp_path: Path

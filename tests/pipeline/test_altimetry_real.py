@@ -81,7 +81,6 @@ def along_tracks(swept: Any, seed: int) -> Altimetry:
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_real_images_are_placed_by_heights_within_what_is_said(swept):
     """About a metre flat and 0.1 m up; without leaving parts out what was said was half of that."""

@@ -105,7 +105,7 @@ def straight(curve: np.ndarray, cols: np.ndarray) -> np.ndarray:
     return curve - np.polynomial.polynomial.polyval(cols, fit).T
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_tell_the_curve_and_how_well(calibration: Path, archive: list[Path], line: Sensor) -> None:
     found, text = read_calibration(calibration), json.loads(calibration.read_text())
     cols = np.arange(5.0, SIZE[0] - 5.0)
@@ -163,7 +163,7 @@ def test_a_run_with_a_calibration_writes_it_and_is_calibrated_again_to_the_same(
         run(paths[2:], "added", add_to=str(tmp_path / "new/two"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_is_not_of_the_images_is_refused(calibration: Path, line: Sensor, tmp_path: Path) -> None:
     """A mirrored line, another sensor, and another number of columns."""
     rng = np.random.default_rng(12)
@@ -222,7 +222,7 @@ def test_an_archive_of_parts_tells_the_line_and_a_new_part_is_corrected_by_its_c
     assert after[1] < 0.95 * after[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_verb_says_what_it_found_or_why_it_did_not(archive: list[Path], tmp_path: Path) -> None:
     def said(*words: object) -> Result:
         return CliRunner().invoke(cli, ["calibrate", *map(str, words)], standalone_mode=False, obj={"quiet": False})
@@ -240,7 +240,7 @@ def test_the_verb_says_what_it_found_or_why_it_did_not(archive: list[Path], tmp_
     assert one.read_bytes() == other.read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_that_cannot_be_used_are_named(archive: list[Path], tmp_path: Path) -> None:
     out, place = tmp_path / "x.cal", tmp_path / "copy"
 

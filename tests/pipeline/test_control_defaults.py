@@ -14,6 +14,7 @@ import barpc
 from barpc.base.errors import InputError
 from barpc.pipeline.run import AdjustResult
 from barpc.pointio.gcps import read_gcps
+from barpc.pointio.matches import write_matches
 from barpc.scene import View
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,14 +40,23 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> list[View]:
     return [replace(view, sensor=replace(view.sensor, err_bias=None, err_rand=None)) for view in found.views]
 
 
-def adjusted(views: list[View] | list[Path], gcp: Path, folder: Path, **options: object) -> AdjustResult:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return barpc.adjust(views, folder / "run", gcp=str(gcp), points_per_image=400, **options)
+@pytest.fixture(scope="module")
+def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., AdjustResult]:
+    """The images adjusted with control; they are matched once."""
+    ties = tmp_path_factory.mktemp("ties") / "ties.npz"
+    write_matches(ties, barpc.check(VIEWS, points_per_image=400).tracks, [view.stem for view in VIEWS])
+
+    def run(views: list[View] | list[Path], gcp: Path, folder: Path, **options: object) -> AdjustResult:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return barpc.adjust(views, folder / "run", gcp=str(gcp), matches=ties, matches_only=True, **options)
+
+    return run
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("level", [1.0, 200.0, -3.5])
-def test_altitudes_that_are_all_the_same_are_a_default(level: float, tmp_path: Path) -> None:
+def test_altitudes_that_are_all_the_same_are_a_default(level: float, adjusted, tmp_path: Path) -> None:
     found = adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path)
     assert found.record.status == "look"
     assert any("5 of 5 points have no altitude, or a default" in reason for reason in found.record.reasons)
@@ -56,7 +66,7 @@ def test_altitudes_that_are_all_the_same_are_a_default(level: float, tmp_path: P
     assert "--heights flat" in given.said[0]
 
 
-def test_altitudes_that_a_person_says_are_flat_are_used(tmp_path: Path) -> None:
+def test_altitudes_that_a_person_says_are_flat_are_used(adjusted, tmp_path: Path) -> None:
     found = adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: 222.0), tmp_path, heights="flat")
     assert found.adjustment.gauge.sigma[2] < 3.0
     two = "\n".join((tmp_path / "g.csv").read_text().splitlines()[:3]) + "\n"
@@ -65,7 +75,7 @@ def test_altitudes_that_a_person_says_are_flat_are_used(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("times", "unit"), [(1 / 0.3048, "in feet"), (0.3048, "in metres and not feet")])
-def test_altitudes_in_another_unit_are_refused(times: float, unit: str, tmp_path: Path) -> None:
+def test_altitudes_in_another_unit_are_refused(times: float, unit: str, adjusted, tmp_path: Path) -> None:
     gcp = written(tmp_path / "g.csv", lambda alt: alt * times)
     with pytest.raises(InputError, match=rf"altitudes scatter by [\d.]+ m .* by 0\.\d m if they are {unit}"):
         adjusted(VIEWS, gcp, tmp_path)
@@ -74,7 +84,7 @@ def test_altitudes_in_another_unit_are_refused(times: float, unit: str, tmp_path
         assert adjusted(VIEWS, named, tmp_path).record.status == "good"
 
 
-def test_a_point_outside_its_image_is_refused(tmp_path: Path) -> None:
+def test_a_point_outside_its_image_is_refused(adjusted, tmp_path: Path) -> None:
     gcp = written(tmp_path / "g.csv", float, moved=100.0)
     with pytest.raises(InputError, match="point gcp_004: outside its image, and inside it by the camera"):
         adjusted(VIEWS, gcp, tmp_path)
@@ -82,8 +92,12 @@ def test_a_point_outside_its_image_is_refused(tmp_path: Path) -> None:
     assert any("outside its image" in reason for reason in kept.record.reasons)
 
 
+@pytest.mark.costs(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("column", ["alt", "height_ellipsoidal"])
-def test_control_that_moves_right_cameras_by_the_geoid_is_named(column: str, right: list[View], tmp_path: Path) -> None:
+def test_control_that_moves_right_cameras_by_the_geoid_is_named(
+    column: str, right: list[View], adjusted, tmp_path: Path
+) -> None:
     """Whatever its column is called: 49 m are within the accuracy that nobody stated."""
     above_sea = adjusted(right, written(tmp_path / "g.csv", lambda alt: alt - GEOID, column), tmp_path)
     assert above_sea.record.status == "look"
@@ -95,7 +109,7 @@ def test_control_that_moves_right_cameras_by_the_geoid_is_named(column: str, rig
     assert not any("above sea level" in reason for reason in higher.record.reasons)
 
 
-def test_pointing_errors_are_no_geoid(tmp_path: Path) -> None:
+def test_pointing_errors_are_no_geoid(adjusted, tmp_path: Path) -> None:
     """The delivered cameras put the scene 89 m too low, and 7 m aside."""
     assert adjusted(VIEWS, written(tmp_path / "g.csv", float), tmp_path).record.status == "good"
 

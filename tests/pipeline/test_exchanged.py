@@ -51,6 +51,7 @@ def test_right_cameras_and_bad_ones_are_not_exchanged(samples: AdjustResult) -> 
     assert exchanged_cameras([views[0], views[1], moved], tracks) is None
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("keep_going", [False, True])
 def test_a_run_with_exchanged_rpcs_ends_or_leaves_them_out(tmp_path: Path, keep_going: bool) -> None:
     given = [f"{VIEWS[0]},camera={VIEWS[1]}", f"{VIEWS[1]},camera={VIEWS[0]}", str(VIEWS[2])]
@@ -61,6 +62,8 @@ def test_a_run_with_exchanged_rpcs_ends_or_leaves_them_out(tmp_path: Path, keep_
         barpc.check(given, points_per_image=500)
 
 
+@pytest.mark.costs(8)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("order", rest_slow([*ORDERS, (1, 0)], 2, mark=pytest.mark.nightly))
 def test_so_it_is_among_real_images(shared_data: Path, order: tuple[int, ...]) -> None:

@@ -48,6 +48,7 @@ def spread(views, tracks, i: int, j: int) -> float:
     return robust_spread(coherent(first, epipolar_segments(views[i], views[j], first).errors(second)[:, 1])[1])
 
 
+@pytest.mark.costs(5)
 @pytest.mark.slow
 def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tmp_path) -> None:
     images = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))
@@ -133,6 +134,8 @@ def test_an_image_that_is_left_out_leaves_the_rest_of_the_matches(shared_data, c
     assert len(result.run.matched) == 3
 
 
+@pytest.mark.landing(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "content"), [("a.txt", b""), ("a.txt", b"0 0\n"), ("a.match", bytes(16)), ("a.match", b"")]
 )

@@ -1,4 +1,4 @@
-"""Grids, tiles and resampled images of a run: written where one RPC does not do, reopened, owned, told."""
+"""Grids of a run: written where one RPC does not do, reopened, owned, told."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from barpc.pipeline import grid_outputs as grids
 from barpc.pipeline.grid_outputs import grid_names, write_grids
 from barpc.pipeline.verify_outputs import difference
 from barpc.rpcio import read_rpc
-from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX, RESAMPLED
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.rpcio.grids import read_correction, write_correction
 from barpc.scene import View
 from barpc.sensor.csm import STATE_END
@@ -40,7 +40,7 @@ from tests.rpcio.conftest import make_rpc, write_image
 from .test_growth import write_block
 
 SIZE, ALTS = (1500, 2200), (0.0, 600.0)
-ENDS = (GRID_SUFFIX, CORRECTION, RESAMPLED)
+ENDS = (GRID_SUFFIX, CORRECTION)
 
 
 @pytest.fixture(scope="module")
@@ -130,18 +130,8 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
     assert rpc.err_bias == fit.rpc.err_bias
 
 
-@pytest.mark.slow  # before a commit: the option
-def test_a_resampled_image_has_one_rpc_that_holds(tmp_path, view, camera, fit):
-    """Its pixels are those of the image, taken where the camera sees what its RPC sees."""
-    (written,) = run_of(tmp_path, (view, fit, camera), resample=True)
-    assert list(written) == ["a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED]
-    assert max(written["a" + RESAMPLED].values()) < 0.02
-    rpc, _ = read_correction(tmp_path / f"a{CORRECTION}")
-    assert read_rpc(tmp_path / f"a{RESAMPLED}").off(rpc).max() < 1e-9
-
-
 def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view, camera, fit):
-    errors = grids.make_grids(view, fit.rpc, camera, grids.GridFiles(grids=True, resampled=False), str(tmp_path))
+    errors = grids.make_grids(view, fit.rpc, camera, grids.GridFiles(grids=True), str(tmp_path))
     assert set(grids.verify_grids(view, camera, errors, str(tmp_path / "a"))) == {"a" + GRID_SUFFIX, "a" + CORRECTION}
     rpc, lacking = read_correction(path := tmp_path / "a" / f"a{CORRECTION}")
     write_correction(replace(lacking, shift=-lacking.shift), rpc, path, overwrite=True)
@@ -156,14 +146,14 @@ def test_a_run_that_dies_half_way_leaves_nothing_half_written(tmp_path, view, ca
     def dying(*given, **how):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(grids, "write_resampled", dying)
+    monkeypatch.setattr(grids, "write_correction", dying)
     with pytest.raises(KeyboardInterrupt):
-        run_of(tmp_path / "out", (view, fit, camera), resample=True)
+        run_of(tmp_path / "out", (view, fit, camera), grids=True)
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".barpc"]
     assert not list((tmp_path / "out" / ".barpc" / "partial").rglob("*.tif"))
     monkeypatch.undo()
-    run_of(tmp_path / "out", (view, fit, camera), resample=True)
-    assert own_files(tmp_path / "out") == {"a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED}
+    run_of(tmp_path / "out", (view, fit, camera), grids=True)
+    assert own_files(tmp_path / "out") == {"a" + GRID_SUFFIX, "a" + CORRECTION}
 
 
 def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, view, camera, fit):
@@ -180,7 +170,7 @@ def test_a_camera_without_ground_in_a_part_of_its_image_is_one_line(tmp_path, vi
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
     """A grid does not hold a step between detectors in the cell that it runs through: said, with how much it is."""
 
@@ -206,23 +196,10 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
 
 
 def test_all_names_are_known_before_the_run(view):
-    assert grid_names(view, RunOptions()) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
-    names = grid_names(view, RunOptions(resample=True))
-    assert names == ["a" + GRID_SUFFIX, "a" + CORRECTION, "a" + RESAMPLED]
+    assert grid_names(view) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
 
 
 # --- its parts ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("asked", "resampled", "ends"),
-    [
-        (False, False, []), (True, False, [GRID_SUFFIX, CORRECTION]), (False, True, [CORRECTION, RESAMPLED]),
-        (True, True, [GRID_SUFFIX, CORRECTION, RESAMPLED]),
-    ],
-)  # fmt: skip
-def test_a_resampled_image_has_its_correction_beside_it(view, asked, resampled, ends) -> None:
-    assert grids.GridFiles(asked, resampled).names(view) == ["a" + end for end in ends]
 
 
 def plane(left: float = 0.0, **more) -> SimpleNamespace:
@@ -232,11 +209,11 @@ def plane(left: float = 0.0, **more) -> SimpleNamespace:
 
 @pytest.fixture
 def tasks(monkeypatch) -> list:
-    """What would be written: of each view, its grids and whether it is resampled."""
+    """What would be written: of each view, whether it has grids."""
     found: list = []
 
     def write(run, tasks, executor, progress):
-        found.extend((view.name, rpc, files.grids, files.resampled) for view, rpc, _, files in tasks)
+        found.extend((view.name, rpc, files.grids) for view, rpc, _, files in tasks)
         return [{f"{view.name}.x": {"barpc": 1.0}} for view, *_ in tasks]
 
     monkeypatch.setattr(grids, "_write_grids", write)
@@ -248,14 +225,11 @@ def test_grids_are_for_cameras_that_their_rpc_misses_by_a_fiftieth_of_a_pixel(tm
     misses = {"a": 0.02, "b": 0.0201, "c": np.nan, "d": 0.0}
     given = [(replace(view, name=name), plane(left), None) for name, left in misses.items()]
     written = run_of(tmp_path / "out", *given)
-    assert tasks == [("b", "rpc", True, False), ("c", "rpc", True, False)]
+    assert tasks == [("b", "rpc", True), ("c", "rpc", True)]
     assert written == [{}, {"b.x": {"barpc": 1.0}}, {"c.x": {"barpc": 1.0}}, {}]
     tasks.clear()
-    run_of(tmp_path / "resampled", *given, resample=True)
-    assert tasks == [(name, "rpc", name in "bc", True) for name in "abcd"]
-    tasks.clear()
     run_of(tmp_path / "asked", *given, grids=True)
-    assert tasks == [(name, "rpc", True, False) for name in "abcd"]
+    assert tasks == [(name, "rpc", True) for name in "abcd"]
 
 
 def test_a_stage_of_grids_is_only_where_there_are_some(tmp_path, view, tasks) -> None:
@@ -269,8 +243,8 @@ def read_as(monkeypatch, **rms: float) -> list:
     """Readers of files that see these errors; what each of them was asked for."""
     asked: list = []
 
-    def verify(path, sample, lacking):
-        asked.append((path.name, lacking, len(sample.points)))
+    def verify(path, sample):
+        asked.append((path.name, len(sample.points)))
         return [SimpleNamespace(consumer=name, rms=px, max_error=2 * px, note="") for name, px in rms.items()]
 
     monkeypatch.setattr(grids, "verify_grid", verify)
@@ -294,20 +268,12 @@ def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkey
         found = grids.verify_grids(view, model, errors, str(tmp_path))
         assert found == {"a" + GRID_SUFFIX: {name: 2 * px for name, px in rms.items()}}
         count = len(grids.Sample.of(model, view.size, grids.widened(view.alt_range)).points)
-        assert asked == [("a" + GRID_SUFFIX, None, count + 2)]
+        assert asked == [("a" + GRID_SUFFIX, count + 2)]
         return
     ((name, px),) = rms.items()
     said = rf"a_grid\.tif: {name} reads it with errors of {px:.3g} px RMS, not 0\.005; is the disk full"
     with pytest.raises(OutputError, match=said):
         grids.verify_grids(view, model, errors, str(tmp_path))
-
-
-def test_only_a_resampled_image_is_seen_through_its_correction(tmp_path, view, monkeypatch) -> None:
-    asked = read_as(monkeypatch, barpc=0.0)
-    monkeypatch.setattr(grids, "read_correction", lambda path: (None, path.name))
-    errors = {"a" + end: (0.0, 0.0, np.empty((0, 3))) for end in (GRID_SUFFIX, CORRECTION, RESAMPLED)}
-    assert list(grids.verify_grids(view, make_rpc(), errors, str(tmp_path))) == list(errors)
-    assert [row[1] for row in asked] == [None, None, "a" + CORRECTION]
 
 
 @pytest.mark.parametrize(
@@ -429,8 +395,7 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     assert where.shape[1] == 3
 
 
-@pytest.mark.parametrize(("asked", "resampled"), [(True, False), (False, True), (True, True)])
-def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch, asked, resampled) -> None:
+def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch) -> None:
     """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
     where, written = np.zeros((1, 3)), {}
     alts = grids.widened(view.alt_range)
@@ -454,16 +419,15 @@ def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monke
     monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
     monkeypatch.setattr(grids, "grid_correction", correction)
     monkeypatch.setattr(grids, "_largest_miss", lambda sample, camera: (0.1, 0.2, where))
-    for kind in ("grid", "correction", "resampled"):
+    for kind in ("grid", "correction"):
         monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))
-    errors = grids.make_grids(view, rpc, rpc, grids.GridFiles(asked, resampled), str(tmp_path))
+    errors = grids.make_grids(view, rpc, rpc, grids.GridFiles(grids=True), str(tmp_path))
     known = {
-        "a" + GRID_SUFFIX: (asked, (0.1, 0.2, where), ("grid", "grid", True)),
-        "a" + CORRECTION: (True, (0.3, 0.4, where), ("correction", "lacking", "better", True)),
-        "a" + RESAMPLED: (resampled, (0.3, 0.4, where), ("resampled", "better", "lacking", view.path, True)),
+        "a" + GRID_SUFFIX: ((0.1, 0.2, where), ("grid", "grid", True)),
+        "a" + CORRECTION: ((0.3, 0.4, where), ("correction", "lacking", "better", True)),
     }
-    assert errors == {name: miss for name, (there, miss, _) in known.items() if there}
-    assert written == {f"a/{name}": row for name, (there, _, row) in known.items() if there}
+    assert errors == {name: miss for name, (miss, _) in known.items()}
+    assert written == {f"a/{name}": row for name, (_, row) in known.items()}
 
 
 def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, fit) -> None:
@@ -481,10 +445,10 @@ def block(tmp_path_factory):
     return write_block(folder, 3)[1], str(folder / "matches.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, tmp_path):
     images, matches = block
-    options = RunOptions(matches=matches, matches_only=True, grids=True, resample=True)
+    options = RunOptions(matches=matches, matches_only=True, grids=True)
     result = adjust(images, tmp_path / "a", options)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
         adjust(images, tmp_path / "b", options, executor=executor)
@@ -494,12 +458,12 @@ def test_a_run_with_everything_is_told_and_the_same_whatever_the_workers(block, 
         for name in view.outputs:
             assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
         assert all(isinstance(px, float) and px < LINEAR for one in view.outputs.values() for px in one.values())
-        for end in (GRID_SUFFIX, CORRECTION, RESAMPLED):
+        for end in ENDS:
             found = open_camera(tmp_path / "a" / (view.name + end)).model
             ground = found.localize(np.array([[10.0, 20.0], [200.0, 250.0]]), np.array([*view.alt_range_m]))
             rpc = read_rpc(tmp_path / "a" / f"{view.name}_RPC.TXT")
             assert np.abs(rpc.project(ground) - [[10.0, 20.0], [200.0, 250.0]]).max() < 1e-3
-    adjust(images, tmp_path / "a", replace(options, grids=False, resample=False, overwrite=True))
+    adjust(images, tmp_path / "a", replace(options, grids=False, overwrite=True))
     left = {path.name for path in (tmp_path / "a").iterdir()}
     assert not [name for name in left if name.endswith(ENDS)]
 

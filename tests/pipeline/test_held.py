@@ -33,6 +33,7 @@ def on_disk(where: dict[Path, Path], **options: object) -> AdjustResult:
     return barpc.check([f"{image},camera={run / image.stem}_RPC.TXT" for image, run in where.items()], **options)
 
 
+@pytest.mark.nightly
 def test_what_is_printed_is_what_lies_on_disk(tmp_path: Path) -> None:
     """The recipe of the manual: it printed 0.012 px, and 5.8 px lay there."""
     few = {"points_per_image": 600}
@@ -53,6 +54,7 @@ def test_what_is_printed_is_what_lies_on_disk(tmp_path: Path) -> None:
     assert len(moved) == 1
 
 
+@pytest.mark.nightly
 def test_a_chain_that_held_ends_where_the_whole_does_when_it_is_updated(tmp_path: Path) -> None:
     few = {"points_per_image": 600}
     whole = barpc.adjust(VIEWS, tmp_path / "whole", **few)
@@ -67,6 +69,7 @@ def test_a_chain_that_held_ends_where_the_whole_does_when_it_is_updated(tmp_path
         assert abs(pair.epipolar_before.median) < 0.01
 
 
+@pytest.mark.slow
 def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -> None:
     """Half a pixel of bending along the epipolar lines of a pair, which the pair cannot see."""
     few = {"points_per_image": 600}
@@ -84,6 +87,8 @@ def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -
     assert found.record.status == "look"
 
 
+@pytest.mark.costs(6)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (0, 2, 1)])
 def test_so_it_is_with_real_images(shared_data: Path, tmp_path: Path, order: tuple[int, ...]) -> None:

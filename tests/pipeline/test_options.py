@@ -121,11 +121,6 @@ def grids(run: Run, out: Path, scene: Path) -> None:
     assert (needed, always) == (set(), {"grid.tif", "correction.tif"})
 
 
-def resample(run: Run, out: Path, scene: Path) -> None:
-    run("a", resample=True)
-    assert {p.name for p in (out / "a").glob("*_resampled.tif")} == {f"view_0{k}_resampled.tif" for k in range(3)}
-
-
 def rpc_formats(run: Run, out: Path, scene: Path) -> None:
     run("a", rpc_formats=("rpb", "geom"))
     assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
@@ -400,7 +395,7 @@ def calibration(run: Run, out: Path, scene: Path) -> None:  # what it does: test
 
 ROWS = {
     "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
-    "grids": grids, "resample": resample,
+    "grids": grids,
     "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
     "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
     "check_points": check_points,
@@ -427,7 +422,6 @@ SLOW = (
     "gcp_crs",
     "reference_sigma",
     "stop_after",
-    "resample",
     "altimetry",
     "fit",
     "add_to",
@@ -437,6 +431,7 @@ SLOW = (
 """Options that take a run or two of their own: the landing check tries them."""
 
 
+@pytest.mark.landing(5)
 @pytest.mark.parametrize(
     "name",
     [

@@ -64,6 +64,8 @@ def images(folder):
     return [f"{path},model=physical" for path in sorted(folder.glob("*.tif"))]
 
 
+@pytest.mark.costs(3)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 def test_an_adjustment_on_physical_models(folder, tmp_path):
     models = [open_camera(image).model for image in images(folder)]
@@ -173,7 +175,6 @@ def test_an_xml_alone_tells_its_size_and_that_it_holds_a_physical_model(tmp_path
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     """An attitude that swings by 100 urad at 2 Hz: a single RPC misses it by pixels."""
     cameras = []

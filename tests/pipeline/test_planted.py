@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +29,9 @@ def start(shared_data):
     return made
 
 
+@pytest.mark.costs(12)
+@pytest.mark.landing(1)
 @pytest.mark.slow
-@pytest.mark.landing(4)
 @pytest.mark.parametrize(
     ("name", "kind", "size", "view", "seed"),
     [
@@ -52,11 +54,11 @@ def test_what_is_planted_is_followed_and_named(start, tmp_path, name, kind, size
     assert found.code == 3
     assert found.error <= FOLLOWED, found.line()
     assert found.worst <= GOOD, found.line()
-    assert any(found.image in line for line in found.words), found.line()
+    where = re.compile(r"\b(rows?|columns?|lines?|RPC)\b", re.IGNORECASE)  # not what the scene or tie points do
+    assert any(found.image in line and where.search(line) for line in found.words), found.line()
 
 
-@pytest.mark.slow
-@pytest.mark.landing(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize(("view", "px"), [(1, 3.0), (0, 3.0), (2, -1.5), (1, -1.5)])
 def test_a_band_of_columns_displaced_along_the_rays_is_one_term_of_its_image(start, tmp_path, view, px) -> None:
     """Terms in the other images explain a step of the middle one as well, but for the correlated noise of matches."""
@@ -91,8 +93,7 @@ def moved(untouched: Clean, box: tuple[int, int, int, int], by: tuple[float, flo
     return views
 
 
-@pytest.mark.slow
-@pytest.mark.landing(3)
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "box", "by", "said"),
     [

@@ -15,8 +15,14 @@ from benchmarks import real_crops
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.costs(8)
 @pytest.mark.parametrize(
-    ("name", "parts"), [("whole", ((0, 1, 2), (0, 1), (0, 2), (1, 2))), ("north", ((0, 1, 2),)), ("ventoux", ((0, 1),))]
+    ("name", "parts"),
+    [
+        pytest.param("whole", ((0, 1, 2), (0, 1), (0, 2), (1, 2)), marks=pytest.mark.nightly),
+        ("north", ((0, 1, 2),)),
+        ("ventoux", ((0, 1),)),
+    ],
 )
 def test_a_real_set_is_good_and_as_near_as_a_shift(
     name: str,

@@ -114,7 +114,6 @@ def test_a_stated_sigma_is_the_scene_s(shown, options, tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_a_reference_of_another_place_moves_nothing(shown, place, options, tmp_path, capsys):
     alone = adjust(shown.images, tmp_path / "alone", replace(options, reference=()))
     flags = [
@@ -210,7 +209,6 @@ def test_a_real_image_comes_to_its_place_by_finer_and_coarser_references(quickbi
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 def test_a_geoid_that_was_left_out_is_the_reason(quickbird, shared_data, tmp_path):
     """The terrain names EGM2008, and is right without a word; the same heights in a file that names none are not."""
@@ -229,7 +227,7 @@ def test_a_geoid_that_was_left_out_is_the_reason(quickbird, shared_data, tmp_pat
     assert "jitter" not in why
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 @pytest.mark.parametrize("wrong", rest_slow(["mirrored", "of another place", "one height"], mark=pytest.mark.nightly))
 def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, shared_data, tmp_path, wrong):

@@ -103,6 +103,8 @@ def test_add_to(grown: Path) -> None:
     agree(residuals(grown, {name: by_gdal(folder / f"{name}.vrt") for name, folder in where.items()}), printed(grown))
 
 
+@pytest.mark.landing(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("of", ["triplet", "grown", "ventoux_biased"])
 def test_check_of_what_lies_on_disk_prints_what_the_run_printed(of: str, request: pytest.FixtureRequest) -> None:
     found = request.getfixturevalue(of)

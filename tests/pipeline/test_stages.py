@@ -16,6 +16,7 @@ from rasterio import Affine
 
 from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.options import AdjustOptions, RunOptions
+from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
 from barpc.pipeline import inputs
 from barpc.pipeline import run as stages
@@ -36,7 +37,6 @@ from barpc.report import Run
 from barpc.scene import Tracks, View
 from barpc.simulate import simulate_block
 from barpc.tie.reference import Accuracy
-from barpc.tie.tasks import HERE, Work
 from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
 
@@ -423,8 +423,13 @@ def test_a_stage_that_is_one_task_says_its_beginning_and_its_end(corner, tmp_pat
     told: list[tuple[str, int, int]] = []
     options = RunOptions(stop_after="adjustment")
     result = stages.adjust(corner.images[:2], tmp_path / "out", options, progress=lambda *now: told.append(now))
-    single = ("adjustment", "block", "summary", "report")
+    single = ("block", "summary", "report")
     assert [now for now in told if now[0] in single] == [(name, done, 1) for name in single for done in (0, 1)]
+    passes = [now for now in told if now[0] == "adjustment"]
+    assert passes == [
+        *(("adjustment", n, 0) for n in range(len(passes) - 1)),
+        ("adjustment", len(passes) - 2, len(passes) - 2),
+    ]
     took = [stage["stage"] for stage in result.summary["stages"]]
     assert took[-7:] == ["tie points", "adjustment", "block", "summary", "pictures", "tables", "report"]
     told.clear()

@@ -78,7 +78,7 @@ finally:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_samples_run_within_a_gigabyte_and_half_a_minute_of_one_core(tmp_path):
     command = [sys.executable, "-c", PROGRAM, "adjust", *map(str, SAMPLES), "-o", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -33,8 +33,7 @@ def test_blas_is_held_to_one_thread_and_given_back() -> None:
         keep(1)
 
 
-@pytest.mark.slow
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="the libraries of a process are told by /proc")
 @pytest.mark.parametrize("code", [RUN, COMMAND], ids=["Python", "command"])
 def test_the_threads_of_a_blas_change_no_byte(code: str, tmp_path: Path) -> None:

@@ -178,8 +178,8 @@ LEAN = {
 """File, head, a line, and how it is read."""
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
-@pytest.mark.landing(3)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is told by /proc")
 @pytest.mark.parametrize("kind", LEAN)
 def test_a_table_of_many_lines_is_read_lean_and_soon(tmp_path: Path, kind: str) -> None:
@@ -219,8 +219,7 @@ DENSE = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.landing(1)
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is told by /proc")
 @pytest.mark.parametrize("kind", DENSE)
 def test_the_densest_file_of_a_kind_takes_a_gigabyte_and_seconds_at_most(tmp_path: Path, kind: str) -> None:

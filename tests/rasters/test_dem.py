@@ -16,7 +16,7 @@ from barpc.base.geodesy import DEFAULT, STATED
 from barpc.rasters.dem import Dem, HeightGrid, datum_of, localize_on_terrain
 from barpc.rasters.vertical import Vertical, geoid_file, vertical_of
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import altitude_range
+from barpc.sensor.rpc import altitude_range
 from tests.sensor.conftest import make_rpc
 
 STEP = 0.01
@@ -96,6 +96,8 @@ def surface(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
     return 180.0 + 2000.0 * (lon - 5.0) - 900.0 * (lat - 44.0)
 
 
+@pytest.mark.landing(50)
+@pytest.mark.few(25)
 @pytest.mark.parametrize(
     ("crs", "geoid", "says"),
     [

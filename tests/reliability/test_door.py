@@ -196,6 +196,8 @@ def test_every_verb_goes_on_where_files_were_moved(project, undisturbed, tmp_pat
             assert made == files, verb
 
 
+@pytest.mark.landing(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ["run/summary.json", "run/tables/images.json"])
 def test_names_that_are_too_long_are_one_line(project, tmp_path, monkeypatch, caplog, table) -> None:
     from tests.sealing import seal

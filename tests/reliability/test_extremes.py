@@ -107,7 +107,7 @@ def test_an_inverse_that_does_not_converge_is_no_crash(monkeypatch) -> None:
 # --- files that grow --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_archive_counts_what_its_numbers_become(tmp_path: Path) -> None:
     """510 kB of bytes that are all alike would be 3.9 GB of doubles."""
     data = io.BytesIO()

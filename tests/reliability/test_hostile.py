@@ -177,6 +177,7 @@ WHOLE_RUN = (  # a run goes on to its end: two are enough before a commit
 )  # fmt: skip
 
 
+@pytest.mark.landing(6)
 @pytest.mark.few(4)
 @pytest.mark.parametrize(
     "name",
@@ -359,6 +360,7 @@ def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, tr
     assert_silent(trap, barpc("info", crops[0]), tmp_path / "out" / "applied")
 
 
+@pytest.mark.landing(2)
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=pytest.mark.slow if x in KINDS else pytest.mark.nightly) for x in CONTENTS],

@@ -78,7 +78,7 @@ def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> No
     assert after[name] != before[name]
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "stage"),

@@ -31,7 +31,7 @@ FILES = {"a.vrt": "one", "b_RPC.TXT": "two", "summary.json": "three"}
 def work(folder: Path) -> None:
     """A run as small as can be: a kept result, three outputs, the end."""
     with Workspace(folder, names=FILES) as workspace:
-        workspace.store("stage", "0" * 32, {"x": np.arange(3)})
+        workspace.store.write(f"stage/{'0' * 32}", {"x": np.arange(3)})
         for name, text in FILES.items():
             with workspace.stage(name):
                 workspace.write_text(name, text)
@@ -54,6 +54,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, when: int, c
         yield seen
 
 
+@pytest.mark.landing(5)
 @pytest.mark.parametrize(
     ("where", "name", "least"),
     [

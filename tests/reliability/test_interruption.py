@@ -32,6 +32,7 @@ def sweep(trials: int, seed: int) -> dict[str, object]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.costs(14)
 @posix
 @pytest.mark.parametrize(
     "trials", [pytest.param(2, marks=pytest.mark.slow), pytest.param(50, marks=pytest.mark.nightly)]
@@ -90,6 +91,7 @@ def wide(tmp_path_factory) -> list[Path]:
     return [crop(path, folder / path.name, side=360, start=300) for path in SAMPLES[:2]]
 
 
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @posix
 @pytest.mark.slow
@@ -134,8 +136,8 @@ def wait_until_gone(pid: int) -> None:
     pytest.fail(f"process {pid} is still there")
 
 
+@pytest.mark.nightly
 @posix
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are listed in /proc")
 def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_path):
     command = ("adjust", *wide, "-o", tmp_path / "out", "-j", 2)
@@ -152,6 +154,7 @@ def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_p
     assert outputs(tmp_path / "out") == outputs(tmp_path / "alone")
 
 
+@pytest.mark.costs(4)
 @posix
 @pytest.mark.slow
 def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):
@@ -191,7 +194,7 @@ def emptied(path: Path) -> None:
     path.write_bytes(b"")
 
 
-@pytest.mark.landing(2)
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", rest_slow([flipped, cut_short, other_content, Path.unlink, emptied]))
 def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):

@@ -173,6 +173,7 @@ def test_a_name_that_files_cannot_carry_is_refused_in_one_line(name, where, pris
         assert hashes([tmp_path]) == before
 
 
+@pytest.mark.nightly
 @pytest.mark.slow  # before a commit: names of images, and folders that are refused
 def test_folders_may_be_called_so(pristine, tmp_path):
     deep = tmp_path.joinpath(*FOLDERS)
@@ -185,6 +186,7 @@ def test_folders_may_be_called_so(pristine, tmp_path):
             assert vrt.read(1).any()
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("names", rest_slow([["#a", " b "], ["-c", '"d']]), ids=short)
 def test_lists_of_images_hold_every_name(pristine, tmp_path, names):

@@ -143,6 +143,7 @@ def test_a_report_is_made_again_only_where_it_is_barpc_s(crops, out):
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("number", rest_slow([9, 2]))
 def test_stopped_between_two_outputs_the_same_command_finishes(crops, ran, out, tmp_path, monkeypatch, number):

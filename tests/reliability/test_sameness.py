@@ -82,7 +82,7 @@ def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
     require_same(scene, tmp_path, way, [orders[0], random.Random(way).choice(orders[1:])])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_no_order_of_three_images_changes_a_byte(scene, tmp_path):
     require_same(scene, tmp_path, "the defaults", list(permutations(images_of(scene, "the defaults"))))
 
@@ -180,7 +180,7 @@ def test_the_same_pixels_in_other_dress_are_found(scene, tmp_path, how):
             load_views(order)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_vrt_with_an_rpc_of_its_own_is_the_same_image(scene, tmp_path):
     images = images_of(scene, "")
     twin = tmp_path / "twin.vrt"

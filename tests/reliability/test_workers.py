@@ -42,12 +42,13 @@ def alone(scene) -> dict[str, bytes]:
     return outputs(scene / "alone")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_rerun_gives_the_same_bytes(scene, alone):
     assert barpc(*command(scene, "again")).code == 0
     assert outputs(scene / "again") == alone
 
 
+@pytest.mark.costs(9)
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", rest_slow([2, 4], mark=pytest.mark.nightly))
 def test_any_number_of_workers_gives_the_same_bytes(scene, alone, jobs):
@@ -104,7 +105,7 @@ def cluster(tmp_path):
         process.communicate()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_cluster_gives_the_same_bytes_also_when_it_loses_a_worker(scene, alone, cluster):
     address, workers = cluster
     run = [sys.executable, "-m", "barpc", *map(str, command(scene, "dask", "-j", address))]

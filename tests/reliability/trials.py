@@ -93,7 +93,7 @@ def sweep(trials: int, seed: int, jobs: int, folder: Path) -> dict[str, object]:
     before = [sha256(path.read_bytes()).digest() for path in images]
     out, log = folder / "out", folder / "log.txt"
     command = ["-q", "adjust", *map(str, images), "-o", str(out), "-j", str(jobs)]
-    command += ["--grids", "--resample"]
+    command += ["--grids"]
     began = time.monotonic()
     code = finish(start(command, log))
     seconds = time.monotonic() - began

@@ -88,7 +88,7 @@ def store(server: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     forget()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_bucket_is_read_by_itself_and_by_workers(store: Store, tmp_path: Path) -> None:
     options = RunOptions(images="copy", allow_remote=HOSTS, tie=TieOptions(points_per_image=600), stop_after="all")
     urls = [f"s3://scenes/a/{name}" for name in NAMES[:2]]

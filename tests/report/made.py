@@ -89,8 +89,9 @@ def without_points(folder: Path, count: int, **texts: str) -> Path:
         "observations.csv": ",".join(OBSERVATION_COLUMNS),
         "residuals.csv": ",".join(RESIDUALS),
     }
+    (folder / "tables").mkdir(exist_ok=True)
     for name, text in usual.items():
-        (folder / name).write_text(texts.get(Path(name).stem, text))
+        (folder / "tables" / name).write_text(texts.get(Path(name).stem, text))
     return folder
 
 

@@ -195,7 +195,7 @@ def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float,
     if told:
         assert said == [
             "Moving objects explain the tie points that move together hardly better than displaced rows or columns of "
-            "an image: check where these tie points lie."
+            "an image. Check where these tie points lie."
         ]
 
 
@@ -208,9 +208,13 @@ def test_what_is_left_is_a_reason_where_it_is_much() -> None:
     found = adjustment(left=left)
     first, second = reasons(found)
     assert first == (
-        "In rows 100-399 of west 80 % of the tie points disagree with the rest of the image, typically by 2.5 px."
+        "In rows 100-399 of west 80 % of the tie points disagree with the rest of the image, typically by 2.5 px. "
+        "Check for clouds, water, change there."
     )
-    assert second == "In rows 100-399 of east the tie points share a residual of 0.19 px."
+    assert (
+        second
+        == "In rows 100-399 of east the tie points share a residual of 0.19 px. Check for clouds, water, change there."
+    )
     assert [one.last for one in left_entries(found)] == [399.0] * 3
     assert reasons(adjustment(left=[interval(0, 0.1, 0.05)])) == []
     assert reasons(adjustment(left=[interval(0, 0.1, 0.09)])) == []  # of less than 0.1 px: a remark
@@ -224,7 +228,7 @@ def test_rows_of_which_most_ties_move_may_be_what_is_off() -> None:
     (said,) = reasons(adjustment(left=left, changed=0.11))
     assert said == (
         "Most tie points of rows 100-399 of west, rows 100-399 of east, rows 100-399 of west, rows 100-399 of east "
-        "move together: moving objects, or a displacement of these rows that no camera models."
+        "move together: moving objects, or displaced rows. Check for clouds and water there."
     )
 
 

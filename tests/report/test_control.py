@@ -9,7 +9,8 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run, verdict
-from barpc.report.page import decisions, report_html
+from barpc.report.answers import decisions
+from barpc.report.page import report_html
 
 
 def summary_of(run: Run, gcps, **options):

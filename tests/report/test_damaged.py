@@ -88,6 +88,7 @@ def small_runs(tmp_path_factory) -> dict[str, Finished]:
     return {name: Finished(run, written(run, folder / name), folder / name) for name, run in runs.items()}
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "step"),

@@ -46,12 +46,12 @@ def test_heights_that_lie_as_far_off_as_the_geoid_seem_to_count_from_it(provenan
         return f"Give --heights {other}, or --heights {present} to confirm the present datum."
 
     assert why == (
-        f"The heights of 6 GCPs lie 46 m {side} the ground by the delivered cameras, or by other heights, and the "
-        f"geoid lies 48 m {geoid} the ellipsoid here: they seem to be above sea level. {cure('egm96', 'ellipsoidal')}"
+        f"The heights of 6 GCPs lie 46 m {side} those by the cameras or other heights; the geoid lies "
+        f"48 m {geoid} the ellipsoid here. They seem to be above sea level. {cure('egm96', 'ellipsoidal')}"
     )
     (why,) = told(block(sign * 46.0), provenance, -sign * GEOID, converted=True)
     assert (
-        f"the geoid lies 48 m {geoid} the ellipsoid here: they seem to be ellipsoidal. {cure('ellipsoidal', 'egm96')}"
+        f"the geoid lies 48 m {geoid} the ellipsoid here. They seem to be ellipsoidal. {cure('ellipsoidal', 'egm96')}"
         in why
     )
 
@@ -133,7 +133,7 @@ def test_heights_that_shift_a_scene_seen_from_one_side_by_less_than_is_known_of_
     found = [*datum_reasons([HeightDatum(source, "them", GEOID, DEFAULT)], one, lean)]
     assert len(found) == bool(aside)
     if aside:
-        assert f"the scene is up to {aside} m off horizontally, and neither" in found[0]
+        assert f"the scene is up to {aside} m off horizontally. Give " in found[0]
         assert found[0].endswith("--geoid none, or --geoid egm96." if source == "heights" else "--heights egm96.")
 
 

@@ -116,8 +116,8 @@ def scattered(adjustment):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (in_the_image, ("leave 0.950 px", "affine", "was an image resampled", "The scene may be tilted")),
-        (between_two_groups, ("{1} and {4} form two groups", "31 %", "0.42 px", "two solutions")),
+        (in_the_image, ("leave 0.950 px", "affine", "no image was resampled", "The scene may be tilted")),
+        (between_two_groups, ("{1} and {4} form two groups", "31 %", "0.42 px", "between them")),
         (scattered, ("scatter 2.6 times",)),
     ],
 )

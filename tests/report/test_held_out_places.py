@@ -54,7 +54,7 @@ def test_rows_that_only_they_contradict_are_named_and_need_a_look(run: Run, move
     assert one.rows[0] < 0.2 * height
     assert one.rows[1] < 0.3 * height
     assert one.off_px == pytest.approx(np.hypot(*move), rel=0.3)
-    assert summary.reasons == (f"{one.sentence}.",)
+    assert summary.reasons == (f"{one.sentence}. Check for clouds, water, change there.",)
     assert f"of {one.image}: check tie points there" in one.sentence
     assert f"{one.off_px:.2f} px" in one.sentence
     assert (one.far > 0.3) == (move[1] != 0.0)

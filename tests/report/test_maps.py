@@ -451,9 +451,11 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     ]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
-    assert key == f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn at twice that scale."
+    assert key == f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn twice as long."
     assert shares == [1.0, 0.0]
-    assert [caption for _, caption in charts_of] == ["A: 100 % systematic", "B: 0 % systematic"]
+    assert [caption for _, caption in charts_of] == [
+        f"{name} % of cells with a significant mean" for name in ("A: 100", "B: 0")
+    ]
     first, second = (Drawing(svg) for svg, _ in charts_of)
     assert first.box == (300, 150)
     assert first.rects("empty") == [(0, 0, 300, 150)]
@@ -474,7 +476,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
         np.array([(18.75 - length / 2, 28.125), (18.75 + length / 2, 28.125)]), abs=0.006
     )
     assert barbs[1] == pytest.approx((18.75 + length / 2, 28.12), abs=0.006)
-    assert first.described == "40 residuals are drawn; 100 % systematic."
+    assert first.described == "40 residuals are drawn; 100 % of cells with a significant mean."
     assert first.root.get("data-v") == "0"
     assert first.root[0].text == "Residuals over A"
     assert second.rects("heat") == [(262.5, 131.25, 37.5, 18.75)]

@@ -14,12 +14,12 @@ from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.report import outcome as runs
+from barpc.report.answers import decisions
 from barpc.report.measures.block import measure_scene
 from barpc.report.measures.ground_points import measure_check_points, measure_control, measure_gcps, measure_reference
 from barpc.report.measures.pairs import MAX_PER_PAIR
 from barpc.report.measures.views import _image_correction_entry, ce90, measure_views, rmse_by_view
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
-from barpc.report.page import decisions
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.views import cell_numbers
 from barpc.scene import Tracks

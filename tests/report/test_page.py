@@ -85,7 +85,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
         "Do the pairs fit for stereo, and can heights be measured?",
         "How was each camera corrected?",
         "How uncertain are position and shape of the scene?",
-        "Which decisions were made, and on which figures?",
+        "What was decided, and why?",
         "Do the new RPC files reproduce the corrected cameras?",
         "With which options, and how much data?",
     ]
@@ -161,6 +161,7 @@ def many_times(found: RunFiles, copies: int) -> RunFiles:
     return RunFiles(told, observations, np.concatenate(points), np.concatenate(tracks), outlines, thumbnails=small)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("num", rest_slow([300, 1000]))
 def test_the_page_of_many_images_is_bounded_and_says_what_it_leaves_out(block_run, monkeypatch, num):

@@ -11,14 +11,12 @@ from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
-from barpc.report.measures.views import ce90, measure_views, moved_by_clocks, moved_in_space, stated_ce90
+from barpc.report.measures.views import ce90, measure_views, moved_in_space, stated_ce90
 from barpc.report.runfiles import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import Timed, Timing
 from barpc.simulate import simulate_block
 from tests.lanes import rest_slow
-from tests.sensor.s1_product import Product
 
 MODELS = ("rotation+translation", "rotation", "translation")
 
@@ -74,7 +72,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     assert found.ce90_m == ce90(found.major_m, found.minor_m)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("model", rest_slow(MODELS, mark=pytest.mark.nightly))
 def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
     run = block_run.run
@@ -123,26 +121,6 @@ def test_errors_that_images_share_are_in_the_ellipse_of_each():
         assert one.correction.center_sigma_px == pytest.approx(sigma, rel=1e-3)
         alone = moved_in_space(*given)[1]
         assert (np.abs(sigma / alone - 1.0) > 1e-3).any() == off.any()
-
-
-def test_that_of_a_radar_is_what_its_clocks_do_to_a_place():
-    """Against differences of the whole model, one clock after the other."""
-    radar, pixel, alt = Product().model(), np.array([8000.0, 6000.0]), np.array(120.0)
-    timed = Timed(radar, Timing([[3.0, 2e-4]]))
-    covariance = np.array([[0.5, 0.3, 9.0], [0.3, 1.2, 9.0], [9.0, 9.0, 9.0]])  # range and along the flight first
-    at = timed.localize(pixel, alt)
-    moved, sigma, found = moved_by_clocks(timed, covariance, at)
-    steps = [(0.5, 0.0), (0.0, 0.5 / radar.speed)]  # half a metre to each side
-    ahead, behind = ([Timed(radar, Timing([[3.0 + s * m, 2e-4 + s * n]])) for m, n in steps] for s in (1.0, -1.0))
-    there, here = (np.array([one.localize(pixel, alt) for one in side]) for side in (ahead, behind))
-    by_clock = ((there - here) * metres_per_unit(at))[:, :2].T
-    values, axes = np.linalg.eigh(by_clock @ covariance[:2, :2] @ by_clock.T)
-    assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=1e-3)
-    assert found.azimuth_deg == pytest.approx(np.degrees(np.arctan2(*axes[:, 1])) % 180.0, abs=0.1)
-    assert found.ce90_m == ce90(found.major_m, found.minor_m)
-    in_image = np.array([a.project(at) - b.project(at) for a, b in zip(ahead, behind, strict=True)]).T
-    assert sigma**2 == pytest.approx(np.diag(in_image @ covariance[:2, :2] @ in_image.T), rel=1e-3)
-    assert moved == pytest.approx(pixel - radar.project(at), abs=1e-6)
 
 
 def test_what_is_stated_is_taken_from_where_the_priors_take_it(block_run):

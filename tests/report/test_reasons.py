@@ -49,6 +49,7 @@ def test_an_option_in_a_remedy_is_one_of_its_table():
     assert "min_overlap" in declared(TieOptions)
 
 
+@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_every_flag_that_any_message_names_exists_in_some_verb():
     known = {"--help", "--version"}.union(
@@ -71,7 +72,9 @@ def reason(run: Any = None, **fields: Any) -> tuple[str | None, str]:
 def test_most_tie_points_rejected_is_a_contradiction_and_no_lack_of_overlap():
     cause, advice = reason(num_observations=3, num_rejected=290)
     assert cause == "contradicted"
-    assert advice.startswith("99 % of its tie points were rejected, as they contradict those of the other images: ")
+    assert advice.startswith(
+        "99 % of its tie points were rejected, as they contradict those of the other images. Check "
+    )
     assert "IMAGE,camera=FILE" in advice
     assert "overlap" not in advice
     assert reason(num_observations=0, num_rejected=30)[0] == "contradicted"
@@ -87,7 +90,7 @@ def test_wrong_matches_are_told_from_what_is_off_together():
     anywhere = run_of(adjusted(alike=np.array([5.0, 9.0, 9.0]), **noisy))
     cause, advice = reason(anywhere, num_observations=60, num_rejected=290)
     assert cause == "wrong_matches"
-    assert "83 % of its tie points were rejected, with neighbouring errors in random directions" in advice
+    assert "83 % of its tie points were rejected; neighbours err in random directions" in advice
     assert "residuals of 4.50 px" in advice
     assert reason(anywhere, num_observations=60, num_rejected=10)[0] == "held_out"
 
@@ -96,7 +99,7 @@ def test_an_image_beside_one_that_contradicts_is_sent_to_it():
     noisy = {"held_out_noise": np.array([9.0, 1.0, 1.0]), "held_out_rms": np.array([4.5, 0.1, 0.1])}
     cause, advice = reason(run_of(adjusted(**noisy), beside={0: 2}))
     assert cause == "beside"
-    assert "observed in C, too" in advice
+    assert "seen in C, too" in advice
 
 
 def test_where_tie_points_contradict_is_said_of_the_image_and_not_again_of_the_block():
@@ -107,7 +110,7 @@ def test_where_tie_points_contradict_is_said_of_the_image_and_not_again_of_the_b
     cause, advice = reason(run, name=name)
     assert cause == "place"
     assert advice.startswith(
-        "in rows 100-399 80 % of the tie points disagree with the rest of the image, typically by "
+        "In rows 100-399 80 % of the tie points disagree with the rest of the image, typically by "
     )
     cause, advice = reason(run, name=name, num_observations=60, num_rejected=90)
     assert cause == "rejected"  # it is a part of the image that is off, and so its RPC is its own
@@ -118,10 +121,10 @@ def test_columns_that_lie_off_over_all_rows_are_no_clouds():
     columns = Interval(0, 0, 100.0, 400.0, 30.0, 0.02, 0.16, False, 0.0)
     names = tuple(found_by_judge(left=[]).names)
     for one, told in (
-        (columns, "in columns 100-399, over all rows the tie points share a residual of 0.16 px: check for "
+        (columns, "In columns 100-399, over all rows the tie points share a residual of 0.16 px. Check for "
          "detectors or resampling"),
-        (replace(columns, share=0.8, by_share=True, apart=2.5), "check for clouds, water, change there"),
-        (replace(columns, axis=1), "check for clouds, water, change there"),
+        (replace(columns, share=0.8, by_share=True, apart=2.5), "Check for clouds, water, change there"),
+        (replace(columns, axis=1), "Check for clouds, water, change there"),
     ):  # fmt: skip
         run = run_of(adjusted(left=[one], names=names), number={name: k for k, name in enumerate(names)})
         assert reason(run, name=names[0])[0] == "place"
@@ -131,8 +134,8 @@ def test_columns_that_lie_off_over_all_rows_are_no_clouds():
 @pytest.mark.parametrize(
     ("matched", "cause", "words"),
     [
-        ((), "untied", "no tie points connect it to the main group of images, and its camera"),
-        ((("B", "C"),), "no_overlap", "no pair with it was selected for matching"),
+        ((), "untied", "No tie points lead to the main group of images, and the camera"),
+        ((("B", "C"),), "no_overlap", "No pair was selected for matching"),
         ((("A", "C"), ("B", "C")), "untied", "(1 pair with it tried)"),
         ((("A", "C"), ("A", "B")), "untied", "(2 pairs with it tried)"),
     ],

@@ -52,6 +52,9 @@ def test_a_pair_with_a_jump_says_by_how_much_heights_behind_are_off() -> None:
     assert not summarize(run).passed
 
 
+@pytest.mark.costs(4)
+@pytest.mark.landing(1)
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("lines", "word"), [(3.0, "3 lines were lost"), (-5.0, "5 lines were repeated")])
 def test_a_whole_number_of_lines_is_lost_and_heights_behind_are_right(lines: float, word: str) -> None:
@@ -64,7 +67,7 @@ def test_a_whole_number_of_lines_is_lost_and_heights_behind_are_right(lines: flo
     assert summarize(run).passed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_rows_displaced_in_both_coordinates_are_no_lost_lines() -> None:
     made = simulate_block(3, 1000, seed=0, per_site=3, size=(600, 600), attitude=5e-6, position=0.3, noise=0.05)
     xy = made.tracks.xy.copy()
@@ -73,7 +76,7 @@ def test_rows_displaced_in_both_coordinates_are_no_lost_lines() -> None:
     assert [one.kind for one in found.findings] == ["step"]
 
 
-@pytest.mark.parametrize(("lines", "views"), [(3.0, 3), (0.0, 2)])
+@pytest.mark.parametrize(("lines", "views"), [pytest.param(3.0, 3, marks=pytest.mark.nightly), (0.0, 2)])
 def test_a_third_image_sees_it_and_where_nothing_jumped_nothing_is_said(lines: float, views: int) -> None:
     run, _ = jumped(lines, views)
     assert not [part for i in range(views) for part in unseen_parts(run, i)]

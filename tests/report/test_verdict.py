@@ -36,7 +36,7 @@ def test_a_check_of_wrong_cameras_says_to_adjust_them(check_run):
     summary = check_run.summary
     assert summary["status"] == "look"
     assert summary["headline"] == "9 images need review (of 9)."
-    assert all(view["advice"].endswith("adjust the cameras") for view in summary["views"])
+    assert all(view["advice"].endswith("Adjust the cameras") for view in summary["views"])
     assert not summary["passed"]
 
 
@@ -52,7 +52,7 @@ def test_a_view_with_few_tie_points_is_weakly_tied():
     assert view["status"] == "weak"
     assert str(view["num_observations"]) in view["advice"]
     assert summary["headline"] == "1 image needs review (of 4)."
-    assert any(line.startswith(f"{view['name']}: weakly connected: only") for line in summary["verdict"])
+    assert any(line.startswith(f"{view['name']}: weakly connected. Only") for line in summary["verdict"])
 
 
 def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
@@ -71,18 +71,18 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
 @pytest.mark.parametrize(
     ("placed", "scale", "status", "said"),
     [
-        (None, 1.0, "failed", "its RPC does not match the image: with its axes swapped"),
+        (None, 1.0, "failed", "Its RPC does not match the image: with its axes swapped"),
         (
             SimpleNamespace(covariance=0.04 * np.eye(9)),
             1.0,
             "doubtful",
-            "its RPC does not match the image: with its axes",
+            "Its RPC does not match the image: with its axes",
         ),
         (
             SimpleNamespace(covariance=0.04 * np.eye(9)),
             33.0,
             "doubtful",
-            "its RPC is 33 times less accurate than",
+            "Its RPC is 33 times less accurate than",
         ),
     ],
 )

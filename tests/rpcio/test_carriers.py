@@ -316,7 +316,7 @@ def ended(words: list[str]) -> int:
     return int(end.value.code or 0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_run_of_such_images_is_that_of_the_tiffs(tmp_path: Path) -> None:
     samples = Path(__file__).parents[2] / "data_samples"
     given, plain = [], []

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.windows import Window
 
 from barpc.base.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
 from barpc.base.safe_io import Kind
 from barpc.rasters.raster import open_raster
-from barpc.rpcio import FORMATS, grids, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
@@ -34,8 +33,7 @@ from barpc.rpcio.images import (
     write_crop,
 )
 from barpc.rpcio.sources import hidden_by, metadata_beside, shadows, sidecars
-from barpc.rpcio.text import DIRECT, collect_numbered, listed_numbers, number
-from barpc.rpcio.xml import rpc_domain
+from barpc.rpcio.text import collect_numbered, listed_numbers, number
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import RPC
@@ -262,7 +260,6 @@ def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
         lambda **how: write_rpc_vrt(rpc, image, path, **how),
         lambda **how: write_rpc_copy(rpc, image, path, **how),
         lambda **how: write_crop(rpc, image, path, (0, 0, 5, 5), **how),
-        lambda **how: grids.write_resampled(rpc, none, image, path, **how),
         lambda **how: write_correction(none, rpc, path, **how),
         lambda **how: write_grid(nodes, path, **how),
     ):
@@ -272,58 +269,6 @@ def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
         assert path.read_text() == "mine"
         write(overwrite=True)
         assert path.read_bytes() != b"mine"
-
-
-def test_an_image_of_one_column_is_resampled(tmp_path: Path) -> None:
-    image = write_image(tmp_path / "a.tif", (1, 40, 1), dtype="uint8")
-    down = CorrectionGrid([0.0, 1.0], [0.0, 39.0], np.full((2, 2, 2), [0.0, 3.0]))
-    grids.write_resampled(make_rpc(), down, image, tmp_path / "b.tif")
-    np.testing.assert_array_equal(pixels(tmp_path / "b.tif")[0, :-3, 0], pixels(image)[0, 3:, 0])
-
-
-@pytest.mark.parametrize(("far", "ok"), [(4096, True), (4097, False)])
-def test_a_block_is_made_of_4096_pixels_a_side_at_most(far: int, ok: bool, tmp_path: Path, monkeypatch) -> None:
-    """Of a row that is stretched: the last column of the block, 16 px around it and itself."""
-    monkeypatch.setattr(grids, "BLOCK_SIZE", 16)
-    image = write_image(tmp_path / "a.tif", (1, 16, 9000), dtype="uint8")
-    cols, rows = np.array([0.0, 15.0]), np.array([0.0, 15.0])
-    shift = np.zeros((2, 2, 2))
-    shift[:, 1, 0] = far - 16 - 1.5 - 15.0  # column 15 is taken from there, column 0 from column 0
-    lacking = CorrectionGrid(cols, rows, shift)
-    with open_raster(image) as dataset, open_raster(image) as same:
-        if ok:
-            taken = []
-            monkeypatch.setattr(grids, "_stored", lambda values, *_: taken.append(values) or values)
-
-            class Out:
-                mask_flag_enums, colorinterp = same.mask_flag_enums, same.colorinterp
-
-                def write(self, *_: object, **__: object) -> None: ...
-
-            grids._resample_block(dataset, Out(), Window(0, 0, 16, 16), lacking)
-            source = dataset.read(1)
-            np.testing.assert_allclose(taken[0][:, 0], source[:, 0], atol=1e-6)
-        else:
-            with pytest.raises(ImageError, match="spreads a block over 4097 px is none"):
-                grids._resample_block(dataset, None, Window(0, 0, 16, 16), lacking)
-
-
-@pytest.mark.parametrize(
-    ("kind", "nodata", "given", "kept"),
-    [
-        ("uint8", 0, [0.4, 0.6, -3.0, 300.0], [1, 1, 1, 255]),
-        ("uint8", 255, [254.6, 254.4, 300.0, 1.0], [254, 254, 254, 1]),
-        ("int16", -7, [-7.2, -6.4, -8.0, 4e4], [-6, -6, -8, 32767]),
-        ("uint8", None, [0.4, 0.6, -3.0, 300.0], [0, 1, 0, 255]),
-        ("float32", -1.0, [-1.0, 0.25, 3e9, 7.0], [-1.0, 0.25, 3e9, 7.0]),
-    ],
-)
-def test_a_known_pixel_is_rounded_cut_and_never_nodata(kind, nodata, given, kept) -> None:
-    shown = np.array([True, True, True, True, False])
-    values = grids._stored(np.array([*given, 9.0]), shown, np.dtype(kind), nodata)
-    assert values.dtype == kind
-    assert values[:4].tolist() == np.array(kept, kind).tolist()
-    assert values[4] == (9.0 if nodata is None else nodata)
 
 
 # --- files beside an image -------------------------------------------------------------------------------------
@@ -630,10 +575,3 @@ def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, mo
                 read_correction(path)
         else:
             assert read_correction(path)[0] == make_rpc()
-
-
-def test_the_element_of_an_rpc_holds_its_localisation_where_there_is_one() -> None:
-    rpc = make_rpc()
-    both = replace(rpc, direct=np.tile(rpc.coeffs[0], (len(DIRECT), 1)))
-    assert [key in rpc_domain(both) for key in DIRECT] == [True] * len(DIRECT)
-    assert not any(f'"{key}"' in rpc_domain(replace(both, direct=None)) for key in DIRECT)

@@ -284,7 +284,7 @@ def by_line(text):
     return row, col, lat, lon, alt, np.array(values[10:]).reshape(4, 20)
 
 
-@pytest.mark.parametrize("changes", [{}, {"err_bias": None, "err_rand": None}, {"direct": np.full((4, 20), 0.25)}])
+@pytest.mark.parametrize("changes", [{}, {"err_bias": None, "err_rand": None}])
 def test_a_reader_that_goes_by_the_line_finds_every_number(changes, tmp_path):
     rpc = replace(make_rpc(), **changes)
     write_rpc(rpc, tmp_path / "a_RPC.TXT")

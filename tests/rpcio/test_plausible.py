@@ -166,7 +166,7 @@ def test_pictures_that_were_changed_under_their_rpc_need_a_look(
     found = barpc.adjust(sorted(tmp_path.glob("*.tif")), tmp_path / "run", points_per_image=400)
     assert found.record.status == "look"
     assert {view.cause for view in found.record.views} == {"other_pixels"}
-    assert all("its RPC was made for 1000 x 1000 px" in reason for reason in found.record.reasons[:2])
+    assert all("Its RPC was made for 1000 x 1000 px" in reason for reason in found.record.reasons[:2])
 
 
 def test_the_folder_of_a_run_is_no_image_and_its_images_are_adjusted(tmp_path: Path) -> None:

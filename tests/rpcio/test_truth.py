@@ -14,8 +14,7 @@ from barpc.base.errors import ImageError, RpcFormatError
 from barpc.base.geodesy import Array
 from barpc.pipeline.verify_outputs import CONSUMERS, verify
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
-from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, altitude_range
 from tests.lanes import rest_slow
 
 PRINTED = 0.51e-7

@@ -214,7 +214,7 @@ def test_the_line_method_finds_the_camera_centre_of_small_images_within_two_perc
         assert found.altitude == pytest.approx(shot.look.altitude, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_three_views_of_600_pixels_take_seconds(tmp_path):
     start = time.process_time()
     write_scene(tmp_path / "scene", ImageOptions(size=(600, 600)))

@@ -59,8 +59,7 @@ def cast(sensor, terrain, image, step=0.02):
     return found
 
 
-@pytest.mark.landing(2)
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("count", [100, pytest.param(300, marks=pytest.mark.nightly)])
 def test_altitudes_are_those_of_brute_force_ray_casting(sensor, surface, count):
     """Where the tracer and 2 cm steps along the exact line of sight differ, it is on an edge of a building."""

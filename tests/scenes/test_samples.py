@@ -35,7 +35,7 @@ def test_the_samples_carry_the_cameras_that_the_command_makes(scene):
         assert np.allclose(view["rotation"], shot.correction.rotation, rtol=1e-12, atol=0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_samples_have_the_pixels_that_the_command_renders(scene):
     numbers = scene.picture(1).numbers.astype(int)
     with rasterio.open(SAMPLES / "view_01.tif") as dataset:

@@ -21,7 +21,6 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import range_doppler
 from barpc.sensor.sicd import open_sicd
 from barpc.sensor.terrasar import open_terrasar
-from barpc.sensor.timing import Timed, Timing
 from barpc.simulate import Look, fly
 from tests.sensor.radar_documents import document
 from tests.sensor.s1_product import Product
@@ -101,13 +100,6 @@ def _terrasar(lon: float) -> Case:
     return Case(model, model.size, model.alt_range)
 
 
-def _timed(case: Case) -> Case:
-    """Clocks that are off by metres and by parts of a millisecond, and go."""
-    middle = case.size[case.model.azimuth_axis] / 2
-    timing = Timing([[4.0, -3e-4], [0.5, 2e-5], [-0.1, 1e-5]], middle, middle)
-    return Case(Timed(case.model, timing), case.size, case.alt_range)
-
-
 def _grid(lon: float) -> DirectGrid:
     cols, rows, alts = (
         np.arange(-500.0, 21000, 1000),
@@ -150,8 +142,6 @@ MODELS: dict[str, Callable[[], Case]] = {
         (20000, 19000),
         (0.0, 1000.0),
     ),
-    "clocks of a Range-Doppler model": lambda: _timed(_range_doppler(5.4)),
-    "clocks of a SICD image": lambda: _timed(_sicd("PLANE")),
     "rpc and what it lacks": lambda: Case(Displaced(make_rpc(), _lacking()), (20000, 19000), (0.0, 1000.0)),
     "pushbroom": lambda: Case(_pushbroom(5.4), (20000, 19000), (0.0, 1000.0)),
     "pushbroom across the antimeridian": lambda: Case(_pushbroom(180.0), (20000, 19000), (0.0, 1000.0)),

@@ -132,7 +132,7 @@ def test_no_tracks_give_no_points():
 def test_the_line_method_finds_the_orbit_of_the_pleiades_crops(shared_data):
     rasterio = pytest.importorskip("rasterio")
     from barpc.rpcio import read_rpc
-    from barpc.sensor.geometry import altitude_range
+    from barpc.sensor.rpc import altitude_range
 
     for path in sorted((shared_data / "optical/phr_triplet_north").glob("*.tif")):
         rpc = read_rpc(path)

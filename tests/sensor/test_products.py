@@ -22,7 +22,6 @@ from barpc.sensor.sentinel1 import (
     open_product,
     read_annotation,
 )
-from barpc.sensor.timing import Timing
 from tests.sensor.s1_product import GRD, INTERVAL, IW, LATE, SAMPLING, START, STRIPMAP, Product
 
 XML = {name: product.xml() for name, product in IW.items()}
@@ -239,8 +238,6 @@ def test_the_model_of_a_swath_has_the_numbers_of_its_annotation(first):
     assert model.advice == ""
     assert GRD.model().all_ground is None
     assert "take the SLC of the scene" in GRD.model().advice
-    velocity = IW["IW1"].state(0.5 * model.size[1] * INTERVAL)[1]
-    assert model.speed == pytest.approx(np.linalg.norm(velocity), rel=1e-9)
     for words in ("21576 x 12236 px from 2021-02-16T15:12:07, looks right, for", "-100 to 900 m"):
         assert words in repr(replace(model, alt_range=(-100.0, 900.0)))
 
@@ -451,10 +448,3 @@ def test_slant_range_columns_and_rows_count_time():
     np.testing.assert_allclose(image, [[6.0], [500.0]], rtol=1e-9)
     np.testing.assert_array_equal(slope[..., 0], [[0.0, 6e7], [500.0, 0.0]])
     np.testing.assert_allclose(frame.times(image), [[1.0], [5.0001e-3]], rtol=1e-14)
-
-
-def test_a_timing_in_rows_becomes_one_in_seconds():
-    model = IW["IW1"].model()
-    timed = model.timed(Timing([[1.0, 2e-4], [0.1, 0.0]], 6000.0, 3000.0))
-    assert timed.delays.timing == Timing([[1.0, 2e-4], [0.1, 0.0]], 6000.0 * INTERVAL, 3000.0 * INTERVAL)
-    assert replace(timed, delays=model.delays) == model

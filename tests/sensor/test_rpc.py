@@ -283,23 +283,6 @@ def test_a_window_of_coarser_pixels_counts_from_its_own_corner():
     assert rpc.window(400.0, 30.0, 2.0, 1.0) != rpc.crop(400.0, 30.0)
 
 
-def test_a_localisation_rpc_is_a_quotient_of_cubics_of_col_row_and_altitude():
-    rng = np.random.default_rng(4)
-    direct = rng.normal(0, 0.02, (4, 20))
-    direct[1::2, 0], direct[0, 1], direct[2, 2] = 1.0, 1.0, -1.0
-    rpc = replace(make_rpc(), direct=direct)
-    image, alt = box(rpc, 1.0, 30)
-    x = np.column_stack([(image - rpc.image_offset) / rpc.image_scale, (alt - 500.0) / 500.0]).T
-    lon_num, lon_den, lat_num, lat_den = direct @ monomials(x)
-    expected = np.column_stack([5.4 + 0.12 * lon_num / lon_den, 43.2 + 0.09 * lat_num / lat_den, alt])
-    np.testing.assert_allclose(rpc.localize_direct(image, alt), expected, rtol=1e-13)
-    with pytest.raises(RpcError, match="without a localisation RPC"):
-        make_rpc().localize_direct(image, alt)
-    for wrong in (np.zeros((4, 20)), direct[:2], direct * [[1.0], [0.0], [1.0], [1.0]]):
-        with pytest.raises(RpcError, match="direct"):
-            replace(rpc, direct=wrong)
-
-
 def test_a_crop_and_a_window_of_step_one_are_the_same_to_the_bit():
     rpc = make_rpc()
     assert rpc.crop(12.5, 7.0) == rpc.window(12.5, 7.0)

@@ -120,7 +120,7 @@ def test_a_layout_without_overlap_is_refused_in_one_line():
         simulate_block(4, 100, outliers=2.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_thousand_views_are_simulated():
     block = simulate_block(1000, 20000)
     assert len(block.views) == 1000

@@ -15,8 +15,7 @@ from scipy import ndimage
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import View
-from barpc.sensor.geometry import altitude_range
-from barpc.sensor.rpc import RPC
+from barpc.sensor.rpc import RPC, altitude_range
 from barpc.tie import TieResult, find_tracks
 from tests.scenes import ImageOptions, Scene
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
+from barpc.base.tasks import Work, store_of
 from barpc.scene import Tracks, View
 from barpc.tie.matchers.features import Keypoints, locate
 from barpc.tie.pairing.overlaps import EVERYWHERE, Pair, Scope, best_pairs, possible_pairs
-from barpc.tie.tasks import Work, store_of
 
 
 def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:

@@ -282,7 +282,7 @@ def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
     all_inside(scene, find_tracks(scene.views, scope=Scope(area=area)).tracks, scene.tied.tracks, area)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path, monkeypatch) -> None:
     scene = render(views=2, size=(450, 450))
     views = [in_blocks(view, tmp_path) for view in scene.views]  # strips are read whole

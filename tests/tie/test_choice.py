@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from barpc.base.options import RunOptions
+from barpc.base.tasks import Store, Work
 from barpc.pipeline import adjust
 from barpc.scene import connected_groups
 from barpc.tie import Scope, TieOptions, find_tracks, tracks
@@ -28,7 +29,6 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
     twice_tied,
 )
-from barpc.tie.tasks import Store, Work
 from tests.lanes import diagonal, rest_slow
 from tests.scenes.dates import Years
 from tests.tie.stages import select_pairs
@@ -253,6 +253,7 @@ def test_the_one_chain_through_forty_dates_is_found_at_once(monkeypatch) -> None
     assert len(set(looks.compared)) == len(looks.compared) <= 40 * 39 / 2
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "said",

@@ -144,6 +144,7 @@ BANDS = (
 )
 
 
+@pytest.mark.landing(2)
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("content", "axis", "first", "last"), BANDS)
 def test_bands_of_a_real_image_are_told_and_water_is_not(triplet, tmp_path, content, axis, first, last) -> None:
@@ -196,6 +197,7 @@ def test_few_keypoints_are_counted_in_fewer_parts() -> None:
     assert all(one.axis == 1 and one.first >= 440 and one.last <= 840 for one in known)
 
 
+@pytest.mark.nightly
 def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
     scene = render(views=3, size=(300, 300))
     for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):

@@ -16,7 +16,7 @@ from barpc.verbs.moving import moved
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")]
 
 
-@pytest.mark.landing(2)
+@pytest.mark.nightly
 @pytest.mark.parametrize("off", [(0.0, 0.0), (150.0, 0.0), (400.0, -300.0), (-700.0, 500.0)])
 def test_cameras_far_off_are_found_on_an_orthoimage(shared_data: Path, off: tuple[float, float]) -> None:
     folder = shared_data / "cross_sensor/ngi_2015"
@@ -31,6 +31,7 @@ def test_cameras_far_off_are_found_on_an_orthoimage(shared_data: Path, off: tupl
     np.testing.assert_allclose(match.offset, off, atol=0.5)
 
 
+@pytest.mark.nightly
 def test_an_orthoimage_of_another_place_is_refused(shared_data: Path) -> None:
     folder = shared_data / "cross_sensor/ngi_2015"
     file = folder / "ngi_05_0182.tif"

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
+from barpc.base.tasks import Work, store_of
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate, quota
 from barpc.tie.pixels import survey, tiles
-from barpc.tie.tasks import Work, store_of
 from barpc.workspace import Workspace
 from tests.constants import Sized, chosen
 from tests.tie.stages import detect

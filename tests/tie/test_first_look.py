@@ -171,7 +171,7 @@ def test_images_of_several_dates_are_looked_at_closely_at_once(scene, looks) -> 
     assert looks == [False]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_check_points_of_real_images_are_met_as_with_all_their_detail(triplet, triplet_ties) -> None:
     every = find_tracks(triplet, TieOptions(points_per_image=20_000))
     assert triplet_ties.tracks.num_points < 0.6 * every.tracks.num_points

@@ -78,6 +78,7 @@ def shifted(scene: Rendered, by: tuple[float, float]) -> dict[tuple[int, int], M
     return {(0, 1): replace(given, xy=given.xy + np.array([[0.0, 0.0], by]))}
 
 
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("count", rest_slow((13, 6, 500)))
 def test_false_matches_are_as_none_given_and_that_is_said(render, caplog, count: int) -> None:
     scene = render(views=2, size=(300, 300))
@@ -87,6 +88,7 @@ def test_false_matches_are_as_none_given_and_that_is_said(render, caplog, count:
     assert re.search(rf"of {count} matches given 0 are verified \(.*\): own are used, ok, \d\d\d", caplog.text)
 
 
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("by", rest_slow(((3.0, -4.0), (-30.0, 0.0), (0.0, 9.0))))
 def test_matches_that_agree_with_each_other_and_with_no_pixel_give_way_to_own_ones(render, caplog, by) -> None:
     """As those of other crops, or of another pair, do: their epipolar lines are straight, and elsewhere."""

@@ -249,7 +249,7 @@ def frames(xy: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.concatenate([scale * np.eye(2), xy[..., None]], axis=3)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_example_of_the_manual_runs_with_what_has_kornias_interface(render, monkeypatch) -> None:
     feature = types.ModuleType("kornia.feature")
     feature.DISK, feature.LightGlueMatcher, feature.laf_from_center_scale_ori = Disk, LightGlueMatcher, frames

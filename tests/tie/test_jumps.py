@@ -9,6 +9,7 @@ import pytest
 from scipy.ndimage import shift
 
 from barpc.base.options import TieOptions
+from barpc.base.tasks import HERE
 from barpc.rasters.raster import open_raster
 from barpc.scene import View
 from barpc.tie import find_tracks
@@ -17,7 +18,6 @@ from barpc.tie.matchers.matcher import Matches
 from barpc.tie.matchers.matching import _PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.tasks import HERE
 from benchmarks.planted import Plant
 from tests.tie.conftest import Rendered, write_image
 from tests.tie.stages import common_tracks

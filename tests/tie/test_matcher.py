@@ -91,6 +91,7 @@ def matcher(request, monkeypatch) -> str:
     return "another"
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "side"), [(2, 300), pytest.param(3, 600, marks=pytest.mark.nightly)])
 def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher, number: int, side: int) -> None:

@@ -261,8 +261,8 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
 
 
 def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(render) -> None:
+    from barpc.base.tasks import Store, Work, store_of
     from barpc.tie.matchers.features import locate
-    from barpc.tie.tasks import Store, Work, store_of
 
     scene = render(views=2, size=(300, 300))
     pair = tuple(scene.views)

@@ -56,6 +56,7 @@ def laid(view: View, how: str, folder: Path) -> View:
     return replace(view, path=str(write_image(folder / f"{view.name}.tif", pixels)), size=pixels.shape[::-1])
 
 
+@pytest.mark.landing(4)
 @pytest.mark.parametrize("how", rest_slow(LAID, 2))
 def test_a_picture_that_lies_otherwise_is_named_and_how(render, tmp_path, how: str) -> None:
     scene = render(views=3, size=(300, 300))
@@ -70,8 +71,9 @@ def test_a_picture_that_lies_otherwise_is_named_and_how(render, tmp_path, how: s
     assert caught.value.groups == (tuple(v.name for k, v in enumerate(views) if k != wrong), (name,))
 
 
+@pytest.mark.costs(7)
+@pytest.mark.landing(1)
 @pytest.mark.slow
-@pytest.mark.landing(3)
 @pytest.mark.parametrize("how", LAID)
 def test_so_it_is_among_real_images(triplet, ventoux, tmp_path, how: str) -> None:
     views = [triplet[0], laid(triplet[1], how, tmp_path), triplet[2]]
@@ -127,7 +129,7 @@ def test_images_that_are_right_are_not_asked(render, triplet, ventoux, monkeypat
         assert find_tracks(views).tracks.num_points > 200
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pictures_of_nothing_in_common_lie_no_how(render, tmp_path) -> None:
     first, second = render(views=2, size=(300, 300)).views
     noise = np.random.default_rng(1).integers(100, 3000, (300, 300)).astype(np.uint16)

@@ -50,7 +50,7 @@ def triplet_spread(triplet) -> dict[tuple[int, int], float]:
     return raw_spread(triplet)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("i", "j"), PAIRS)
 def test_the_spread_across_epipolar_lines_is_a_twelfth_of_a_pixel_and_under_half_the_detectors(
     triplet, triplet_ties: TieResult, triplet_spread, i: int, j: int
@@ -77,6 +77,7 @@ def test_registration_more_than_halves_the_spread_of_keypoints_on_steep_ground(v
     assert robust_spread(residual) <= 0.45 * raw_spread(ventoux)[0, 1]
 
 
+@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_matches_are_many_and_hardly_any_is_false(triplet, triplet_ties: TieResult, every_tie) -> None:
     areas = [w * h / 1e6 for w, h in (view.size for view in triplet)]

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
+from barpc.base.tasks import HERE
 from barpc.pipeline.loading import load_views
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
@@ -30,7 +31,6 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
-from barpc.tie.tasks import HERE
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
@@ -88,6 +88,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
     return replace(view, sensor=replace(sensor, image_offset=sensor.image_offset + px))
 
 
+@pytest.mark.costs(7)
 @pytest.mark.slow
 @pytest.mark.parametrize("px", rest_slow([(120.0, -90.0), (0.0, 0.0)], mark=pytest.mark.nightly))
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):
@@ -113,7 +114,7 @@ def read_rpc_of(truth, name: str) -> RPC:
     return RPC(**{key: np.array(value) for key, value in record.items()})
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem, reference, truth, tmp_path):
     there = str(write_reference(tmp_path / "ref.tif", scene, season, GSD, shift=(6.0, -4.0)))
     first, second = (register_views(views, [path], dem, accuracy=Accuracy(5.0)) for path in (reference, there))
@@ -142,7 +143,7 @@ def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, sea
     assert found.views[0].peak == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     with rasterio.open(reference) as file:
         pixels, profile, place = file.read(1), file.profile, file.transform

@@ -11,7 +11,8 @@ import pytest
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import altitude_range, epipolar_offset
+from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.rpc import altitude_range
 from barpc.tie import Matches, Pair, Scope, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
@@ -249,6 +250,7 @@ def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray
     return float(np.median(ours) - np.median(theirs))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("left", "right"),
@@ -275,6 +277,7 @@ def test_real_crops_of_a_few_hundred_pixels_are_tied_at_any_two_resolutions(
     assert ("by keypoints" in result.pairs[0].means) == (coarsest.max() == 4 and coarsest.min() == 4)
 
 
+@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("swapped", rest_slow([False, True], mark=pytest.mark.nightly))
 def test_a_multispectral_image_is_tied_to_the_panchromatic_one_of_the_other_view(

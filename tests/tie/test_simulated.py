@@ -53,7 +53,7 @@ def test_the_true_error_is_below_a_twelfth_of_a_pixel_in_both_directions(render,
         assert np.abs(bias).max() <= 0.005 * 600 / side
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "conditions",
     [
@@ -99,6 +99,7 @@ def _unpickled(task: bytes):
     return pickle.loads(pickle.dumps(function(*args, **rest)))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("workers", "number", "side"),

@@ -16,6 +16,7 @@ import pytest
 
 import barpc.tie.pixels as reading
 from barpc.base.errors import ImageError, InputError
+from barpc.base.tasks import Store, Work
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions, find_tracks
@@ -23,7 +24,6 @@ from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, detect_tile, keep_tile, locate
 from barpc.tie.patches.register import _usual
 from barpc.tie.pixels import Survey, read_picture, survey, tiles
-from barpc.tie.tasks import Store, Work
 from barpc.workspace import Workspace
 from tests.constants import Sized
 from tests.lanes import diagonal, rest_slow
@@ -60,6 +60,7 @@ def left(xy: np.ndarray) -> float:
     return float(np.mean(xy[:, 0] < SIDE / 2))
 
 
+@pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("most", "zoom"),

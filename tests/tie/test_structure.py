@@ -57,6 +57,7 @@ def tied(winter):
     return find_tracks(winter)
 
 
+@pytest.mark.costs(7)
 @pytest.mark.slow
 def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, tied) -> None:
     report = tied.pairs[0]
@@ -79,14 +80,14 @@ def test_the_same_images_give_the_same_bytes(winter) -> None:
     assert one.xy.tobytes() == two.xy.tobytes()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_place_is_refused(render, winter) -> None:
     other = render(views=2, seed=5).views[1]
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
         find_tracks([winter[0], replace(winter[1], path=other.path)], TieOptions(matcher=STRUCTURE, search=90.0))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     scene = render(views=2)
     found = find_tracks(scene.views, TieOptions(matcher=STRUCTURE))
@@ -350,7 +351,7 @@ def redrawn_pair(shared_data, folder: Path, change) -> list[View]:
     return list(load_views([source / "img_02.tif", path]).views)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_lines_that_coarser_pictures_lose_tie_a_pair_where_it_lies(shared_data, tmp_path) -> None:
     """Half of what snow leaves has grown anew, the rest is turned over: check points of the images as they were."""
     views = redrawn_pair(shared_data, tmp_path, lambda pixels: pixels)

@@ -74,6 +74,7 @@ def errors(made: Path, ramp: Path, heights: object, least: float = 0.8) -> np.nd
     return np.linalg.norm(shown - seen, axis=0)[inside]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("crs", "start"), [("EPSG:4979", 5.39), ("EPSG:32631", 0.0), ("EPSG:4979", 365.39)])
 def test_every_pixel_is_where_the_camera_sees_it_on_the_dem(crs, start, ramp, tmp_path):
     """Of a DEM in degrees, in UTM, and one whose longitudes are a whole turn on."""
@@ -87,6 +88,7 @@ def test_every_pixel_is_where_the_camera_sees_it_on_the_dem(crs, start, ramp, tm
     assert np.nanmax(flat) > 5  # else the relief would show nothing
 
 
+@pytest.mark.landing(2)
 @pytest.mark.parametrize("start", [179.99, -180.01])
 @pytest.mark.parametrize("middle", rest_slow([180.0, 179.9995, -180.0, -179.9995]))
 def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
@@ -211,6 +213,7 @@ def moved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array(cv2.phaseCorrelate(a.astype(np.float64), b.astype(np.float64), window)[0])
 
 
+@pytest.mark.costs(6)
 @pytest.mark.slow
 def test_orthoimages_of_one_scene_lie_on_each_other(tmp_path):
     """Rendered views of bare ground, 25 degrees apart: their maps agree on true heights, and not on a level."""

@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, Usag
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cameras import open_camera
 from barpc.cli import COMMANDS, cli
-from barpc.scene import Camera
 from barpc.simulate import simulate_block
 from barpc.verbs.images import every
 from barpc.verbs.options import FLAG_NAMES, run_options
@@ -477,30 +475,6 @@ def test_verbs_that_take_time_say_how_far_they_are(tmp_path):
         assert [done for done, _ in rows] == sorted(done for done, _ in rows), stage
 
 
-# --- notebooks --------------------------------------------------------------------------------------------
-
-
-def test_results_and_cameras_are_tables_and_no_text_of_a_file_is_markup(tmp_path):
-    camera = barpc.open_camera(VIEWS[0])
-    shown = Camera(camera.model, Path("<script>.tif"), "tag", camera.size, camera.alt_range)._repr_html_()
-    assert "&lt;script&gt;.tif" in shown
-    assert "<script>" not in shown
-    assert "(1000, 1000)" in shown
-    for thing in (camera.model, barpc.fit(VIEWS[0], alt_range=(0, 400)), barpc.Corrected):
-        if not inspect.isclass(thing):
-            assert thing._repr_html_().count("<tr>") >= 5
-    found = barpc.check(VIEWS[:2], points_per_image=300)
-    shown = found._repr_html_()
-    assert shown.count("<tr>") == 3
-    assert found.record.headline.split(".")[0] in shown
-    assert "view_00" in shown
-    assert "report.html" not in shown
-    reserved = replace(found, record=replace(found.record, reasons=("a < b",), out_dir=str(tmp_path)))
-    assert reserved._repr_html_().endswith("<ul><li>a &lt; b</li></ul>")
-    (tmp_path / "report.html").touch()
-    assert reserved._repr_html_().endswith(f'<a href="{tmp_path}/report.html">report.html</a>')
-
-
 # --- who works --------------------------------------------------------------------------------------------
 
 
@@ -527,7 +501,7 @@ def test_a_verb_works_in_the_process_that_calls_it_unless_told_otherwise():
     assert set(found.values()) == {1}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_two_processes_write_what_one_does(tmp_path):
     for jobs in (1, 2):
         barpc.match(VIEWS[:2], tmp_path / str(jobs), points_per_image=300, jobs=jobs)

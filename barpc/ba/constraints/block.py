@@ -228,8 +228,7 @@ def make_problem(
     sigma = prior_sigmas(views, options, drift, off, 0 if waves is None else waves.size)
     on_cameras, jointly = CameraPrior(np.zeros_like(sigma), sigma, unknowns.sight), None
     if prior is not None:
-        radars = [block.names[v] for v in unknowns.radars]
-        on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras, radars)
+        on_cameras, jointly = apply_prior(prior, block.names, options.first_model, drift, on_cameras)
     elif waves is not None:
         jointly = JointPrior.of_alike(waves, len(views), unknowns.size)
     joined = None if jointly is None else np.unique(jointly.index // unknowns.size)

@@ -22,6 +22,7 @@ from barpc.ba.parameters.projected import Projected
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.structure import Structure
 from barpc.base.errors import BarpcWarning
+from barpc.base.frozen import joined
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, parts
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import robust_spread
@@ -44,8 +45,7 @@ def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
         return None
     most = max(prior.common.shape[2] for prior in given)
     common = [np.pad(p.common, ((0, 0), (0, 0), (0, most - p.common.shape[2]))) for p in given]
-    index, mean, rows = (np.concatenate([getattr(p, name) for p in given]) for name in ("index", "mean", "rows"))
-    return PointPrior(index, mean, rows, np.concatenate(common))
+    return PointPrior(**joined([replace(p, common=wide) for p, wide in zip(given, common, strict=True)]))
 
 
 def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:

@@ -14,14 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
 from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.parameters.additional_parameters import OF_VIEWS, AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, EarlierScene, JointPrior
 from barpc.ba.solving.linear import ArrayStore, Blocks, Cholesky, woodbury
 from barpc.ba.solving.structure import dissect, unknowns_of
-from barpc.base.errors import InputError, listed, plain
+from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import ARRAYS, MAX_NUMBER
@@ -29,7 +28,6 @@ from barpc.scene import IntArray
 
 PRIOR_KIND = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
-_CSR = ("data", "indices", "indptr")  # of release 0.3
 _LEARNT = ("told", "shown", "written")
 _SCENE = ("by_unknown", "own", "radius")
 _FACTOR_BYTES = 1e8  # bytes of the factor of a whole block to keep in memory; the rest goes to a temporary file
@@ -64,10 +62,8 @@ class BlockPrior:
         B^T B is to be subtracted from a sparse `information`: it is that of common errors of heights.
     layout : AdditionalParameters or None
         Layout of the additional parameters in the images; None: there are none.
-    radars : tuple of str
-        Views of radars with corrected clocks.
     scene : EarlierScene or None
-        Motions of the scene by the camera unknowns; None: file of an earlier release.
+        Motions of the scene by the camera unknowns; None: they are not known.
     told : (n,) or None
         Information of tie points on each view, without the limit by errors common to a view [1/px^2].
     shown : (4 + drift, 2) or None
@@ -86,7 +82,6 @@ class BlockPrior:
     center: Array
     less: Array | None = None
     layout: AdditionalParameters | None = None
-    radars: tuple[str, ...] = ()
     scene: EarlierScene | None = None
     told: Array | None = None
     shown: Array | None = None
@@ -127,7 +122,6 @@ class BlockPrior:
                 model=self.model,
                 drift=self.drift,
                 splines=self._layout.count,
-                radars=np.array(self.radars, dtype=np.str_),
                 **arrays,
             )
 
@@ -144,20 +138,17 @@ class BlockPrior:
         try:
             names = tuple(str(name) for name in file["names"])
             params = file["params"]
-            matrix = file["information"] if "information" in file else _read_blocks(file, *params.shape)
+            matrix = file["information"] if "information" in file else _read_blocks(file, len(params))
             less = None if "information" in file else file["less"]
             of_views = {name: file.get(name, np.zeros((len(names), *shape))) for name, shape in OF_VIEWS.items()}
             layout = AdditionalParameters(int(file.get("splines", 0)), **of_views)
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
-            radars = tuple(str(name) for name in file.get("radars", ()))
             scene = None
             if "scene_radius" in file:
                 by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
                 scene = EarlierScene(by_unknown, own, float(radius))
-            shown = file.get("shown")
-            if shown is not None and len(shown) == 3 + known[1]:  # of release 0.3, without turns
-                shown = np.vstack([shown, np.zeros(shown.shape[1])])
-            prior = cls(names, *known, layout, radars, scene, file.get("told"), shown, written=file.get("written"))
+            learnt = file.get("told"), file.get("shown")
+            prior = cls(names, *known, layout, scene, *learnt, written=file.get("written"))
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
         if not prior._is_whole():
@@ -228,7 +219,6 @@ class BlockPrior:
             center=self.center[views],
             less=None,
             layout=self._layout.select(views),
-            radars=tuple(name for name in self.radars if name in wanted),
             scene=scene,
             told=None if self.told is None else self.told[views],
             rest=rest,
@@ -292,7 +282,6 @@ class BlockPrior:
             center=np.concatenate([whole.center, later.center[new]]),
             less=np.pad(np.zeros((0, whole.params.size)) if whole.less is None else whole.less, ((0, 0), (0, wider))),
             layout=whole._layout.joined(later._layout.select(new)),
-            radars=(*whole.radars, *(name for name in later.radars if name in names)),
             scene=scene,
             told=told,
             shown=later.shown,
@@ -336,10 +325,8 @@ def _is_counted(array: Array) -> bool:
     return array.dtype == np.float64 and _is_square_finite(array) and bool((array >= 0.0).all())
 
 
-def _read_blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
-    """Return the blocks of a file of `save`, or of the CSR matrix that release 0.3 wrote."""
-    if "indptr" in file:
-        return Blocks.of(_csr(file, n * q), q)
+def _read_blocks(file: Mapping[str, Array], n: int) -> Blocks:
+    """Return the blocks of a file of `save`."""
     pairs: IntArray = np.asarray(file["pair_view"])
     blocks = Blocks(file["diagonal"], file["pairs"], pairs)
     if not (pairs.ndim == 2 and pairs.shape[1] == 2 and pairs.dtype == np.int64):
@@ -348,17 +335,6 @@ def _read_blocks(file: Mapping[str, Array], n: int, q: int) -> Blocks:
     if not (_are_indices(pairs.ravel(), n - 1) and (pairs[:, 0] < pairs[:, 1]).all() and (np.diff(keys) > 0).all()):
         raise ValueError("its pairs of views are not in order")
     return blocks
-
-
-def _csr(file: Mapping[str, Array], size: int) -> sp.csr_array:
-    data, indices, bounds = (file[name] for name in _CSR)
-    # checked here: the check of scipy takes differences, which overflow, and then reads beyond the arrays
-    ends = bounds.shape == (size + 1,) and bounds[0] == 0 and bounds[-1] == len(indices) == len(data)
-    if not (ends and _are_indices(bounds, len(indices)) and (bounds[1:] >= bounds[:-1]).all()):
-        raise ValueError("the bounds of its rows do not go together")
-    if not _are_indices(indices, size - 1):
-        raise ValueError("a column beyond its size")
-    return sp.csr_array((data, indices, bounds), shape=(size, size))
 
 
 def _are_indices(numbers: Array | IntArray, most: int) -> bool:
@@ -372,11 +348,8 @@ def apply_prior(
     model: str,
     drift: int,
     cameras: CameraPrior,
-    radars: Collection[str] = (),
 ) -> tuple[CameraPrior, JointPrior]:
     """Return the priors of a run that continues an earlier block: a joint prior replaces those of the old views.
-
-    `radars` are the views of radars with corrected clocks in this run.
 
     Raises
     ------
@@ -385,11 +358,6 @@ def apply_prior(
     """
     if (prior.model, prior.drift) != (model, drift):
         raise InputError(f"the earlier block was adjusted with {prior.model} (drift {prior.drift}); use the same")
-    if other := sorted(set(prior.radars) ^ (set(radars) & set(prior.names))):
-        raise InputError(
-            f"the earlier block corrected {listed(other)} otherwise, as a radar or not as one: give the same "
-            "camera files, or adjust all images together"
-        )
     size = prior.params.shape[1]
     if size != cameras.mean.shape[1]:
         raise InputError(f"the earlier block has {size} unknowns a view, not {cameras.mean.shape[1]}")

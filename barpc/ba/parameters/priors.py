@@ -14,8 +14,8 @@ from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.radar import Radar
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import Clocked
 
 DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the less accurate of delivered RPCs
 DRIFT_SIGMA = 0.2  # m, at the first and last row of a view: 0.3 microradian from 700 km, as of good platforms
@@ -185,14 +185,16 @@ def states_accuracy(view: View) -> bool:
 def is_stated(view: View, options: AdjustOptions) -> bool:
     """Return whether options, a file or radar metadata state the accuracy of a view; else it is the default."""
     given = options.sigma_attitude is not None or options.sigma_position is not None
-    of_model = isinstance(view.sensor, Pushbroom | Clocked) and view.sensor.accuracy is not None
+    of_model = isinstance(view.sensor, Pushbroom | Radar) and view.sensor.accuracy is not None
     return given or of_model or states_accuracy(view)
 
 
 def _stated_accuracy(view: View) -> tuple[float, float]:
-    """Return the stated accuracies [m] of a view's attitude (on the ground) and position, or of its two clocks."""
+    """Return the stated accuracies [m] of a view's attitude (on the ground) and position."""
     sensor = view.sensor
-    if isinstance(sensor, Pushbroom | Clocked) and sensor.accuracy is not None:
+    if isinstance(sensor, Radar) and sensor.accuracy is not None:
+        return (max(*sensor.accuracy, USABLE_ACCURACY),) * 2
+    if isinstance(sensor, Pushbroom) and sensor.accuracy is not None:
         attitude, position = sensor.accuracy
         return max(attitude, USABLE_ACCURACY), max(position, USABLE_ACCURACY)
     return (stated_accuracy(view),) * 2
@@ -217,8 +219,6 @@ def prior_sigmas(
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         return np.hstack([np.full((count, size), IMAGE_MODEL_SIGMA), np.full((count, waves), FIRST_SIGMA)])
-    radars = [isinstance(view.sensor, Clocked) for view in views]
-    parts[0][radars, :2] = stated[radars] if options.sigma_position is None else options.sigma_position
     parts += [np.full((count, 3), DRIFT_SIGMA)] * drift
     parts.append(np.full((count, waves), FIRST_SIGMA))
     return np.hstack(parts)

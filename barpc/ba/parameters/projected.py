@@ -91,8 +91,6 @@ class Cameras:
             out.image[:] = found[0]
             out.by_point[:] = found[1][:, : out.by_point.shape[1]]
             out.by_unknown[:] = found[2][:, : out.by_unknown.shape[1]]
-        elif views.start in unknowns.radars:
-            self._timed(params[views.start], ecef, views.start, out)
         else:
             self._moved(params[views], ecef, views, bounds, seen, out)
         if unknowns.waves is not None and seen is not None:
@@ -127,19 +125,6 @@ class Cameras:
         if all_wanted:
             inverse = np.repeat(1.0 / unknowns.distance[views], np.diff(bounds))
             unknowns.stack(*motion.by_turns(by_moved), out.by_point, inverse, row, out.by_unknown)
-
-    def _timed(self, params: Array, ecef: Array, view: int, out: Projected) -> None:
-        """Project points into a radar image with corrected clocks."""
-        unknowns = self.unknowns
-        model = unknowns.radars[view].timed(unknowns.timing(params, view))
-        ground, by_ecef = ground_rows_from_ecef(ecef)
-        if not out.by_point.shape[1]:
-            out.image[:] = model.project(ground.T).T
-            return
-        image, by_ground, by_timing, along = model.timing_jacobian(ground.T)
-        out.image[:], out.by_point[:] = image.T, _matrix_products(np.moveaxis(by_ground, 0, -1), by_ecef)
-        if out.by_unknown.shape[1]:
-            out.by_unknown[:] = unknowns.stack_timing(np.moveaxis(by_timing, 0, -1), along, view)
 
     def _image(self, ecef: Array, views: slice, bounds: IntArray) -> Array:
         """Return the image points (2, n) of the delivered cameras."""

@@ -1,14 +1,12 @@
 """The unknowns of each view in metres (or pixels), and the camera correction that they parametrise.
 
 Geometric models scale rotations to metres on the ground (angle x distance to the scene), so that all unknowns have a
-similar effect. Image models have pixels at the edge of the image. A radar with correctable clocks uses only the first
-two unknowns of the constants and of each degree of the drift: range, and position along the flight (azimuth time x
-speed).
+similar effect. Image models have pixels at the edge of the image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,7 +19,6 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import camera_centers
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.rpc import localize_stack
-from barpc.sensor.timing import Clocked, Timed, Timing
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
 """Image models -> which of the terms 1, col, row the correction of each coordinate has."""
@@ -40,7 +37,6 @@ class Unknowns:
     # (N, 2) position of its scene, east and north of the mean of all [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
     waves: AdditionalParameters | None = None  # additional parameters in the images
-    radars: Mapping[int, Clocked] = field(default_factory=dict)  # views with corrected clocks
     direction: Array | None = None  # (N, 3) line of sight of the middle of each image, ECEF
 
     @property
@@ -70,12 +66,11 @@ class Unknowns:
 
     @property
     def sight(self) -> Array | None:
-        """Unit vectors (N, q) of a turn about the line of sight; zeros for radars. None without rotations."""
+        """Unit vectors (N, q) of a turn about the line of sight; None without rotations."""
         if self.direction is None or not self.geometric or not self.rotates:
             return None
         out = np.zeros((len(self.direction), self.size))
         out[:, :3] = self.direction
-        out[list(self.radars)] = 0.0
         return out
 
     @property
@@ -105,26 +100,6 @@ class Unknowns:
         """Return the rotation vectors (n, D, 3) [rad] that multiply the powers 1 to D of the normalised row."""
         vectors = params[:, self.constants : self._of_model].reshape(len(params), self.drift, 3)
         return vectors / self.distance[views, None, None]
-
-    def timing(self, params: Array, view: int) -> Timing:
-        """Return the clock correction of a radar with the unknowns (q,)."""
-        radar = self.radars[view]
-        drift = params[self.constants : self._of_model].reshape(-1, 3)[:, :2]
-        place = (float(values[radar.azimuth_axis, view]) for values in (self.middle, self.half))
-        return Timing(np.vstack([params[:2], drift]) / [1.0, radar.speed], *place)
-
-    def stack_timing(self, by_timing: Array, along: Array, view: int) -> Array:
-        """Return derivatives (2, q, n) by the unknowns of a radar.
-
-        `by_timing` (2, 2, n) are those by range [px/m] and azimuth time [px/s]; `along` (n,) is the azimuth [px].
-        """
-        radar, out = self.radars[view], np.zeros((2, self.size, len(along)))
-        u = (along - self.middle[radar.azimuth_axis, view]) / self.half[radar.azimuth_axis, view]
-        part = by_timing / np.array([[1.0], [radar.speed]])
-        for at in (0, *range(self.constants, self._of_model, 3)):
-            out[:, at : at + 2] = part
-            part = part * u
-        return out
 
     def normalized(self, image: Array, index: IntArray) -> Array:
         """Return col, row (2, n) [px] normalised: -1 at the left and the top, 1 at the right and the bottom."""
@@ -192,16 +167,13 @@ class Unknowns:
         return tuple(found)
 
     def _moved(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
-        """Return the sensor of each view with its correction in space, or of its clocks."""
+        """Return the sensor of each view with its correction in space."""
         vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
         rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
         corrections = [
             Correction(*of_view, *(row if self.drift else ())) for *of_view, row in zip(*vectors, rows, strict=True)
         ]
-        found: list[SensorModel] = [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
-        for i, radar in self.radars.items():
-            found[i] = Timed(radar, self.timing(params[i], i))
-        return found
+        return [Corrected(v.sensor, c) for v, c in zip(views, corrections, strict=True)]
 
     def _in_images(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
         """Return the sensor of each view with its correction in the image."""
@@ -232,7 +204,5 @@ def make_unknowns(
     direction = (scene - centers) / distance[:, None]
     middle = scene.mean(axis=0)
     place = (scene - middle) @ enu_basis(ground_from_ecef(middle))[:2].T
-    sensors = enumerate(view.sensor for view in views) if model not in _IMAGE_TERMS else ()
-    radars = {i: sensor for i, sensor in sensors if isinstance(sensor, Clocked)}
     half = size.T / 2.0
-    return Unknowns(model, drift, centers, distance, half - 0.5, half, place, waves, radars, direction)
+    return Unknowns(model, drift, centers, distance, half - 0.5, half, place, waves, direction)

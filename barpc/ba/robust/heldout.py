@@ -88,6 +88,22 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
     return part, part.triangulate(first, part.project_points(params, first), 1.0 / block.sigma)
 
 
+def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return the points (P, 3) of observations of sigma (K,) [px] by a robust loss, and the weights (K,) by it.
+
+    The cameras, of unknowns (N, q), are linear between these and the points `first`.
+    """
+    xy, counted = problem.xy, np.ones(len(sigma))
+    projected = problem.project_points(params, first)  # near the end: from here it is linear
+    points = problem.triangulate(first, projected, 1.0 / sigma)
+    for _ in range(STEPS):  # of three views that do not agree two may
+        residual = projected.image - xy
+        residual += (projected.by_point * problem.structure.of_points(points - first)).sum(axis=1)
+        counted = geman_mcclure((residual**2).sum(axis=0) / (CRITICAL * sigma) ** 2)[1]
+        points = problem.triangulate(first, projected, np.sqrt(counted) / sigma)
+    return points, counted
+
+
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     """Measure the check observations of a block under cameras of unknowns (N, q) of a problem."""
     views = len(block.views)
@@ -97,14 +113,7 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     index = block.own_points[0]
     part, first = seen_in(problem, params, block)
     observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
-    counted = np.ones(len(block.view))
-    projected = part.project_points(params, first)  # near the end: from here it is linear
-    points = part.triangulate(first, projected, 1.0 / block.sigma)
-    for _ in range(STEPS):  # of three views that do not agree two may
-        residual = projected.image - block.xy
-        residual += (projected.by_point * part.structure.of_points(points - first)).sum(axis=1)
-        counted = geman_mcclure((residual**2).sum(axis=0) / (CRITICAL * block.sigma) ** 2)[1]
-        points = part.triangulate(first, projected, np.sqrt(counted) / block.sigma)
+    points, counted = robust_points(part, params, first, block.sigma)
     residual = part.residuals(params, points)
     squared = observations.squared(residual, counted)
     expected = block.sigma**2 * observations.freedom(counted)

@@ -11,6 +11,7 @@ from barpc.ba.constraints.block import Block
 from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.projected import Projected
+from barpc.ba.robust.heldout import robust_points
 from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import MEDIAN, Observations, geman_mcclure
@@ -24,6 +25,7 @@ from barpc.base.statistics import (
     CRITICAL,
     GROSS,
     ITERATIONS,
+    MANY,
     MUCH_NOISE,
     OUTLIER,
     SHRINK,
@@ -40,6 +42,7 @@ logger = logging.getLogger(__name__)
 _SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
 _MIN_NOISE_RATIO = 0.5  # of the stated sigmas, while outliers are about
 _MANY_CUT = 0.01  # of the observations: more are looked at again
+_SAMPLED_VIEWS = 10  # from which a sample of the observations is searched first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +82,7 @@ class Rounds:
     ) -> None:
         unknowns, options = problem.cameras.unknowns, heights.options
         residual, projected = problem.prepare(state.params, state.points)
-        self.problem = heights.hold(problem, state.points)
+        self.problem, self.block = heights.hold(problem, state.points), block
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
         self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
@@ -127,11 +130,43 @@ class Rounds:
         """Run the robust rounds, under priors widened for unexpected corrections."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         given = self.state, self.residual, self.projected
-        self.state, self.residual, self.counted, self.noise, self.projected = _robust(
+        self.state, self.residual, self.counted, self.noise, self.projected = self._sampled(start) or _robust(
             start, self.observations, given, self.use, self.smooth
         )
         # with those that are cut next: a view of which many are displaced must not hold the others
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
+
+    def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
+        """Return the result of `_robust` with cameras of a sample: of tracks drawn until each view has `MANY`.
+
+        None with few views or a joint prior, where the sample is a quarter of all, and where a view lost significantly
+        more of it than the others: so few observations have no smooth part.
+        """
+        structure, use = start.structure, self.use
+        if structure.num_views < _SAMPLED_VIEWS or self.smooth.alike is not None or start.joint_prior is not None:
+            return None
+        drawn = np.random.default_rng(0).permutation(structure.num_points)[structure.point]
+        order = np.lexsort((drawn, ~use, structure.view))
+        chosen = np.isin(np.arange(structure.num_points), structure.point[~self.observations.is_tie])
+        chosen[structure.point[order[np.arange(len(order)) - structure.bounds[structure.view] < MANY]]] = True
+        rest = ~chosen[structure.point]
+        if rest.sum() <= 0.75 * len(rest):
+            return None
+        part = self.block.without(rest)
+        seen = make_structure(part.view, part.point, structure.num_views, structure.num_points, structure.place)
+        problem = replace(self.problem, cameras=start.cameras.seeing(part.xy), structure=seen, xy=part.xy, _room=[])
+        few = Rounds(problem, part, self.state, self.heights, use[~rest])
+        few._search()
+        kept, count = seen.sum_views(np.stack([few.counted, few.use])).T
+        usual = kept.sum() / count.sum()
+        if (kept < usual * count - OUTLIER * np.sqrt(usual * (1.0 - usual) * count)).any():
+            return None
+        params, sigma = few.state.params, np.where(use, self.observations.sigma * few.noise, np.inf)
+        points, counted = robust_points(start, params, self.state.points, sigma)
+        residual, projected = start.prepare(params, points)
+        squared = self.observations.squared(residual, counted)
+        counted = _observation_weights(self.observations, use, squared, counted)
+        return replace(few.state, points=points), residual, counted, few.noise, projected
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
         """Return one pass; the outcome where it is the last."""

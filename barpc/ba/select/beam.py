@@ -232,6 +232,7 @@ class TermSearch:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma
         self.seen, self.taken = seen, tuple[_Taken, ...]()
         self.group: list[Term] = []  # moving groups, searched for once
+        self.tested: dict[int, tuple[MixtureFit, list[Interval], list[Period]]] = {}  # by the identity of the fit
 
     def run(self) -> Selection:
         """Return the selected terms."""
@@ -293,7 +294,15 @@ class TermSearch:
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
 
     def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
-        """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K)."""
+        """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K).
+
+        They are cached: the fit of the best candidate is tested after its refinement, and again as the next state.
+        """
+        if id(found) not in self.tested:
+            self.tested[id(found)] = found, *self._significant(found, extra)
+        return self.tested[id(found)][1:]
+
+    def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]

@@ -43,15 +43,10 @@ class Bands:
     def of(cls, ties: Block) -> Bands:
         """Return the bands of the tie points of a block."""
         first, second = _pairs(ties)
-        pair, whole = ties.view[first] * len(ties.views) + ties.view[second], np.zeros_like(first)
-        keys = [
-            np.column_stack([pair, ties.view[rows], whole + axis, _band(ties.xy[axis, rows], pair)])
-            for rows in (first, second)
-            for axis in (0, 1)
-        ]
-        keys.append(np.column_stack([pair, whole, whole + 2, whole]))
-        _, group, count = np.unique(np.concatenate(keys), axis=0, return_inverse=True, return_counts=True)
-        return cls(ties, first, second, group.ravel(), count)
+        pair = np.unique(ties.view[first] * len(ties.views) + ties.view[second], return_inverse=True)[1]
+        bands = [_band(ties.xy[axis, rows], pair) for rows in (first, second) for axis in (0, 1)]
+        group = np.concatenate([(4 * BANDS + 1) * pair + BANDS * n + one for n, one in enumerate([*bands, 0])])
+        return cls(ties, first, second, group, np.bincount(group))
 
     def offsets(self, found: Solution) -> Array:
         """Return the offsets (5 M,) [px] of all bands under the cameras of a solution."""
@@ -72,16 +67,23 @@ class Bands:
         """The two observations of every pair."""
         return self.first, self.second
 
-    def medians(self, offsets: Array) -> tuple[Array, Array]:
-        """Return the absolute median and its standard error (B,) [px] of every band with enough offsets (5 M,)."""
-        order = np.lexsort((offsets, self.group))
-        middle, spread = np.full((2, len(self.count)), np.nan)
-        for band, part in enumerate(np.split(offsets[order], np.cumsum(self.count)[:-1])):
-            known = part[np.isfinite(part)]
-            if len(known) >= _LEAST:
-                middle[band] = np.median(known)
-                spread[band] = MAD * np.median(np.abs(known - middle[band]))
-        return np.abs(middle), _MEDIAN * spread / np.sqrt(self.count)
+    def medians(self, offsets: Array) -> Array:
+        """Return the median (B,) of the finite offsets (5 M,) of every band with enough of them; NaN of others."""
+        known = np.flatnonzero(np.isfinite(offsets) & (self.count >= _LEAST)[self.group])
+        order = known[np.argsort(offsets[known])]
+        # numbers that sort by band, then by offset: these are sorted in 0.4 of the time of two keys
+        number = np.sort(self.group[order] * len(order) + np.arange(len(order)))
+        count = np.bincount(self.group[order], minlength=len(self.count))
+        many, middle = count >= _LEAST, np.full(len(count), np.nan)
+        start, count = (np.cumsum(count) - count)[many], count[many]
+        low, high = (offsets[order[number[start + half] % len(order)]] for half in ((count - 1) // 2, count // 2))
+        middle[many] = 0.5 * (low + high)
+        return middle
+
+    def errors(self, offsets: Array, middle: Array) -> Array:
+        """Return the standard errors (B,) [px] of medians (B,) of offsets (5 M,)."""
+        spread = MAD * self.medians(np.abs(offsets - middle[self.group]))
+        return np.asarray(_MEDIAN * spread / np.sqrt(np.maximum(self.count, 1)))
 
 
 def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
@@ -103,11 +105,10 @@ def _in_image(by_point: Array, normal: Array) -> Array:
 
 def _band(place: Array, pair: IntArray) -> IntArray:
     """Return the index (M,) of each coordinate's band: equal parts of the extent of its pair."""
-    _, index = np.unique(pair, return_inverse=True)
-    low, high = np.full((2, index.max(initial=0) + 1), np.inf)
-    np.minimum.at(low, index, place)
-    np.minimum.at(high, index, -place)
-    part = BANDS * (place - low[index]) / np.maximum(-high - low, 1e-9)[index]
+    low, high = np.full((2, pair.max(initial=0) + 1), np.inf)
+    np.minimum.at(low, pair, place)
+    np.minimum.at(high, pair, -place)
+    part = BANDS * (place - low[pair]) / np.maximum(-high - low, 1e-9)[pair]
     return np.asarray(np.minimum(part.astype(np.int64), BANDS - 1))
 
 
@@ -138,12 +139,12 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
 
     A median counts up to `OUTLIER` standard deviations of tie points: beyond, both models reject the matches.
     """
-    bands = Bands.of(ties)
-    if not len(bands.first):
+    bands = None if tried.outcome is plain.outcome else Bands.of(ties)
+    if bands is None or not len(bands.first):
         return Comparison(False, 0.0)
     offsets = [bands.offsets(one) for one in (tried, plain)]
-    (one, _), (other, error) = (bands.medians(each) for each in offsets)
-    changed, _ = bands.medians(offsets[0] - offsets[1])
+    middles = [bands.medians(each) for each in (*offsets, offsets[0] - offsets[1])]
+    (one, other, changed), error = np.abs(middles), bands.errors(offsets[1], middles[1])
     most = OUTLIER * plain.outcome.noise * float(np.median(ties.sigma))
     grown = np.minimum(one, most) - np.minimum(other, most)
     surely = (grown > SURELY * error).any() and np.nanmax(grown) > -np.nanmin(grown)

@@ -121,6 +121,18 @@ def _ends_with_its_image(one: Finding, block: Block) -> bool:
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
     """Solve the block with splines over the rows and detector steps, if options or correlated residuals request them.
 
+    Terms and moving ground have them as a rival, and where they win the solution is asked again: it is cached.
+    """
+    key = id(found.outcome), options
+    if key not in parts.splined:
+        parts.splined[key] = found, _with_splines(found, parts, options)
+    given, best = parts.splined[key]
+    return found if best is given else replace(best, findings=found.findings)
+
+
+def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
+    """Solve as `with_splines`.
+
     The number of splines grows until no correlated residuals are left, observations are too few, or check residuals
     did not fall for `_TWICE` numbers in succession.
     """

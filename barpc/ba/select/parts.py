@@ -12,6 +12,7 @@ from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.solution import Solution
 from barpc.ba.terms.moving_ground import Motion, MovingGroup, members
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
+from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
@@ -36,6 +37,11 @@ class Parts:
     def outer(self) -> Block:
         """The block of check observations."""
         return self.block.without(~self.kept_out | (self.group > 0))
+
+    @cached_property
+    def splined(self) -> dict[tuple[int, AdjustOptions], tuple[Solution, Solution]]:
+        """Cache of `with_splines`: identity of the outcome and options -> solution given, solution with splines."""
+        return {}
 
     @cached_property
     def apart(self) -> Block:

@@ -14,7 +14,11 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 import scipy.linalg as la
@@ -30,6 +34,7 @@ from barpc.base.statistics import CONVERGED, ITERATIONS, ROUNDING
 from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
+_told: ContextVar[Callable[[], None]] = ContextVar("told", default=lambda: None)  # before each minimisation
 
 TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
 SCIPY_UNKNOWNS = (
@@ -83,6 +88,17 @@ class Minimum:
         return Covariance(self.reduced, factor, free)
 
 
+@contextmanager
+def passes_told(tell: Callable[[int], None]) -> Iterator[None]:
+    """Call `tell(n)` at the start of the n-th minimisation; how many there will be depends on the residuals."""
+    number = count(1)
+    token = _told.set(lambda: tell(next(number)))
+    try:
+        yield
+    finally:
+        _told.reset(token)
+
+
 def minimise(
     problem: Problem,
     state: State,
@@ -94,14 +110,15 @@ def minimise(
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
     The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "scipy", "sparse" or "auto"
-    (see the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
+    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "auto" or "sparse" (see
+    the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
 
     Raises
     ------
     AdjustError
         The cost is not finite, or no step lowers it.
     """
+    _told.get()()
     start = time.process_time()
     unknowns, result = int(problem.free.sum()), None
     if solver == "auto":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from operator import attrgetter
 from typing import Any
@@ -12,7 +11,7 @@ from scipy.special import erf
 
 from barpc.ba import Adjustment
 from barpc.ba.parameters.priors import USABLE_ACCURACY
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.fit import RpcFit
 from barpc.report.outcome import Run
 from barpc.report.summary.views import (
@@ -31,7 +30,6 @@ from barpc.sensor.geometry import Several, ground_grids, ground_sample_distance,
 from barpc.sensor.image_corrections import ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
-from barpc.sensor.timing import Timed
 
 _SPLINE_ROWS = 400  # of an image, over which a spline is averaged
 
@@ -108,7 +106,7 @@ def _gap_corners(run: Run, i: int) -> tuple[tuple[float, float, float, float], .
 
 
 def _fit_entry(fit: RpcFit) -> FitEntry:
-    return replace(FitEntry(*_FIT(fit)), localisation_m=None if fit.localisation is None else fit.localisation.max_m)
+    return FitEntry(*_FIT(fit))
 
 
 def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
@@ -157,15 +155,10 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
         covariance = apart.placed.covariance
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     common = (model, adjustment.params[i].tolist(), sigma)
-    if isinstance(sensor, Timed):
-        moved, uncertain, place = moved_by_clocks(sensor, covariance, middle)
-        offset, *slopes = (sensor.correction.coeffs * [1.0, 1e3]).tolist()
-        known: dict[str, Any] = {"range_m": offset[0], "azimuth_ms": offset[1], "timing_slopes": slopes}
-        known["timing_sigma"] = (np.array(sigma[:2]) / [1.0, sensor.sensor.speed / 1e3]).tolist()
-    elif isinstance(sensor, Corrected):
+    if isinstance(sensor, Corrected):
         shared = None if strange else _shared_errors(adjustment, i, middle)
         moved, uncertain, place = moved_in_space(sensor, covariance, model, middle, seen, shared)
-        known = {
+        known: dict[str, Any] = {
             "rotation_urad": (sensor.correction.rotation * 1e6).tolist(),
             "angle_urad": float(np.linalg.norm(sensor.correction.rotation)) * 1e6,
             "translation_m": sensor.correction.translation.tolist(),
@@ -176,7 +169,7 @@ def _correction(adjustment: Adjustment, i: int, middle: Array, seen: tuple[Array
         assert isinstance(sensor, ImageCorrected)
         shift, slope = sensor.correction.shift.tolist(), sensor.correction.slope.tolist()
         return CorrectionEntry(*common, None, None, shift_px=shift, slope=slope)
-    if not strange or isinstance(sensor, Timed):
+    if not strange:
         known |= {"center_sigma_px": uncertain.tolist(), "ellipse": place}
     return CorrectionEntry(
         *common, moved.tolist(), **{"center_sigma_px": None, **known, **_image_correction_entry(spline)}
@@ -239,15 +232,6 @@ def moved_in_space(
     parts = {"rotation": by_rotation / distance, "translation": by_translation}
     jacobian = np.hstack([part for name, part in parts.items() if name in unknowns])
     return _ground_accuracy(image - before, jacobian, covariance, by_point @ enu_basis(ground)[:2].T, shared)
-
-
-def moved_by_clocks(model: Timed, covariance: Array, ground: Array) -> tuple[Array, Array, EllipseEntry]:
-    """As `moved_in_space`, for radar timing: `covariance` begins with range and position along the flight [m]."""
-    image, by_timing = model.timing_jacobian(ground)
-    by_level = (model.project_jacobian(ground)[1] / metres_per_unit(ground))[:, :2]
-    return _ground_accuracy(
-        image - model.sensor.project(ground), by_timing / [1.0, model.sensor.speed], covariance, by_level
-    )
 
 
 def _ground_accuracy(

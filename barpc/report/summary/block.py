@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar
 
+from barpc.base.fields import field_names
 from barpc.report.records import Number, Record, column
 from barpc.report.summary.words import Count, Vector
 
@@ -62,7 +63,7 @@ class DatumEntry(Record):
     @classmethod
     def columns(cls, entries: Sequence[DatumEntry]) -> str:
         """Return the columns of a table, without the sources that contribute to no motion."""
-        part, sigma, *sources = cls.__dataclass_fields__
+        part, sigma, *sources = field_names(cls)
         told = [name for name in sources if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
         return " ".join([part, sigma, *told])
 

@@ -32,7 +32,7 @@ class PairEntry(Record):
         "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
         "beaten": Column("instead of", lambda pair: "; ".join(pair.beaten)),
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
-        "kept": Column("kept [px]", lambda pair: _offset_cell(pair.epipolar_kept), ".3f", adjusted=True),
+        "kept": Column("after, used [px]", lambda pair: _offset_cell(pair.epipolar_kept), ".3f", adjusted=True),
     }
     PAGE: ClassVar = (
         "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after kept"

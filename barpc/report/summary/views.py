@@ -50,12 +50,6 @@ class CorrectionEntry(Record):
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
     translation_norm_m: Number = column("Length of T", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
-    range_m: Number = column("Radar: correction of the range", "m", "range", "+.3f", default=None)
-    azimuth_ms: Number = column("Radar: correction of the azimuth time", "ms", "azimuth", "+.4f", default=None)
-    timing_sigma: Pixel | None = column("Posterior standard deviations of both, m and ms", default=None)
-    timing_slopes: tuple[Pixel, ...] | None = column(
-        "Radar: further correction at the end, m and ms, by power", default=None
-    )
     jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = column("Rows between its knots", "px", default=None)
     detector_px: Number = column("RMS of the steps between detectors", "px", "detectors", ".2f", default=None)
@@ -92,9 +86,6 @@ class FitEntry(Record):
     coverage: Number = column("Share of the image covered by the fit's points", head="covered", form=".0%")
     method: str = column("Solver", head="solver")
     num_check_points: Count = column("Check points", head="check points")
-    localisation_m: Number = column(
-        "Largest error of the localisation RPC against P_BA on the ground", "m", default=None
-    )
 
 
 def _moves(view: ViewEntry) -> list[Cell]:
@@ -136,7 +127,6 @@ class ViewEntry(Record):
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
     CONTROL: ClassVar = "name control_w control_w_point"
-    CLOCKS: ClassVar = " correction.range_m correction.azimuth_ms"
     FITS: ClassVar = (
         "name fit.rmse_px largest fit.min_denominator fit.roundtrip_px fit.coverage fit.num_check_points fit.method"
     )
@@ -155,7 +145,7 @@ class ViewEntry(Record):
     @property
     def reservation(self) -> str:
         """Its verdict and advice as a sentence; without meaning for an image without reservation."""
-        return f"{self.name}: {STATUS_WORDS[self.status]}: {self.advice}."
+        return f"{self.name}: {STATUS_WORDS[self.status]}. {self.advice}."
 
     name: str = column("Unique in the run", head="image", min_length=1)
     path: str = column("The image; empty for a view without pixels")
@@ -181,7 +171,7 @@ class ViewEntry(Record):
     camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
     fit: FitEntry | None = column("Certificate of the refitted RPC; null where none was fitted")
     outputs: Mapping[Annotated[str, Meta(pattern="^[^/]+$")], Mapping[str, float | str | None]] = column(
-        "File -> consumer -> difference to P_BA in px, or the reason without one"
+        "File -> consumer -> difference from the corrected camera in px, or the reason without one"
     )
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")

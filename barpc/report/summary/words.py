@@ -16,7 +16,7 @@ from barpc.scene import IntArray
 STATUS_WORDS = {
     "adjusted": "adjusted",
     "consistent": "consistent",
-    "tied": "tied",
+    "tied": "matched",
     "weak": "weakly connected",
     "doubtful": "needs review",
     "failed": "not adjusted",
@@ -51,6 +51,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def capital(text: str) -> str:
+    """Return a text that begins with a capital letter."""
+    return text[:1].upper() + text[1:]
+
+
 def median(values: Iterable[float | None]) -> float:
     """Return the median of the finite numbers; NaN without any."""
     found = np.array(list(values), dtype=np.float64)
@@ -72,17 +77,6 @@ def two_digits(value: float) -> str:
     ('33', '0.26', '680')
     """
     return f"{float(f'{value:.2g}'):g}"
-
-
-def figure(value: float) -> str:
-    """Return a number with one decimal, or with one digit where it would read 0.0.
-
-    Examples
-    --------
-    >>> figure(12.34), figure(0.0234), figure(0)
-    ('12.3', '0.02', '0')
-    """
-    return f"{value:.1f}" if abs(value) >= 0.05 else f"{value:.1g}"
 
 
 def metres(value: float) -> str:
@@ -108,33 +102,35 @@ class Cause:
     remedy: str = ""
 
     def advice(self, **figures: object) -> str:
-        """Return the sentence with its figures, and the remedy."""
-        return ": ".join(filter(None, (self.sentence, self.remedy))).format_map(figures)
+        """Return the sentence with its figures, and the remedy as another one."""
+        return ". ".join(capital(text.format_map(figures)) for text in (self.sentence, self.remedy) if text)
 
 
+_ITS_RPC = "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"
+_DISTURBED = "check for clouds, water, change"
 CAUSES = {
     "no_overlap": Cause("failed", "in no matched pair",
-        "no pair with it was selected for matching (overlap, angle or list), and its camera was not changed",
+        "no pair was selected for matching (overlap, angle or list), and the camera was not changed",
         "check its RPC (IMAGE,camera=FILE names another), or lower [tie] min_overlap in a file given with --options"),
     "untied": Cause("failed", "not connected to the others",
-        "no tie points connect it to the main group of images{tried}, and its camera was not changed",
+        "no tie points lead to the main group of images{tried}, and the camera was not changed",
         "check for clouds, water and other dates, or supply matches (--matches)"),
     "other_rpc": Cause("failed", "RPC does not match the image",
         "its RPC does not match the image: {strangeness}. These were adjusted without it, and its camera was not "
         "changed",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
+        _ITS_RPC),
     "contradicts_all": Cause("failed", "contradicts the others",
         "{strangeness}. They were adjusted without it, and its camera was not changed",
-        "check for clouds, water and change, and that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
+        f"{_ITS_RPC}, and for clouds, water, change"),
     "one_rpc_misses": Cause("failed", "RPC fit misses its tolerance",
         "one RPC does not fit the corrected camera to {tolerance:g} px", "lower --drift, or use its grid (--grids)"),
     "other_pixels": Cause("doubtful", "RPC of other pixels", "{doubt}",
         "give the RPC of these pixels (IMAGE,camera=FILE)"),
     "contradicted": Cause("doubtful", "contradicts the others",
         "{share:.0f} % of its tie points were rejected, as they contradict those of the other images",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another), and for clouds, water, change"),
+        f"{_ITS_RPC}, and for clouds, water, change"),
     "whole_pixels": Cause("weak", "matched at whole pixels",
-        "its tie points were matched at whole pixels: an error of {shared:.1f} px may be common to all",
+        "tie points were matched at whole pixels, so all may share an error of {shared:.1f} px",
         "add ground points, an image of another date, or matches (--matches)"),
     "few": Cause("weak", "few tie points", "only {few} tie points", "check overlap, clouds and dates"),
     "none": Cause("weak", "no tie points", "no tie points", "check overlap, clouds and dates"),
@@ -143,18 +139,19 @@ CAUSES = {
     "copy": Cause("doubtful", "duplicate image", "shows the same pixels as {other}", "give each image once"),
     "foreign_camera": Cause("doubtful", "RPC does not match the image",
         "its RPC {stated}: {strangeness}. It was resected from the tie points of the other images",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
+        _ITS_RPC),
     "odd": Cause("doubtful", "RPC less accurate than stated",
         "its RPC is {scale:.0f} times less accurate than stated, relative to the other images{either}",
-        "check that it belongs to this image (IMAGE,camera=FILE names another)"),
+        _ITS_RPC),
     "systematic": Cause("doubtful", "systematic residuals",
-        "systematic residuals of {size:.2f} px {along} remain: {why}"),
+        "systematic residuals of {size:.2f} px {along} remain: {why}",
+        "compare with other matches (--matches)"),
     "rejected": Cause("doubtful", "many tie points rejected",
         "{share:.0f} % of its tie points were rejected; neighbours err in the same direction, so it is no noise{place}",
-        "check for clouds, water, change"),
+        _DISTURBED),
     "wrong_matches": Cause("doubtful", "wrong matches",
-        "{share:.0f} % of its tie points were rejected, with neighbouring errors in random directions, as of "
-        "mismatches, and check tie points have residuals of {error:.2f} px",
+        "{share:.0f} % of its tie points were rejected; neighbours err in random directions, as mismatches do. Check "
+        "tie points have residuals of {error:.2f} px",
         "check for repeated patterns and noise, or supply matches (--matches)"),
     "place": Cause("doubtful", "inconsistent rows or columns",
         "in {place} {what}", "check for {cause}"),
@@ -162,8 +159,8 @@ CAUSES = {
         "{place} have {found} of about {due} tie points expected from their detail, so an error there would not show",
         "check for clouds, water, change there, or a jump in the image"),
     "beside": Cause("doubtful", "connected to a contradicting image",
-        "check tie points have residuals of {error:.2f} px, and most of them are observed in {other}, too, whose tie "
-        "points contradict the others",
+        "check tie points have residuals of {error:.2f} px; most of them are seen in {other}, too, which contradicts "
+        "the other images",
         "check that image first"),
     "held_out": Cause("doubtful", "large residuals of check tie points",
         "check tie points have residuals of {error:.2f} px, {noise:.1f} times the accuracy that the matcher states",
@@ -173,14 +170,14 @@ CAUSES = {
         "add an image from another direction, or a DEM (--dem)"),
     "follows_more": Cause("doubtful", "one RPC is not enough",
         "its corrected camera includes {follows}, and one RPC misses it by {left:.2f} px (RMS; {most:.2f} px at most)",
-        "use its grids ({image}_grid.tif), or --resample"),
+        "use its grids ({image}_grid.tif)"),
     "disagrees": Cause("doubtful", "cameras disagree",
         "tie points have residuals of {error:.2f} px", "adjust the cameras"),
     "left": Cause("doubtful", "large residuals",
         "tie points keep residuals of {error:.2f} px", "check for wrong matches and moving objects"),
     "unseen": Cause("doubtful", "tie points not projectable",
         "its camera cannot intersect or project its own tie points",
-        "check that the RPC belongs to this image (IMAGE,camera=FILE names another)"),
+        _ITS_RPC),
     "moving_objects": Cause("doubtful", "tie points move",
         "{share:.0f} % of its tie points move together and were excluded",
         "check that the others lie on stationary ground"),

@@ -12,7 +12,7 @@ an RPC can hold them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -35,8 +35,8 @@ from barpc.base.geodesy import (
 )
 from barpc.sensor.curve import Curve, fit_orbit
 from barpc.sensor.document import seconds, warn_off_grid
+from barpc.sensor.radar import Radar, aside, dot, on_circle
 from barpc.sensor.sentinel1.annotation import Annotation, burst_rows, read_annotation, read_orbit_file
-from barpc.sensor.timing import Clocked, Timing, aside, dot, on_circle
 
 Bistatic = Literal["annotated", "full"]  # which bistatic correction; see `bistatic_constant`
 _SPREAD = 1e-5  # s: what lines and azimuth times of a grid may scatter
@@ -138,10 +138,9 @@ class Delays:
 
     atmosphere: bool = False
     bistatic: float | None = None  # b [s]; None for no correction
-    timing: Timing | None = None  # by azimuth time [s]; None for none
 
     def __bool__(self) -> bool:
-        return self.atmosphere or self.bistatic is not None or self.timing is not None
+        return self.atmosphere or self.bistatic is not None
 
     def shift(self, times: Array, ground: Array, sight: Array) -> Array:
         """Return the delays (2, N) [s] of points (N, 3) that see the satellite along unit vectors (3, N)."""
@@ -150,8 +149,6 @@ class Delays:
             out[0] = self.bistatic - 0.5 * times[1]
         if self.atmosphere:
             out[1] = _ZENITH(ground[:, 2]) / (up(ground) * sight).sum(axis=0) * (2.0 / SPEED_OF_LIGHT)
-        if self.timing is not None:
-            out += _as_times(self.timing.at(times[0]))
         return out
 
     def shift_jacobian(self, times: Array, by_ground: Array, ground: Array, sight: Array, by_sight: Array) -> Array:
@@ -172,8 +169,6 @@ class Delays:
             out[1] = -(zenith / cosine**2)[:, None] * by_cosine
             out[1, :, 2] += slope / cosine
             out[1] *= 2.0 / SPEED_OF_LIGHT
-        if self.timing is not None:
-            out += _as_times(self.timing.rate(times[0]))[..., None] * by_ground[0]
         return out
 
 
@@ -206,11 +201,6 @@ def bistatic_constant(annotation: Annotation, form: Bistatic) -> float:
     return annotation.rank * annotation.pulse_interval - constant
 
 
-def _as_times(late: Array) -> Array:
-    """Return the range [m] and azimuth time [s] (2, N) as azimuth time and two-way range time [s]."""
-    return np.stack([late[1], late[0] * (2.0 / SPEED_OF_LIGHT)])
-
-
 RELIEF = (200.0, 500.0)
 """How far the terrain may lie below the lowest and above the highest point of the geolocation grid [m]."""
 NO_DELAYS = Delays()  # pure geometry
@@ -224,7 +214,7 @@ vapour; the bistatic delay along the flight, and of that, corrected, the Doppler
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RangeDoppler(Clocked):
+class RangeDoppler(Radar):
     """A radar image in zero-Doppler geometry (Sentinel-1, TerraSAR-X): itself a `SensorModel`.
 
     Parameters
@@ -244,7 +234,6 @@ class RangeDoppler(Clocked):
     'right'
     """
 
-    azimuth_axis: ClassVar[int] = 1
     _kind: ClassVar[str] = "Range-Doppler model"
 
     orbit: Curve
@@ -307,18 +296,6 @@ class RangeDoppler(Clocked):
         ground_range = "the ground range of a GRD changes every second, with the terrain: take the SLC of the scene"
         return ground_range if isinstance(self.frame, GroundFrame) else ""
 
-    @property
-    def speed(self) -> float:
-        """Speed of the flight at the image's middle row [m/s]."""
-        _, velocity = self.orbit(np.array([0.5 * self.size[1] * self.frame.interval]))
-        return float(np.linalg.norm(velocity))
-
-    def timed(self, timing: Timing) -> RangeDoppler:
-        """Return the model with a timing by the row [px] in place of its own."""
-        interval = self.frame.interval
-        timing = replace(timing, offset=timing.offset * interval, scale=timing.scale * interval)
-        return replace(self, delays=replace(self.delays, timing=timing))
-
     def azimuth_range(self, ground: Array) -> tuple[Array, Array]:
         """Return zero-Doppler [s from `epoch`] and two-way slant range times (...) [s] of points (..., 3).
 
@@ -365,7 +342,7 @@ class RangeDoppler(Clocked):
         image[:, ~np.isfinite(image).all(axis=0)] = np.nan
         return image.T
 
-    def _derivatives(self, ground: Array) -> tuple[Array, Array, Array, Array]:
+    def _derivatives(self, ground: Array) -> tuple[Array, Array]:
         seen = self._geometry(ecef_from_ground(ground))
         by_ecef = np.stack([seen.time_by_ecef.T, seen.sight.T * (-2.0 / SPEED_OF_LIGHT)])  # (2, N, 3)
         ecef_by_ground = ecef_from_ground_jacobian(ground)
@@ -379,8 +356,7 @@ class RangeDoppler(Clocked):
         jacobian = np.einsum("ijn,jnk->nik", by_times, by_ground)
         bad = ~np.isfinite(image).all(axis=0)
         image[:, bad], jacobian[bad] = np.nan, np.nan
-        by_timing = np.stack([by_times[:, 1] * (2.0 / SPEED_OF_LIGHT), by_times[:, 0]], axis=1)
-        return image.T, jacobian, np.moveaxis(by_timing, -1, 0), seen.times[0] / self.frame.interval
+        return image.T, jacobian
 
     def _localize(self, image: Array, alt: Array) -> Array:
         measured = times = self.frame.times(image.T)

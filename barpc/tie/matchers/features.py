@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from barpc.base.fields import field_names, given
+from barpc.base.frozen import joined
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import MANY
+from barpc.base.tasks import Store, Work, names_of
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
 from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
-from barpc.tie.tasks import Store, Work, names_of
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""
@@ -53,7 +55,7 @@ class Keypoints:
 
     def select(self, which: IntArray | BoolArray) -> Keypoints:
         """Return the keypoints of a mask or of indices."""
-        return Keypoints(*(getattr(self, field.name)[which] for field in fields(self)))
+        return Keypoints(*(column[which] for column in given(self).values()))
 
     def strongest(self, most: int) -> Keypoints:
         """Return the `most` strongest keypoints."""
@@ -70,8 +72,7 @@ def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     """Join the keypoints of several tiles; an empty set of none."""
     none = np.empty(0)
     parts = parts or [Keypoints(np.empty((0, 2)), none, none, none, np.empty((0, 128), np.uint8))]
-    columns = (np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(Keypoints))
-    return Keypoints(*columns)
+    return Keypoints(**joined(parts))
 
 
 class Sift:
@@ -274,14 +275,13 @@ def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Su
 
 def _packed(keypoints: Keypoints, box: Box) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of 148 bytes a keypoint; places count from the tile's corner."""
-    local = replace(keypoints, xy=keypoints.xy - np.array(box[:2]))
-    values = {field.name: getattr(local, field.name) for field in fields(Keypoints)}
+    values = given(replace(keypoints, xy=keypoints.xy - np.array(box[:2])))
     return {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in values.items()}
 
 
 def _unpacked(arrays: dict[str, npt.NDArray[Any]], box: Box) -> Keypoints:
     described = np.asarray(arrays["descriptors"], np.uint8)
-    xy, scale, angle, response = (np.asarray(arrays[field.name], np.float64) for field in fields(Keypoints)[:4])
+    xy, scale, angle, response = (np.asarray(arrays[name], np.float64) for name in field_names(Keypoints)[:4])
     return Keypoints(xy + np.array(box[:2]), scale, angle, response, described)
 
 

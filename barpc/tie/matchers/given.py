@@ -12,6 +12,7 @@ from scipy.special import bdtrc
 
 from barpc.base.options import TieOptions
 from barpc.base.statistics import CHANCE
+from barpc.base.tasks import Work
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
@@ -19,7 +20,6 @@ from barpc.tie.matchers.matching import Ends, match_pair
 from barpc.tie.matchers.report import PairReport, better
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine
 from barpc.tie.pairing.overlaps import GIVEN_PAIR, Pair
-from barpc.tie.tasks import Work
 
 logger = logging.getLogger(__name__)
 

@@ -20,6 +20,7 @@ import numpy as np
 from barpc.base.geodesy import Array
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
+from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
@@ -47,7 +48,6 @@ from barpc.tie.pairing.epipolar import (
 from barpc.tie.pairing.overlaps import Pair, Terrain, reach_of, shared_tiles
 from barpc.tie.patches.channels import INVALID_MARGIN
 from barpc.tie.pixels import tiles
-from barpc.tie.tasks import HERE, Work
 
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
 """Name -> matcher."""

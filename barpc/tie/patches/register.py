@@ -10,20 +10,21 @@ one small pseudo-inverse a match serves all iterations.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
 import numpy as np
 
+from barpc.base.fields import given
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
+from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
 from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
-from barpc.tie.tasks import HERE, Work
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
@@ -56,8 +57,8 @@ class PatchRegistration:
 
     def put(self, rows: IntArray, found: PatchRegistration) -> None:
         """Add the registration of some rows."""
-        for field in fields(self):
-            getattr(self, field.name)[rows] = getattr(found, field.name)
+        for name, column in given(found).items():
+            getattr(self, name)[rows] = column
 
 
 def register_places(

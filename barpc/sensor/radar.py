@@ -1,23 +1,18 @@
-"""Common geometry of radars: the range-Doppler circle of a pixel, the look side, and timing corrections.
+"""Common geometry of radars: the range-Doppler circle of a pixel, and the look side.
 
-The points of one range and one Doppler lie on a circle about the line of flight. Their errors are an
-offset and a slope of range and azimuth time along the flight, no attitude.
+The points of one range and one Doppler lie on a circle about the line of flight.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from barpc.base.errors import RpcError
-from barpc.base.frozen import Frozen
 from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, Array, ground_from_ecef, pointwise, up, wrap_longitude
-from barpc.sensor import Behind, Pointwise
+from barpc.sensor import Pointwise
 from barpc.sensor.curve import Curve, cross
 
 
@@ -78,45 +73,9 @@ def on_circle(
     return ground, -away
 
 
-@dataclass(frozen=True, eq=False)
-class Timing(Frozen):
-    """Corrections of a radar's range and azimuth time: polynomials of the position along the flight.
+class Radar(Pointwise):
+    """Base of the radar models: they know where their beam comes from."""
 
-    Parameters
-    ----------
-    coeffs : (D + 1, 2)
-        Range [m] and azimuth time [s], one way, by the powers 1, u, u^2, ... of u = (along - offset) / scale.
-    offset, scale : float, of the coordinate along the flight where u = 0, and from there to u = 1
-    """
-
-    coeffs: Array
-    offset: float = 0.0
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        self._array("coeffs", (None, 2), RpcError)
-        if not (len(self.coeffs) and np.isfinite(self.offset) and np.isfinite(self.scale) and self.scale > 0):
-            raise RpcError(f"timing: {len(self.coeffs)} terms, offset {self.offset}, scale {self.scale}")
-
-    def at(self, along: Array) -> Array:
-        """Return the range [m] and azimuth time [s] (2, N) that are added at coordinates (N,)."""
-        return np.asarray(polynomial.polyval((along - self.offset) / self.scale, self.coeffs))
-
-    def rate(self, along: Array) -> Array:
-        """Return the derivative (2, N) of range and azimuth time by the coordinate."""
-        slopes = polynomial.polyder(self.coeffs) / self.scale
-        return np.asarray(polynomial.polyval((along - self.offset) / self.scale, slopes))
-
-
-class Clocked(Pointwise, ABC):
-    """Base of the radar models: they know where their beam comes from, and their clocks can be corrected.
-
-    Their `_derivatives` are image points (n, 2) and d(image)/d(ground) (n, 2, 3), d(image)/d(range, azimuth time)
-    (n, 2, 2), the coordinate along the flight (n,).
-    """
-
-    azimuth_axis: ClassVar[int]
-    """The image coordinate that goes along the flight: 0 (col) or 1 (row)."""
     orbit: Curve
     size: tuple[int, int]
     alt_range: tuple[float, float]
@@ -133,15 +92,6 @@ class Clocked(Pointwise, ABC):
         if self.look not in ("right", "left"):
             raise RpcError(f"{self._kind}: look {self.look!r}, expected 'right' or 'left'")
 
-    @property
-    @abstractmethod
-    def speed(self) -> float:
-        """Speed of the flight in the middle of the image [m/s]."""
-
-    @abstractmethod
-    def timed(self, timing: Timing) -> Self:
-        """Return the model with a timing, its coordinate in pixels, in place of its own."""
-
     def localize(self, image: Array, alt: Array) -> Array:
         """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3).
 
@@ -157,45 +107,8 @@ class Clocked(Pointwise, ABC):
         """Return the vectors (..., 3) [m], ECEF, from points (..., 3) to the radar; NaN as `project`."""
         return pointwise(lambda part: [self._to_radar(part)], [(3,)], ground)[0]
 
-    def timing_jacobian(self, ground: Array) -> tuple[Array, Array, Array, Array]:
-        """Return image points (..., 2) [px] of ground points (..., 3), derivatives, the place along the flight.
-
-        d(image)/d(ground) (..., 2, 3), d(image)/d(range, azimuth time) (..., 2, 2) [px/m, px/s], and (...) [px].
-        """
-        image, by_ground, by_timing, along = pointwise(self._derivatives, [(2,), (2, 3), (2, 2), ()], ground)
-        return image, by_ground, by_timing, along
-
     @cached_property
     def _middle(self) -> float:
         """Longitude of the image's middle [deg]."""
         lon = float(super().localize(0.5 * np.array(self.size), np.array(np.mean(self.alt_range)))[0])
         return lon if np.isfinite(lon) else 0.0
-
-
-@dataclass(frozen=True)
-class Timed(Behind):
-    """A radar model behind the correction of its clocks; itself a `SensorModel`."""
-
-    sensor: Clocked  # the model as delivered
-    correction: Timing  # its coordinate is the image's, along the flight [px]
-
-    @cached_property
-    def _model(self) -> Clocked:
-        return self.sensor.timed(self.correction)
-
-    def project(self, ground: Array) -> Array:
-        """Project ground points (..., 3) [deg, deg, m] to image points (..., 2) [px]."""
-        return self._model.project(ground)
-
-    def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivatives (..., 2, 3) [px/deg, px/deg, px/m]."""
-        return self._model.project_jacobian(ground)
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        """Localise image points (..., 2) [px] at altitudes (...) [m]: ground points (..., 3)."""
-        return self._model.localize(image, alt)
-
-    def timing_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        """Return image points (..., 2) [px] and their derivative (..., 2, 2) by range and azimuth time."""
-        image, _, by_timing, _ = self._model.timing_jacobian(ground)
-        return image, by_timing

@@ -1,7 +1,8 @@
-"""Execution of the tasks of a stage, and the store of results that travel by reference."""
+"""Execution of the tasks of a stage, and the store of their results, which travel by reference."""
 
 from __future__ import annotations
 
+import logging
 import shutil
 import tempfile
 from collections import deque
@@ -19,6 +20,8 @@ from barpc.base import identity
 from barpc.base.atomic import replacing
 from barpc.base.errors import InputError
 from barpc.base.frozen import Arrays, load_npz
+
+logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how much is done, of how much."""
@@ -70,12 +73,12 @@ def one_by_one(
 
 @dataclass(frozen=True)
 class Store:
-    """A folder that every worker sees under the same path: workers write results, the caller knows names."""
+    """A folder that every worker sees under the same path, ``<stage>/<key>.npz`` in it; a name is ``stage/key``."""
 
     folder: str
     room: str  # for files on their way, on the same disk
 
-    scratch = "arrays"  # where names of a run that need not outlive it begin
+    scratch = "arrays"  # the stage of what need not outlive a run
 
     def write(self, name: str, arrays: Arrays) -> None:
         """Write named arrays, whole or not at all; not if a file that they were made of has changed."""
@@ -85,14 +88,16 @@ class Store:
             replacing(path, overwrite=True, durable=False, room=Path(self.room)) as partial,
             partial.open("wb") as file,
         ):
-            np.savez(file, **arrays)  # type: ignore[arg-type]
+            np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
     def read(self, name: str) -> Arrays | None:
-        """Read the arrays of a name; None where it is missing or damaged."""
+        """Read the arrays of a name, or None; a file that is damaged is taken away and counts as missing."""
         path = Path(self.folder) / f"{name}.npz"
         try:
             return None if path.is_symlink() or not path.is_file() else load_npz(path)
-        except (OSError, ValueError, InputError):
+        except (OSError, ValueError) as error:
+            logger.warning("%s: a damaged cache file is made again (%s)", path, error)
+            path.unlink(missing_ok=True)
             return None
 
     def need(self, name: str) -> Arrays:

@@ -6,7 +6,7 @@ from concurrent.futures import Executor, Future
 
 import pytest
 
-from barpc.tie.tasks import one_by_one
+from barpc.base.tasks import one_by_one
 
 
 class Counting(Executor):
