@@ -39,6 +39,7 @@ from barpc.base.options import OFF, AdjustOptions
 from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
+from barpc.sensor.radar import Radar
 
 
 def adjust_tracks(
@@ -325,8 +326,8 @@ def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment
     """Return the result of two images without findings with the displacements that they would not have shown."""
     cameras = found.problem.cameras
     index = np.flatnonzero(np.isfinite(whole.points[:, 0]) & ~whole.held)
-    other = cameras.unknowns.radars or whole.findings or found.problem.joint_prior is not None
-    if len(cameras.sensors) != 2 or other or len(index) < MANY:
+    other = any(isinstance(sensor, Radar) for sensor in cameras.sensors) or found.problem.joint_prior is not None
+    if len(cameras.sensors) != 2 or other or whole.findings or len(index) < MANY:
         return whole
     points, terrain = whole.points[index[:: len(index) // SAMPLE + 1]], found.heights.dem
     ground, known = ground_from_ecef(points), np.full(len(points), np.nan)
