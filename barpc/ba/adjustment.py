@@ -20,7 +20,7 @@ from barpc.ba.control.snooping import image_test
 from barpc.ba.evidence.scan import neighbours_alike
 from barpc.ba.interior import CommonErrors
 from barpc.ba.resection import resect
-from barpc.ba.result import Adjustment
+from barpc.ba.result import Adjustment, height_derivatives
 from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
@@ -32,12 +32,14 @@ from barpc.ba.select.parts import Parts
 from barpc.ba.solution import Solution, solve_block
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.terms.term import Finding
+from barpc.ba.unseen import unseen_steps, with_unseen
 from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import OFF, AdjustOptions
-from barpc.base.statistics import CRITICAL, ITERATIONS, SAMPLE
+from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
+from barpc.sensor.radar import Radar
 
 
 def adjust_tracks(
@@ -134,6 +136,7 @@ def _solved_adjustment(
         found.heights.warn()
         _warn(found.outcome)
         whole = replace(_adjustment(model, found, options, common), altimetry=heights)
+        whole = _with_unseen(whole, found, parts.inner)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_apart(whole, apart, found, parts.inner, given)
@@ -317,6 +320,26 @@ def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tu
     gauge = _with_survey_errors(_datum_report(found, block, covariance), found, block)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
     return gauge, shares
+
+
+def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment:
+    """Return the result of two images without findings with the displacements that they would not have shown."""
+    cameras = found.problem.cameras
+    index = np.flatnonzero(np.isfinite(whole.points[:, 0]) & ~whole.held)
+    other = any(isinstance(sensor, Radar) for sensor in cameras.sensors) or found.problem.joint_prior is not None
+    if len(cameras.sensors) != 2 or other or whole.findings or len(index) < MANY:
+        return whole
+    points, terrain = whole.points[index[:: len(index) // SAMPLE + 1]], found.heights.dem
+    ground, known = ground_from_ecef(points), np.full(len(points), np.nan)
+    if terrain is not None and whole.terrain is not None and whole.terrain.shows and whole.terrain.agrees:
+        known = np.asarray(terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)
+    _, pull, image = height_derivatives(cameras, whole.params, (0, 1), points)
+    sizes = np.array([view.size for view in block.views], dtype=np.float64)
+    # residuals of two rays are half of their offset; all points count
+    sigma = float(whole.rmse().sum() * np.sqrt(len(points) / len(index)))
+    unseen = unseen_steps(sizes, ground, image, pull, (sigma, whole.options.noise_floor), known)
+    held = bool(found.heights.kinds) or whole.altimetry is not None
+    return replace(whole, unseen=unseen, gauge=with_unseen(whole.gauge, points, unseen.heights(image, pull), held))
 
 
 def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> GaugeReport:

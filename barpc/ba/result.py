@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.linalg as la
 
 from barpc.ba.altimetry import AltimetryTest
 from barpc.ba.constraints.gauge import GaugeReport
@@ -23,6 +24,7 @@ from barpc.ba.robust.variances import PriorTest
 from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.terms.term import Finding
+from barpc.ba.unseen import UnseenSteps
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import MANY
@@ -129,6 +131,8 @@ class Adjustment:
         Errors that images have in common, which are in the covariance.
     deformed : Deformation or None
         A deformation of an image by control, which tie points do not show; drifts were held to what these show.
+    unseen : UnseenSteps or None
+        Of two images without findings: displaced rows and columns that nothing would have shown; they are in `gauge`.
     earlier : BlockPrior or None
         What an earlier block knew of those of its views that are among these.
     options : AdjustOptions
@@ -181,6 +185,7 @@ class Adjustment:
     earlier: BlockPrior | None = field(default=None, repr=False)
     common: CommonErrors | None = field(default=None, repr=False)
     deformed: Deformation | None = None
+    unseen: UnseenSteps | None = None
 
     def __repr__(self) -> str:
         used = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} observations"
@@ -267,10 +272,13 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     points = adjustment.points[seen[:: len(seen) // MANY + 1]]
     n, pair = len(points), (min(first, second), max(first, second))
     cameras, params = adjustment.cameras, adjustment.params
-    by_camera, pull = _height_derivatives(cameras, params, pair, points)
+    by_camera, pull, image = height_derivatives(cameras, params, pair, points)
     by_camera, covariance = by_camera.reshape(n, -1), adjustment.covariance.joint(np.array(pair))
     if adjustment.common is not None:
         by_camera, covariance = _with_common(adjustment, pair, points, (by_camera, pull, covariance))
+    if adjustment.unseen is not None:
+        steps = adjustment.unseen.heights(image, pull)
+        by_camera, covariance = np.hstack([by_camera, steps]), la.block_diag(covariance, np.eye(steps.shape[1]))
     relative = by_camera - by_camera.mean(axis=0)
     return PairHeights(
         (first, second), _rms_uncertainty(by_camera, covariance), _rms_uncertainty(relative, covariance), n
@@ -296,22 +304,26 @@ def _with_common(
     return np.concatenate([by_camera, direct.T], axis=1), whole
 
 
-def height_by_unknowns(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> Array:
-    """Return the derivative (n, 2, q) of heights that two views measure, by the unknowns (N, q) of either.
+def height_derivatives(
+    cameras: Cameras, params: Array, pair: tuple[int, int], points: Array
+) -> tuple[Array, Array, Array]:
+    """Return the derivatives of heights that two views measure, and where these see the points.
 
     Parameters
     ----------
     cameras : Cameras, of N views
+    params : (N, q), their unknowns
     pair : (int, int), the views, ascending
     points : (n, 3), ECEF [m]
+
+    Returns
+    -------
+    by_unknown, pull, image : (n, 2, q), (n, 2, 2), (n, 2, 2)
+        Derivatives by the unknowns of either view, and by its image points [m/px]; image points [px].
     """
-    return _height_derivatives(cameras, params, pair, points)[0]
-
-
-def _height_derivatives(cameras: Cameras, params: Array, pair: tuple[int, int], points: Array) -> tuple[Array, Array]:
-    """Return the same, and the derivative (n, 2, 2) by where either view sees the points."""
     n, num, ground = len(points), len(cameras.sensors), ground_from_ecef(points)
-    cameras = cameras.seeing(np.concatenate([cameras.sensors[view].project(ground) for view in pair]).T)
+    image = np.stack([cameras.sensors[view].project(ground) for view in pair], axis=1)
+    cameras = cameras.seeing(image.swapaxes(0, 1).reshape(-1, 2).T)
     bounds = np.searchsorted(np.repeat(pair, n), np.arange(num + 1))
     projected = cameras.project(params, np.concatenate([points, points]).T, bounds)
     by_point = projected.by_point.reshape(2, 3, 2, n).transpose(3, 2, 0, 1)  # point, view, coordinate, axis
@@ -321,7 +333,7 @@ def _height_derivatives(cameras: Cameras, params: Array, pair: tuple[int, int], 
     normal = np.swapaxes(stacked, 1, 2) @ stacked
     weights = np.linalg.solve(normal, up[..., None])[..., 0]
     pull = np.einsum("nvca,na->nvc", by_point, weights)
-    return -np.einsum("nvc,nvcq->nvq", pull, by_unknown), pull
+    return -np.einsum("nvc,nvcq->nvq", pull, by_unknown), pull, image
 
 
 def _rms_uncertainty(rows: Array, covariance: Array) -> float:

@@ -22,8 +22,9 @@ from scipy.ndimage import maximum_filter
 from barpc.ba import BlockPrior
 from barpc.ba.parameters.projected import Cameras
 from barpc.ba.parameters.unknowns import make_unknowns
-from barpc.ba.result import height_by_unknowns
+from barpc.ba.result import height_derivatives
 from barpc.ba.solving.structure import counting_sort
+from barpc.ba.unseen import UnseenSteps
 from barpc.base.errors import BarpcError, InputError
 from barpc.base.geodesy import CHUNK, Array, IntArray, ecef_from_ground, parts
 from barpc.base.options import TieOptions
@@ -34,6 +35,7 @@ from barpc.export.shots import read_scene
 from barpc.pipeline import load_views
 from barpc.report.finished import FinishedRun
 from barpc.report.runfiles import PRIOR_FILE
+from barpc.report.summary.block import AXES
 from barpc.rpcio.formats import CORRECTION
 from barpc.scene import BoolArray, View
 from barpc.sensor.geometry import intersect_pair
@@ -254,10 +256,14 @@ class NoSurfaceError(BarpcError):
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors:
-    """Views of an adjusted block behind their corrections, and the covariance (V q, V q) of their unknowns."""
+    """Views of an adjusted block behind their corrections, and the covariance (V q, V q) of their unknowns.
+
+    `unseen`: displacements that two images do not show, further unknowns with variances of one.
+    """
 
     cameras: Cameras
     covariance: Array
+    unseen: UnseenSteps | None = None
 
     @classmethod
     def of(cls, prior: BlockPrior, views: Sequence[View]) -> CameraErrors:
@@ -290,15 +296,19 @@ class CameraErrors:
         """
         count, num = len(self.cameras.sensors), len(ground)
         params, ecef = np.zeros((count, self.cameras.unknowns.size)), ecef_from_ground(ground)
-        out = np.zeros((num, *params.shape))
+        out, steps = np.zeros((num, *params.shape)), [np.zeros((num, 0))]
         for sign, group in zip((1, -1), groups, strict=False):
             for pair in group:
-                out[:, pair] += sign / len(group) * height_by_unknowns(self.cameras, params, pair, ecef)
-        return out.reshape(num, -1)
+                by_unknown, pull, image = height_derivatives(self.cameras, params, pair, ecef)
+                out[:, pair] += sign / len(group) * by_unknown
+                steps += [] if self.unseen is None else [self.unseen.heights(image, pull)]
+        return np.concatenate([out.reshape(num, -1), *steps], axis=1)
 
     def sigma(self, rows: Array) -> Array:
         """Return the standard deviation (n,) [m] of heights, or differences of them, of these derivatives (n, V q)."""
-        square: Array = np.einsum("ni,ij,nj->n", rows, self.covariance, rows)
+        known = rows[:, : len(self.covariance)]
+        square: Array = np.einsum("ni,ij,nj->n", known, self.covariance, known)
+        square += (rows[:, len(self.covariance) :] ** 2).sum(axis=1)
         return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
@@ -357,6 +367,12 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
     flagged = frozenset(i for i, shot in enumerate(scene.shots) if shot.entry.advice)
     groups = [_ranked_pairs(views, worth, flagged, part) for part in parts]
     errors = CameraErrors.of(BlockPrior.load(scene.run.table(PRIOR_FILE)), views)
+    if len(views) == 2 and scene.run.summary.scene is not None and (told := scene.run.summary.scene.unseen):
+        sizes, found = np.array([view.size for view in views], dtype=np.float64), np.zeros((2, 2, 2))
+        for one in told:
+            at = [view.name for view in views].index(one.image), AXES.index(one.axis)
+            found[(slice(None), *at)] = one.largest_px, one.height_m
+        errors = replace(errors, unseen=UnseenSteps(sizes, *found))
     images = " minus ".join(", ".join(views[i].name for i in part) for part in parts)
     return StereoBlock(views, groups, images, errors, scene.run)
 

@@ -42,7 +42,7 @@ from barpc.report.records import json_form, value_of
 from barpc.report.summary import LeftOutEntry, Summary
 from barpc.report.summary.block import AXES, HeldOutEntry, LeftEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, counted, enu, median, metres
+from barpc.report.summary.words import NAMED, counted, enu, median, metres, two_digits
 
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
 _SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
@@ -124,6 +124,7 @@ def _block_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             *_of_places(run, found, views),
             *_of_same_ground(run, found),
             *_of_solution(run, found),
+            *_of_known_heights(found),
         )
     yield from _of_earlier(run.added)
     yield from deformation_reasons(found)
@@ -268,6 +269,17 @@ def _of_solution(run: Run, found: Adjustment) -> Iterator[str]:
         )
 
 
+def _of_known_heights(found: Adjustment) -> Iterator[str]:
+    """Yield a displacement that a pair does not show along its epipolar lines, and the DEM does."""
+    if found.unseen is not None and (one := found.unseen.shown) is not None:
+        axis = AXES[one.axis]
+        yield (
+            f"Heights behind {axis.removesuffix('s')} {one.edge:.0f} of {found.names[one.view]} are off the DEM's by "
+            f"{metres(one.metres)}, as if these {axis} were displaced by {one.pixels:.1f} px along the epipolar "
+            "lines, which two images do not show: add an image or GCPs."
+        )
+
+
 def _holds(found: Adjustment) -> bool:
     """Whether altimetry constrains the scene."""
     return found.altimetry is not None and not found.altimetry.why_not
@@ -319,6 +331,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
     yield from _pointing_lines(run, run.adjustment, views)
     yield from _unmet_places(run, run.adjustment, views, matter=False)
+    yield from _unseen_lines(run.adjustment)
     if run.added is not None:
         yield from _added_lines(run.added, len(views))
     yield from reference_lines(run)
@@ -330,6 +343,20 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
+
+
+def _unseen_lines(found: Adjustment) -> Iterator[str]:
+    """Yield the displacement of rows or columns with the largest error of heights that nothing would have shown."""
+    unseen = found.unseen
+    if unseen is None or unseen.shown is not None:
+        return
+    view, axis = np.unravel_index(int(unseen.metres.argmax()), unseen.metres.shape)
+    if (pixels := float(unseen.pixels[view, axis])) > LEAST_MOVED:
+        yield (
+            f"A step of up to {two_digits(pixels)} px of {AXES[axis]} of {found.names[view]} along their axis, near "
+            "the epipolar lines, would not have been seen: heights behind it would be off by "
+            f"{metres(float(unseen.metres[view, axis]))}."
+        )
 
 
 def _pointing_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:

@@ -45,12 +45,12 @@ def test_what_all_cells_share_is_a_mean_over_all_tiles(count: int, monkeypatch: 
     """Of the pairs of each tile, and of a difference less that of the other date's."""
     by_pair = {(0, 1): 1.0, (0, 2): 4.0, (3, 4): 7.0}
 
-    def by_unknowns(cameras: Any, params: Any, pair: tuple[int, int], points: np.ndarray) -> np.ndarray:
+    def derivatives(cameras: Any, params: Any, pair: tuple[int, int], points: np.ndarray) -> Any:
         """Of either view half of what its pair has; and so of the place."""
         rows = np.column_stack([np.full(len(points), by_pair[pair]), points[:, 0]])
-        return np.stack([rows / 2, rows / 2], axis=1)
+        return np.stack([rows / 2, rows / 2], axis=1), None, None
 
-    monkeypatch.setattr(stereo, "height_by_unknowns", by_unknowns)
+    monkeypatch.setattr(stereo, "height_derivatives", derivatives)
     monkeypatch.setattr(stereo, "ecef_from_ground", np.asarray)
     cameras: Any = SimpleNamespace(sensors=range(5), unknowns=SimpleNamespace(size=2))
     tiles = [SimpleNamespace(ground=lambda n=n: np.full((4, 3), float(n))) for n in range(count)]

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba import adjust_tracks
+from barpc.ba import adjust_tracks, pair_heights
+from barpc.ba.unseen import unseen_steps
 from barpc.base.geodesy import ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.report.measures.block import explanations
@@ -79,3 +80,57 @@ def test_rows_displaced_in_both_coordinates_are_no_lost_lines() -> None:
 def test_a_third_image_sees_it_and_where_nothing_jumped_nothing_is_said(lines: float, views: int) -> None:
     run, _ = jumped(lines, views)
     assert not [part for i in range(views) for part in unseen_parts(run, i)]
+
+
+def hidden(pixels: float) -> tuple[Run, float]:
+    """A pair with a step along the epipolar lines of its second image; by how much heights behind it are off [m]."""
+    made = simulate_block(2, 1500, seed=1, per_site=2, size=(600, 600), attitude=5e-6, position=0.3, noise=0)
+    first, second = (view.sensor for view in made.views)
+    low, high = (first.localize(np.array([300.0, 300.0]), np.array(alt)) for alt in (200.0, 300.0))
+    along = second.project(high) - second.project(low)
+    xy = made.tracks.xy + np.random.default_rng(1).normal(0.0, 0.05, made.tracks.xy.shape)
+    xy[(made.tracks.view == 1) & (made.tracks.xy[:, 1] > FROM)] += pixels * along / np.hypot(*along)
+    tracks = replace(made.tracks, xy=xy)
+    run = Run("adjust", made.views, (), tracks, adjustment=adjust_tracks(made.views, tracks))
+    return run, pixels * 100.0 / float(np.hypot(*along))
+
+
+def said(run: Run) -> str:
+    return " ".join(summarize(run).verdict)
+
+
+def test_a_pair_says_what_step_it_would_not_have_seen_and_passes() -> None:
+    run, off = hidden(2.0)
+    summary, unseen = summarize(run), run.adjustment.unseen
+    assert not run.adjustment.findings
+    assert unseen is not None
+    assert summary.passed
+    assert "would not have been seen: heights behind it would be off by" in said(run)
+    largest = max(summary.scene.unseen, key=lambda one: one.height_m)
+    assert largest.height_m / largest.largest_px == pytest.approx(off / 2.0, rel=0.3)
+    heights, without = (pair_heights(replace(run.adjustment, unseen=u), 0, 1) for u in (unseen, None))
+    assert heights.relative > without.relative
+    assert heights.absolute < 1.1 * without.absolute
+
+
+@pytest.mark.parametrize(("rise", "sigma"), [(0.0, 5.0), (12.0, 5.0), (0.0, np.nan)])
+def test_heights_good_to_metres_show_a_step_or_bound_it(rise: float, sigma: float) -> None:
+    """Lines along the rows' axis, 1.3 m of height a pixel."""
+    rng, n = np.random.default_rng(0), 1000
+    image = np.repeat(rng.uniform(0.0, 600.0, (n, 1, 2)), 2, axis=1)
+    pull = np.tile([[0.0, 1.3], [0.0, -1.3]], (n, 1, 1))
+    ground = np.column_stack([image[:, 0] * 5e-6, 200.0 + 0.05 * image[:, 0, 0] + rise * (image[:, 0, 1] > FROM)])
+    known = 200.0 + 0.05 * image[:, 0, 0] + rng.normal(0.0, 1.0, n) * sigma
+    found = unseen_steps(np.full((2, 2), 600.0), ground, image, pull, (0.1, 0.02), known)
+    np.testing.assert_allclose(found.pixels[:, 0], 0.14, atol=0.03)  # across the lines tie points show it
+    np.testing.assert_allclose(found.metres, found.pixels * [0.0, 1.3])
+    if np.isnan(sigma):
+        np.testing.assert_allclose(found.pixels[:, 1], 5.0)
+        assert found.shown is None
+        return
+    # four standard deviations beside a cubic, of which a step in the middle leaves 0.035 of its square
+    assert np.all(found.metres[:, 1] < 2.0 * 4.0 * sigma / np.sqrt(0.035 * n))
+    assert (found.shown is None) == (rise == 0.0)
+    if found.shown is not None:
+        assert abs(found.shown.edge - FROM) < 40
+        assert found.shown.metres == pytest.approx(rise, rel=0.25)

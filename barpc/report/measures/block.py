@@ -30,6 +30,7 @@ from barpc.report.summary.block import (
     LeftEntry,
     ModeEntry,
     SceneEntry,
+    UnseenEntry,
 )
 from barpc.report.summary.words import metres
 
@@ -78,8 +79,17 @@ def measure_scene(run: Run) -> SceneEntry | None:
         solver=adjustment.status,
         explanations=explanations(adjustment),
         left=left_entries(adjustment),
+        unseen=_unseen_entries(adjustment),
         held_out_places=held_out_places(run.met_worse, adjustment.names),
     )
+
+
+def _unseen_entries(adjustment: Adjustment) -> tuple[UnseenEntry, ...]:
+    if (unseen := adjustment.unseen) is None:
+        return ()
+    places = [(v, axis) for v in range(2) for axis in range(2)]
+    of = adjustment.names
+    return tuple(UnseenEntry(of[v], AXES[a], float(unseen.pixels[v, a]), float(unseen.metres[v, a])) for v, a in places)
 
 
 def _justification(adjustment: Adjustment, what: str) -> JustificationEntry | None:

@@ -169,6 +169,15 @@ class HeldOutEntry(Record):
     )
 
 
+class UnseenEntry(Record):
+    """Rows or columns of an image, displaced behind an edge unseen."""
+
+    image: str = column("View")
+    axis: str = column("Their axis, along which they are displaced", enum=AXES)
+    largest_px: float = column("The largest, at most 5 rows or 1 column", "px")
+    height_m: float = column("Error of heights behind it", "m")
+
+
 class SceneEntry(Record):
     """The block."""
 
@@ -210,6 +219,9 @@ class SceneEntry(Record):
         "Hypotheses on residuals in the order of their selection", default=()
     )
     left: tuple[LeftEntry, ...] = column("Rows and columns that are inconsistent with the rest in the end", default=())
+    unseen: tuple[UnseenEntry, ...] = column(
+        "Displacements of a pair without findings that nothing would have shown", default=()
+    )
     held_out_places: tuple[HeldOutEntry, ...] | None = column(
         "Regions with larger residuals of check tie points; null: not tested", default=None
     )
