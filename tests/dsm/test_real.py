@@ -107,7 +107,7 @@ def test_the_report_shows_the_same_window_before_and_after(surface, copied):
     page = (copied / "report.html").read_text(encoding="utf-8")
     assert "Which ground do they reconstruct?" in page
     assert page.count("from the delivered cameras, lit") == page.count("from the corrected cameras, lit") == 2
-    assert f"differ by {metres(before.nmad_m)} and by {metres(after.nmad_m)}" in page
+    assert f"differ by {metres(before.nmad_m)} and {metres(after.nmad_m)}" in page
     assert page.count('class="swipe"') == 1
     assert "img_01 (left) and img_03 (right) draped over the surface from the corrected cameras" in page
     assert len(page) < 2_000_000

@@ -87,7 +87,7 @@ def test_the_run_says_what_the_reference_did(held, place):
     assert found["used"]
     assert found["step_m"] == pytest.approx(2.0, rel=1e-3)
     assert all(view["num_points"] <= view["num_passed"] <= view["num_tried"] for view in found["views"])
-    (line,) = [line for line in held.summary["verdict"] if line.startswith("Reference:")]
+    (line,) = [line for line in held.summary["verdict"] if line.startswith("The reference was matched")]
     assert "in 3 images" in line
     assert not [line for line in held.summary["verdict"] if "Without ground control" in line]
     points = read_gcps(place / "held/tables/gcps.geojson", [view.name for view in held.run.views])

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from barpc.base.tasks import Store
 from barpc.workspace import Workspace
 from tests.lanes import rest_slow
 
@@ -209,8 +210,8 @@ def test_damaged_results_are_made_again(crops, ran, out, tmp_path, damage):
 @pytest.mark.slow
 def test_results_of_another_version_are_not_used(crops, out, monkeypatch):
     made, kept = [], set(out.glob(".barpc/cache/*/*.npz"))
-    store = Workspace.store
-    monkeypatch.setattr(Workspace, "store", lambda *args: (made.append(args[1]), store(*args)))
+    write = Store.write
+    monkeypatch.setattr(Store, "write", lambda *args: (made.append(args[1]), write(*args)))
     assert barpc("adjust", *crops, "-o", out, "--overwrite").code == 0
     assert made == []
     monkeypatch.setattr("barpc.workspace.code_version", lambda: "another")

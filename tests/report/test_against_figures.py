@@ -94,6 +94,17 @@ def _(s, *counts):
     assert sorted(map(int, counts)) == sorted((s.tracks.num_tracks, len(s.views), s.tracks.num_observations))
 
 
+@says(
+    rf"A step of up to {NUM} px of (rows|columns) of (\w+) along their axis, near the epipolar lines, would not have "
+    rf"been seen: heights behind it would be off by {LENGTH}\."
+)
+def _(s, pixels, axis, name, height):
+    worst = max(s.scene.unseen, key=lambda one: one.height_m)
+    assert (worst.image, worst.axis) == (name, axis)
+    near(pixels, worst.largest_px)
+    assert height == metres(worst.height_m)
+
+
 @says(r"The scene as a whole moved by ([-+].* up)\.")
 def _(s, shift):
     assert shift == enu(s.scene.shift_enu_m)

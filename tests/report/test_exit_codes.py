@@ -142,7 +142,7 @@ def test_an_image_is_judged_by_tie_points_that_took_no_part(noise, said, block_r
     assert view["held_out_px"] == 0.31
     assert (view["status"] == "doubtful") == said
     if said:
-        assert "check tie points have residuals of 0.31 px, 2.6 times" in view["advice"]
+        assert "Check tie points have residuals of 0.31 px, 2.6 times" in view["advice"]
         assert not summary["passed"]
 
 

@@ -36,7 +36,7 @@ def adjusted(**fields: Any) -> Any:
     """An adjustment of three images that nothing is to be said of."""
     usual = {
         "left_out": (), "names": NAMES, "noise": 1.0, "in_space_rms": None, "two_groups": (), "control": None,
-        "deformed": None, "findings": (), "left": (), "alike": np.full(3, 9.0),
+        "deformed": None, "unseen": None, "findings": (), "left": (), "alike": np.full(3, 9.0),
         "reference_inlier": np.zeros(0, bool),
         "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
