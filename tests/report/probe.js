@@ -28,7 +28,7 @@ frame.addEventListener("load", () => {
   const table = page.querySelector("#t-images"), heads = [...table.tHead.rows[0].cells];
   const column = name => heads.findIndex(head => head.textContent.startsWith(name));
   const values = k => [...table.tBodies[0].rows].map(row => row.cells[k].textContent);
-  const points = column("tie points"), image = column("image");
+  const points = column("used"), image = column("image");
   heads[points].firstElementChild.click(); found.up = values(points); found.sorted = heads[points].getAttribute("aria-sort");
   heads[points].firstElementChild.click(); found.down = values(points);
   heads[image].firstElementChild.click(); found.names = values(image); found.unsorted = heads[points].getAttribute("aria-sort");

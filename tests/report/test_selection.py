@@ -51,7 +51,7 @@ def test_an_outline_that_is_clicked_is_chosen_in_the_tables_and_not_when_clicked
     assert lit == ["2"]
     assert [row for row in rows if row.startswith("t-images")] == ["t-images view_0002"]
     assert len([row for row in rows if row.startswith("t-pairs")]) == len(partners)
-    assert said == f"view_0002: {block_run.summary['views'][2]['num_observations']} tie points"
+    assert said == f"view_0002: {block_run.summary['views'][2]['num_observations']} used"
     assert found["again"] == [[], [], ""]
 
 
