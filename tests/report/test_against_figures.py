@@ -95,10 +95,10 @@ def _(s, *counts):
 
 
 @says(
-    rf"A step of up to {NUM} px of (rows|columns) of (\w+) along their axis, near the epipolar lines, would not have "
-    rf"been seen: heights behind it would be off by {LENGTH}\."
+    rf"A jump of (rows|columns) of (\w+) by {NUM} px or less would not show in tie points of two images\. Heights "
+    rf"behind it would be off by {LENGTH} or less\."
 )
-def _(s, pixels, axis, name, height):
+def _(s, axis, name, pixels, height):
     worst = max(s.scene.unseen, key=lambda one: one.height_m)
     assert (worst.image, worst.axis) == (name, axis)
     near(pixels, worst.largest_px)
