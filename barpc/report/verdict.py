@@ -156,7 +156,7 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
             f"The cameras are {common:.1f} times less accurate than stated, and so is the scene's position. Check the "
             "stated accuracies, or add GCPs or a DEM."
         )
-    yield from _of_image_model(found)
+    yield from _of_image_model(run, found)
     if found.apart is not None and not found.apart.clear:
         error = "wrong tie points or " * found.apart.look.as_stated + "an RPC that does not match it"
         yield (
@@ -165,17 +165,26 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
         )
 
 
-def _of_image_model(found: Adjustment) -> Iterator[str]:
-    """Yield the selection of an affine in the image, and the uncertainty of the scene's shape with it."""
+def _of_image_model(run: Run, found: Adjustment) -> Iterator[str]:
+    """Yield the selection of an affine in the image, and the uncertainty of the scene's shape with it.
+
+    Or that alone, where heights are less certain than the position that `_known_lines` says.
+    """
     if found.in_space_rms is None:
+        if _by_cameras_alone(run, found) and found.gauge.motion_sigma[_SHAPE].max() > found.gauge.sigma[2]:
+            yield _shape_sentence(found)
         return
     yield (
         f"Rotations and translations leave {found.in_space_rms:.3f} px at check tie points, an affine transform per "
         f"image {median(found.held_out_rms):.3f} px: the affine is used. This is unusual: check that no image was "
         "resampled, and that each RPC belongs to its image."
     )
+    yield _shape_sentence(found)
+
+
+def _shape_sentence(found: Adjustment) -> str:
     (east, north), (*bends,) = (found.gauge.motion_sigma[part] for part in (_SHAPE[:2], _SHAPE[2:]))
-    yield (
+    return (
         f"The scene may be tilted, by {metres(east)} at its eastern and {metres(north)} at its northern edge "
         f"({metres(found.gauge.radius)} out), and bent, by {metres(max(bends))}. Add GCPs or a DEM before using "
         "heights."
@@ -406,17 +415,28 @@ def _of_earlier(added: Added | None) -> Iterator[str]:
         )
 
 
+def _is_placed(run: Run, found: Adjustment) -> bool:
+    """Whether altimetry, a reference or cameras that are held constrain the scene's position."""
+    return bool(_holds(found) or (run.reference and run.reference.control) or run.known or found.options.fixed)
+
+
+def _by_cameras_alone(run: Run, found: Adjustment) -> bool:
+    """Whether nothing but the accuracies of the cameras constrains the scene's position."""
+    by_terrain = found.terrain is not None and bool(found.terrain.shows and found.terrain.held)
+    return run.gcps is None and not by_terrain and not _is_placed(run, found)
+
+
 def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
     """Yield the uncertainty of the scene's position, and its source."""
     known = f"the scene's position is uncertain by {lengths(found.gauge.sigma)} (east, north, up; 1 sigma)"
     if run.gcps is not None:
         yield from held_lines(found.control, run.gcps, views, known)
-    elif _holds(found) or (run.reference and run.reference.control) or run.known or found.options.fixed:
-        yield f"{known[0].upper()}{known[1:]}."
-    elif (terrain := found.terrain) is not None and terrain.shows and terrain.held:
-        yield f"With the DEM, {known}."
-    else:
+    elif _by_cameras_alone(run, found):
         yield f"Without ground control, {known}."
+    elif _is_placed(run, found):
+        yield f"{known[0].upper()}{known[1:]}."
+    else:
+        yield f"With the DEM, {known}."
 
 
 def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:

@@ -46,7 +46,7 @@ def adjusted(**fields: Any) -> Any:
         "changed": 0.0,
         "gauge": SimpleNamespace(shift=np.array([1.0, -2.0, 3.0]), sigma=np.array([1.0, 2.0, 0.5]) * 10,
                                  delivered_sigma=np.array([1.0, 2.0, 0.5]) * 10,
-                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 5.0, 6.0, 7.0, 0.8, 9.0, 0.1]),
+                                 motion_sigma=np.array([1.0, 2.0, 3.0, 0.4, 4.5, 6.0, 7.0, 0.8, 4.0, 0.1]),
                                  radius=800.0),
         "apart": None, "altimetry": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
     }  # fmt: skip
@@ -342,6 +342,15 @@ def test_an_affine_in_the_image_says_what_it_was_better_than():
         )
 
 
+@pytest.mark.parametrize(("bend", "reserved"), [(4.9, False), (5.1, True)])
+def test_a_shape_that_is_less_certain_than_the_position_needs_a_look(bend: float, reserved: bool) -> None:
+    """Unless something else than the cameras places the scene: then its own sentences say how well."""
+    gauge = SimpleNamespace(**vars(adjusted().gauge))
+    gauge.motion_sigma = np.array([1.0, 2.0, 5.0, 0.4, 0.3, 6.0, 7.0, 0.8, bend, 0.1])
+    assert any("and bent, by" in one for one in reasons(adjusted(gauge=gauge))) == reserved
+    assert not any("and bent, by" in one for one in reasons(adjusted(gauge=gauge, control=control()), gcps=gcps()))
+
+
 def test_two_groups_are_not_said_again_of_an_odd_image():
     groups = (TwoGroups((0, 2), 0.31, 0.42),)
     (line,) = reasons(adjusted(two_groups=groups))
@@ -355,7 +364,7 @@ def test_two_groups_are_not_said_again_of_an_odd_image():
 
 def moved(by: float, **fields: Any) -> Any:
     shift, sigma = np.array([0.0, -by, 0.1]), np.array([0.0, 2.0, 1.0])
-    gauge = {"shift": shift, "sigma": sigma * 0.1, "delivered_sigma": sigma, "motion_sigma": np.ones(10)}
+    gauge = {"shift": shift, "sigma": sigma * 0.1, "delivered_sigma": sigma, "motion_sigma": np.full(10, 0.05)}
     return adjusted(gauge=SimpleNamespace(**gauge), **fields)
 
 
