@@ -75,6 +75,8 @@ GDAL_OPTIONS: dict[str, Any] = {
 """Settings under which every raster is read."""
 _NO_SIDECAR_OPTIONS: dict[str, Any] = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
 # An .ovr, .msk or .aux.xml beside an image may be, or name, a web service: GDAL is told that there is none.
+_LOOKS_BESIDE_JP2 = tuple(map(int, rasterio.__gdal_version__.split(".")[:2])) < (3, 10)
+"""Whether GDAL looks for such files beside a JPEG 2000 in spite of that."""
 
 _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 
@@ -118,8 +120,8 @@ def _open_dataset(file: PathOrUrl, driver: str) -> Any:
         refuse_foreign_channels(file)
     if isinstance(file, Remote):
         return _opened_remote(file, driver)
-    if driver == "ENVI":
-        return _opened_raw(file)
+    if driver == "ENVI" or (driver == "JP2OpenJPEG" and _LOOKS_BESIDE_JP2):
+        return _opened_alone(file, driver)
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         return rasterio.open(file, driver=driver)
@@ -173,15 +175,16 @@ def _open_visible(driver: str, files: Mapping[str, Callable[[], Any]]) -> Any:
 
 
 @contextmanager
-def _opened_raw(file: Path) -> Iterator[Any]:
+def _opened_alone(file: Path, driver: str) -> Iterator[Any]:
+    """Open a file on disk of which GDAL sees no other beside it, but of raw pixels the header as it was read."""
     with ExitStack() as stack:
-        header = partial(BytesIO, shown_header(file))
-        files: dict[str, Callable[[], Any]] = {
-            _VISIBLE_NAME: lambda: stack.enter_context(opened(file, IMAGE)),
-            f"{_VISIBLE_NAME}.hdr": header,
-        }
-        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="TRUE"):  # not longer: other files may be opened meanwhile
-            dataset = _open_visible("ENVI", files)
+        files: dict[str, Callable[[], Any]] = {_VISIBLE_NAME: lambda: stack.enter_context(opened(file, IMAGE))}
+        found = {}
+        if driver == "ENVI":
+            files[f"{_VISIBLE_NAME}.hdr"] = partial(BytesIO, shown_header(file))
+            found = {"GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"}
+        with rasterio.Env(**found):  # not longer: other files may be opened meanwhile
+            dataset = _open_visible(driver, files)
         with dataset:
             yield dataset
 
