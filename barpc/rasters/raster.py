@@ -176,7 +176,7 @@ def _open_visible(driver: str, files: Mapping[str, Callable[[], Any]]) -> Any:
 
 @contextmanager
 def _opened_alone(file: Path, driver: str) -> Iterator[Any]:
-    """Open a file on disk of which GDAL sees no other beside it, but of raw pixels the header as it was read."""
+    """Open a file on disk so that GDAL sees no file beside it: only the header of raw pixels, written anew."""
     with ExitStack() as stack:
         files: dict[str, Callable[[], Any]] = {_VISIBLE_NAME: lambda: stack.enter_context(opened(file, IMAGE))}
         found = {}

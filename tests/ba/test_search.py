@@ -178,7 +178,8 @@ WORLDS: dict[str, tuple[tuple[Displacement, ...], int, dict[tuple[str, int], flo
 """What is displaced, the seed of the block, and what is to be named, with its size [px]."""
 
 
-@pytest.mark.landing(2)
+@pytest.mark.costs(3)
+@pytest.mark.landing(1)
 @pytest.mark.parametrize("world", rest_slow(WORLDS))
 def test_terms_are_named_that_together_explain_most_though_another_does_by_itself(sized, world: str) -> None:
     """They are found among rivals of the best: without rivals other images are named."""

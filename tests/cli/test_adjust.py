@@ -213,7 +213,9 @@ def test_images_that_do_not_overlap(crops, tmp_path):
     assert_refused(*result, tmp_path / "o", "view_00", "far", "overlap")
 
 
-@pytest.mark.parametrize("what", ["nodata", "constant", pytest.param("noise", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "what", ["nodata", "constant", pytest.param("noise", marks=[pytest.mark.slow, pytest.mark.costs(6)])]
+)
 def test_images_that_show_nothing_in_common(crops, tmp_path, what):
     rng = np.random.default_rng(3)
     change = {

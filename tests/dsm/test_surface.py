@@ -227,6 +227,7 @@ def test_the_report_of_a_run_shows_its_surface_but_no_change_and_images_have_non
     assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "images.tif"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_run_makes_its_surface_as_one_of_its_own_files(rendered, tmp_path, capsys):
     folder = tmp_path / "run"

@@ -69,6 +69,7 @@ def test_a_chain_that_held_ends_where_the_whole_does_when_it_is_updated(tmp_path
         assert abs(pair.epipolar_before.median) < 0.01
 
 
+@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -> None:
     """Half a pixel of bending along the epipolar lines of a pair, which the pair cannot see."""
@@ -87,7 +88,7 @@ def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -
     assert found.record.status == "look"
 
 
-@pytest.mark.costs(6)
+@pytest.mark.costs(8)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (0, 2, 1)])

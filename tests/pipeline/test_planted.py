@@ -29,7 +29,7 @@ def start(shared_data):
     return made
 
 
-@pytest.mark.costs(14)
+@pytest.mark.costs(18)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(

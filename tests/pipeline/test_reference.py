@@ -190,6 +190,7 @@ def coarser(path, step: float, folder):
     return coarse
 
 
+@pytest.mark.costs(4)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 @pytest.mark.parametrize(

@@ -153,7 +153,8 @@ def undisturbed(project: Path, tmp_path_factory: pytest.TempPathFactory) -> dict
     return {verb: (said, made) for verb, (said, made) in found.items()}
 
 
-@pytest.mark.landing(5)
+@pytest.mark.costs(3)
+@pytest.mark.landing(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("edit", EDITS)
 def test_no_verb_is_silent_about_an_edit(project, undisturbed, tmp_path, monkeypatch, caplog, edit) -> None:
@@ -174,6 +175,7 @@ def test_no_verb_is_silent_about_an_edit(project, undisturbed, tmp_path, monkeyp
     assert refused == refused_by
 
 
+@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["all is moved", "all is copied", "the runs are copied", "the inputs are beside"])

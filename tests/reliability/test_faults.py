@@ -455,7 +455,15 @@ AT_WORK = (  # told or borne after much work or waiting, or after dask is import
 
 
 @pytest.mark.few(30)
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK)) for name in FAULTS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            name, marks=[pytest.mark.slow] * (name in AT_WORK) + [pytest.mark.nightly] * (name == "nothing but noise")
+        )
+        for name in FAULTS
+    ],
+)
 def test_a_fault_is_one_line_and_leaves_nothing(name, scene, tmp_path, monkeypatch):
     prepare, code, words = FAULTS[name]
     monkeypatch.chdir(scene.folder)

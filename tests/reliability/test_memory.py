@@ -168,8 +168,9 @@ def test_a_worker_says_what_its_own_memory_is(monkeypatch) -> None:
     assert outcome[2] is MAPPED
 
 
+@pytest.mark.costs(3)
 @pytest.mark.slow
-@pytest.mark.landing(3)
+@pytest.mark.landing(2)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems bound no address space")
 @pytest.mark.parametrize("megabytes", [250, 550, 350, 450, 500, 600, 625, 650, 700, 800, 1000])
 @pytest.mark.parametrize("verb", ["adjust", "verify"])

@@ -93,7 +93,7 @@ def small_runs(tmp_path_factory) -> dict[str, Finished]:
 @pytest.mark.parametrize(
     ("verb", "step"),
     [
-        ("check", 11),
+        pytest.param("check", 11, marks=pytest.mark.costs(3)),
         pytest.param("check", 1, marks=pytest.mark.slow),
         pytest.param("adjust", 7, marks=pytest.mark.nightly),
         pytest.param("adjust", 1, marks=pytest.mark.nightly),
