@@ -362,8 +362,8 @@ def _unseen_lines(found: Adjustment) -> Iterator[str]:
     view, axis = np.unravel_index(int(unseen.metres.argmax()), unseen.metres.shape)
     if (pixels := float(unseen.pixels[view, axis])) > LEAST_MOVED:
         yield (
-            f"A jump of {AXES[axis]} of {found.names[view]} by {two_digits(pixels)} px or less would not show in tie "
-            "points of two images. Heights behind it would be off by "
+            f"A jump of {AXES[axis]} of {found.names[view]} along their axis by {two_digits(pixels)} px or less would "
+            "not show in tie points of two images. Heights behind it would be off by "
             f"{metres(float(unseen.metres[view, axis]))} or less."
         )
 

@@ -95,8 +95,8 @@ def _(s, *counts):
 
 
 @says(
-    rf"A jump of (rows|columns) of (\w+) by {NUM} px or less would not show in tie points of two images\. Heights "
-    rf"behind it would be off by {LENGTH} or less\."
+    rf"A jump of (rows|columns) of (\w+) along their axis by {NUM} px or less would not show in tie points of two "
+    rf"images\. Heights behind it would be off by {LENGTH} or less\."
 )
 def _(s, axis, name, pixels, height):
     worst = max(s.scene.unseen, key=lambda one: one.height_m)
