@@ -1,11 +1,11 @@
-"""Which control points agree with each other, found before any of them moves a camera.
+"""Find the set of ground control points that agree with each other, before any of them constrains the cameras.
 
-The block is solved by its tie points alone; control points are seen in it, and their places are no constraint. What the
-block says of a point minus its given place is d = U a + n: the block's free motions (a, standard normal; a shift of
-any size is one of them) and what is the point's own, n, whitened to unit variance: the stated accuracy of its place and
-that of its rays. A set S of points agrees as well as its evidence says, the density of d with the motions integrated
-out; the points outside are wrong by anything, alike at all sizes. All accuracies of n may be s times too good, and
-the cameras' motions l times larger than their covariance: the data choose among a few (MacKay 1992).
+The block is adjusted by its tie points alone; control points are triangulated in it, without a prior on their position.
+The triangulated minus the given position of a point is d = U a + n. Here a are the free motions of the block (standard
+normal; shifts of any size are among them), and n is the error of the point itself, whitened to unit variance: of its
+stated position and of its rays. The evidence of a set of points is the density of their d with the motions integrated
+out. Points outside the set are wrong, with errors uniform in the logarithm of their size. The standard deviations of n
+may be understated by a factor, and those of the motions by another; the data choose both among a few (MacKay 1992).
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ from barpc.base.geodesy import Array, enu_basis, parts
 from barpc.base.statistics import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 
-UNCONSTRAINED_SIGMA = (
-    1e4  # m: a place so uncertain holds nothing, and keeps a point that one ray shows from running away
-)
+UNCONSTRAINED_SIGMA = 1e4  # m: holds no camera, but keeps a point of one ray from diverging
 _MAX_SET_POINTS = 50_000  # points of sets at a time: some 25 MB
-_SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # more than five times is wrong, not optimistic
-# chance that no sample of three is free of outliers, at which no more are drawn: of all of them where half are wrong
+_SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # of understated standard deviations; beyond the last a point is wrong
+# sampling ends where the probability that all samples of three had outliers is that of all samples with half wrong
 _ENOUGH = (1.0 - 0.5**3) ** (TRIALS // 2)
 ODDS = float(-np.log(LEVEL))
-"""Nats that it costs to call a point wrong, and each factor of e in accuracies or motions; and by which a set must
-beat any other that contradicts it: one in twenty."""
+"""Log of the prior odds against a wrong point, and against each factor e of understated standard deviations [nats].
+
+A set must also exceed a contradicting set by it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """The set of control points that agree and hold a block.
+    """The set of control points that agree, and are used.
 
     Parameters
     ----------
     used : (G,)
-        Points that agree with each other, and more than half of what may be said against them does not.
+        Mask of the points that agree with each other.
     sets : tuple of (G,)
-        Two sets that contradict each other and weigh the same: none is used. Empty where one is.
+        Two contradicting sets of equal evidence, neither of which is used; empty where one set is used.
     scale : float
-        Factor by which the stated accuracies of the points used are too good; 1: they are not.
+        Factor by which the standard deviations of the points used are understated; 1: they are not.
     alike : bool
-        Whether the points that are not used, two or more, agree with each other: in another datum, perhaps.
+        Whether two or more unused points agree with each other: they may have another datum.
     torn : (2,)
-        Residuals of check tie points, without control and with it [px, RMS], where control that agrees with
-        itself would raise them, so that none is used; else empty.
+        RMS of check tie points without and with control [px], where the control agrees with itself but raises it, so
+        that no point is used; else empty.
     """
 
     used: BoolArray
@@ -65,13 +65,15 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """The adjusted places of control points minus their given ones, in units of each point's own accuracy.
+    """Triangulated minus given positions of G control points, whitened by the errors of each point itself.
 
     Parameters
     ----------
     own : (G, 3)
+        Offsets.
     motions : (G, 3, r)
-        By the free motions of the block, of one standard deviation; the last three are shifts of any size.
+        Derivatives of the offsets by r free motions of the block, each in units of its standard deviation. The last
+        three are shifts of any size.
     """
 
     own: Array
@@ -83,25 +85,28 @@ class Offsets:
 
     @cached_property
     def products(self) -> Array:
-        """Products (G, r + 1, r + 1) of every point's motions and, the last, its offset with each other."""
+        """Normal matrix (G, r + 1, r + 1) of each point: of its motions and, in the last row and column, its offset."""
         both = np.concatenate([self.motions, self.own[..., None]], axis=2)
         return np.asarray(np.swapaxes(both, 1, 2) @ both)
 
     def sums(self, masks: BoolArray) -> Array:
-        """Return the sums (B, r + 1, r + 1) of the products of the points in sets (B, G)."""
+        """Return the sums (B, r + 1, r + 1) of `products` over the points of sets (B, G)."""
         flat = self.products.reshape(len(self.own), -1)
         return np.asarray((masks.astype(np.float64) @ flat).reshape(-1, *self.products.shape[1:]))
 
 
 def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array) -> Offsets:
-    """Estimate the offsets of control points at a solution without control.
+    """Return the offsets of the control points of a block from a solution without control.
 
     Parameters
     ----------
-    covariance : Covariance, of the solution
+    covariance : Covariance
+        Of the solution.
     block : Block
-    points : (P, 3), adjusted, ECEF [m]
-    faint : (P,), times by which observations of a point count as noisier there
+    points : (P, 3)
+        Adjusted points, ECEF [m].
+    faint : (P,)
+        Factors on the standard deviation of the observations of each point in that solution.
     """
     gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
     count, q = len(gcps.names), covariance.num_unknowns
@@ -129,10 +134,10 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
 
 
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
-    """Find the control points that hold a block, among those that can be judged, `told` (G,); the others go
-    with them.
+    """Find the control points to use, among those that two or more rays triangulate, `told` (G,).
 
-    Every set is looked at where they are few (twelve); of more, those that agree with three drawn at random.
+    Points that cannot be compared are used with the others. All sets of up to twelve points are compared; of more
+    points, the sets that agree with three points drawn at random.
     """
     given = np.flatnonzero(told)
     if len(given) < 2:
@@ -156,7 +161,7 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
-    """Return whether all points are as near as nineteen times of twenty, and no better without one."""
+    """Return whether the offsets of all points pass a chi-square test, and removing any point loses evidence."""
     count = len(offsets.own)
     every = SetEvidence(offsets, np.ones((1, count), dtype=bool))
     freedom = 3.0 * (count - 1)  # a shift is free
@@ -165,7 +170,7 @@ def _fits_as_stated(offsets: Offsets) -> bool:
 
 
 class _SubsetSearch:
-    """Sets of points that are compared, and their evidence."""
+    """The search of the set of points with the largest evidence."""
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
@@ -183,16 +188,19 @@ class _SubsetSearch:
                 self._add(self._drawn(rest))
 
     def best(self) -> tuple[BoolArray, float, float]:
-        """Return the set with the largest evidence, that, and the scale of its accuracies."""
+        """Return the set (G,) with the largest evidence, its evidence, and the factor on its standard deviations."""
         n = int(self.score.argmax())
         return self.masks[n], float(self.score[n]), float(self.factors[n, 0])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
-        """Return the set that contradicts the best and weighs as much, the rest without a majority, or None."""
+        """Return the set that contradicts the best with as much evidence, or the other points if they are a majority.
+
+        None if there is neither.
+        """
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
         if len(other):
-            # how well as many points happen to fit is no vote
+            # the fit of a set of the same size may be better by chance
             least = np.where(size[other] >= best.sum(), 2.0 * SURE, ODDS)
             rival = np.where(self.score[other] > score - least, self.score[other], -np.inf)
             if np.isfinite(rival).any():
@@ -200,7 +208,7 @@ class _SubsetSearch:
         return None if 2 * best.sum() >= self.count else ~best
 
     def _drawn(self, among: BoolArray) -> BoolArray:
-        """Return the sets (B, G) that agree with three points drawn from some; the same whenever they are drawn."""
+        """Return the sets (B, G) of points that agree with three points drawn from `among`; the seed is fixed."""
         some = self.offsets.select(among)
         rng, count = np.random.default_rng(0), len(some.own)
         every = np.arange(count)
@@ -223,8 +231,10 @@ class _SubsetSearch:
         return out
 
     def _refine(self, n: int) -> None:
-        """Move points into or out of a set as long as that raises its evidence: all that do by themselves, or the one
-        that does most.
+        """Move points into or out of set `n` while this raises its evidence.
+
+        In each iteration all points with a positive gain are moved, or only that with the largest gain, whichever is
+        better.
         """
         for _ in range(self.count):
             mask, before = self.masks[n], self.score[n]
@@ -242,14 +252,15 @@ class _SubsetSearch:
                 break
 
     def _add(self, masks: BoolArray) -> None:
-        """Add sets to those whose evidence is compared."""
+        """Compute the evidence of sets (B, G) and add them to the search."""
         score, factors = self._scored(masks)
         self.masks = np.concatenate([self.masks, masks])
         self.score, self.factors = np.append(self.score, score), np.concatenate([self.factors, factors])
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
-        """Return the evidence (B,) of sets (B, G), and the factors (B, 2) on accuracies and motions that it has it
-        with; minus infinity for sets too unlikely to contradict the best.
+        """Return the evidence (B,) of sets (B, G), and the factors (B, 2) of standard deviations and motions.
+
+        The evidence is minus infinity for sets that cannot contradict the best.
         """
         best = self.score.max(initial=-np.inf)
         score, factors = np.full(len(masks), -np.inf), np.ones((len(masks), 2))
@@ -293,8 +304,9 @@ class SetEvidence:
         self._inside = -0.5 * (self.squares + volume) - of_points - ODDS * np.log(times * motions)
 
     def deviations(self, points: IntArray) -> tuple[Array, Array]:
-        """Return the squared deviations (B, n) of points from their prediction by each set, in its variances, and the
-        logarithms of the determinants of these.
+        """Return the squared deviations (B, n) of points from their prediction by each set, over its covariance.
+
+        Also returned: the log determinants (B, n) of these covariances.
         """
         left, turned = self._seen(points)
         return _deviation(left, self._spread(turned))
@@ -308,14 +320,14 @@ class SetEvidence:
         return np.asarray(self._inside[part] - (wrong * out[:, some]).sum(axis=1))
 
     def at_most(self) -> Array:
-        """Return upper limits (B,) of the log evidence of the sets, by their own points."""
+        """Return upper limits (B,) of the log evidence of the sets, computed from their own points alone."""
         least = _anywhere(np.zeros(1), 3.0 * np.log(self.variance))
         return np.asarray(self._inside - least * (~self.masks).sum(axis=1))
 
     def gains(self, points: IntArray) -> Array:
-        """Return the gains (n,) in the evidence of the only set by single points moved into it, or out of it.
+        """Return the gains (n,) of the evidence of the only set by moving each point into it, or out of it.
 
-        A point is an update of rank three of the predictions.
+        Each is an update of rank three of the predictions (Woodbury).
         """
         inside, out = self.masks[0, points], np.flatnonzero(~self.masks[0])
         left, turned = self._seen(points)
@@ -344,29 +356,28 @@ class SetEvidence:
         return np.asarray(gain)
 
     def _seen(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
-        """Return the offsets (B, n, 3) of points minus their predictions by sets, and their motions (B, n, 3, r)."""
+        """Return the deviations (B, n, 3) of points from their prediction by sets, and motions (B, n, 3, r)."""
         motions, root = self.offsets.motions[points], self._root[part]
         turned = (motions.reshape(-1, motions.shape[2]) @ root).reshape(len(root), *motions.shape)
         return self.offsets.own[points] - (turned @ self._mean[part, None, :, None])[..., 0], turned
 
     def _spread(self, turned: Array, sign: Array | float = 1.0) -> Array:
-        """Return the covariances (6, B, n) of points, lower triangles, by their motions, which are added or taken
-        off.
-        """
+        """Return the covariances (6, B, n) of points, lower triangles, with motions added (sign 1) or removed (-1)."""
         rows = [sign * np.einsum("bnr,bnr->bn", turned[:, :, i], turned[:, :, j]) for i, j in TRIANGLE]
         return np.stack([row + self.variance * (i == j) for row, (i, j) in zip(rows, TRIANGLE, strict=True)])
 
 
 def _deviation(left: Array, spread: Array) -> tuple[Array, Array]:
-    """Return the squares of vectors (..., 3) in variances (6, ...), and the logarithms of these' determinants."""
+    """Return the squared Mahalanobis lengths of vectors (..., 3), and the log determinants of covariances (6, ...)."""
     lower = cholesky3(spread)
     squared = (solve_lower(lower, np.moveaxis(left, -1, 0)) ** 2).sum(axis=0)
     return squared, 2.0 * np.log(lower[[0, 3, 5]]).sum(axis=0)
 
 
 def _anywhere(squared: Array, volume: Array | float) -> Array:
-    """Return minus the log density of wrong points, by their squared deviations and the determinants of these'
-    variances: alike in the logarithm of their size from one standard deviation on, to 10,000.
+    """Return minus the log density of wrong points, from squared deviations and log determinants of covariances.
+
+    The density is uniform in the logarithm of the deviation, from one to 10,000 standard deviations.
     """
     ball = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
     return np.asarray(1.5 * np.log(np.maximum(squared, 1.0)) + ball + 0.5 * volume + ODDS)

@@ -1,11 +1,9 @@
-"""Control points tested against each other and the cameras: data snooping (Baarda 1968).
+"""Tests of ground control points against each other and the cameras: data snooping (Baarda 1968).
 
-A control point that is used pulls its own residual towards zero, the more the less there is beside it. With Q_l the
-covariance stated of its place and Q_x that of the adjusted point, the residual v = adjusted - given has the covariance
-Q_v = Q_l - Q_x, and what all the others predict of it is off by Q_l Q_v^-1 v: leave-one-out without leaving one out.
-All together they are tested by the sum of v^T Q_l^-1 v over the points: errors that are no one's alone show there.
-
-Where they are seen is tested, too: every residual in an image over its own standard deviation, Baarda's w.
+A control point that is used reduces its own residual. With Q_l the covariance of its given position and Q_x that of the
+adjusted point, the residual v = adjusted - given has the covariance Q_v = Q_l - Q_x, and the leave-one-out residual is
+Q_l Q_v^-1 v. The global test compares the sum of v^T Q_l^-1 v over the points with its expectation. The image test
+divides each image residual by its own standard deviation (Baarda's w).
 """
 
 from __future__ import annotations
@@ -26,30 +24,30 @@ from barpc.base.geodesy import Array, enu_basis
 from barpc.base.statistics import CHANCE, CRITICAL, KEPT, RIDGE
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
-CHECKED = 0.1  # redundancy of a point that something beside the cameras' priors tells about
+CHECKED = 0.1  # least redundancy of a point that is checked by more than the priors on the cameras
 
 
 @dataclass(frozen=True, eq=False)
 class ControlTest:
-    """Ground control points against each other and the cameras.
+    """Results of the tests of G ground control points.
 
     Parameters
     ----------
     used : (G,)
-        Points that were used; the others were found wrong.
+        Mask of the points that were used; the others were rejected.
     residual : (G, 3)
-        Place of a point by all others minus its given place, east, north, up [m], in the directions that they
-        tell of; NaN where there is none.
+        Leave-one-out residual: position by all other observations minus the given one, east, north, up [m]. Directions
+        without redundancy are left out; NaN if all are.
     w : (G,)
         Largest component of the residual over its standard deviation.
     redundancy : (G,)
-        Redundancy, how far the others could tell: 0 not at all, 1 as if the point were not used.
+        Mean redundancy number of a point: 0 if nothing else determines it, 1 if its own weight is negligible.
     scatter : float
-        Root mean square residual of the points used over what is expected; NaN where too little is told.
+        RMS residual of the points used over its expectation; NaN below one degree of freedom.
     fits : bool
-        Whether that may be chance.
+        Whether `scatter` passes the chi-square test.
     agreed : Agreement or None
-        Agreement by which the points used were found.
+        How the points used were found.
     """
 
     used: BoolArray
@@ -62,27 +60,27 @@ class ControlTest:
 
     @property
     def checked(self) -> bool:
-        """Whether the others check any point used."""
+        """Whether any point used has redundancy."""
         return bool((self.redundancy[self.used] > CHECKED).any())
 
     @property
     def agrees(self) -> bool:
-        """Whether no point used is contradicted, alone or all together, and one set outweighs the others."""
+        """Whether all tests are passed: of single points, of all together, and no two sets contradict each other."""
         status = [self.status(g) for g in range(len(self.used))]
         return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
     @property
     def sets(self) -> tuple[BoolArray, ...]:
-        """Two sets of points (G,) that contradict each other with equal weight; empty where one is used."""
+        """Two contradicting sets of points (G,) of equal evidence; empty where one set is used."""
         return () if self.agreed is None else self.agreed.sets
 
     @property
     def torn(self) -> tuple[float, ...]:
-        """Residuals of check tie points without and with control [px], where control distorts the block."""
+        """RMS of check tie points without and with control [px], where control distorts the block; else empty."""
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
-        """Return the state of a point, in a word."""
+        """Return the state of a point: "used", "contradicts", "rejected" or "undecided"."""
         if not self.used[point]:
             return "undecided" if self.sets else "rejected"
         return "contradicts" if self.w[point] > CRITICAL else "used"
@@ -104,9 +102,9 @@ def control_test(
     gcps : GroundPoints
         As given.
     agreed : Agreement
-        Whose place was held, and how.
+        Which points were used, and with which factor on their standard deviations.
     faint : (G,)
-        Times by which their observations counted as noisier.
+        Factors on the standard deviations of their observations.
     """
     count, used, sigmas = len(gcps.names), agreed.used, gcps.sigma * agreed.scale
     seen = np.bincount(gcps.point, minlength=count)
@@ -138,11 +136,11 @@ def control_test(
 
 
 def global_test(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
-    """Return the scatter of the points used (G,), in standard deviations, and whether it may be chance.
+    """Return the RMS residual of the points used (G,) over its expectation, and whether it passes a chi-square test.
 
-    `whitened` (G, 3): residuals over their standard deviations; `redundancy` (G,): the mean part of these that others
-    hold. Their sum of squares is expected to be the redundancies' sum R, and its variance at most 2 R: that of a
-    chi-square. Of less than one degree of freedom NaN and True.
+    `whitened` (G, 3) are residuals over the standard deviations of the given positions; `redundancy` (G,) their mean
+    redundancy numbers. The expectation of the sum of squares is the sum R of the redundancy numbers; its variance is at
+    most 2 R, that of a chi-square. Below one degree of freedom: NaN and True.
     """
     freedom = 3.0 * float(redundancy[used].sum())
     if freedom < 1.0:
@@ -154,20 +152,21 @@ def global_test(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[fl
 def image_test(
     covariance: Covariance, problem: Problem, state: State, residual: Array, weight: Array, rows: IntArray
 ) -> Array:
-    """Return Baarda's w (n,) of observations in the images: the larger of |col| and |row| over its standard
-    deviation.
+    """Return Baarda's w (n,) of image observations: the larger of |col| and |row| over its standard deviation.
 
-    A whitened residual has the covariance 1 - J C J^T, C that of camera and point together. NaN: nothing checks it.
+    A whitened residual has the covariance 1 - J C J^T, with C the joint covariance of camera and point. NaN where it
+    is zero.
 
     Parameters
     ----------
     covariance : Covariance
         Of the solution.
-    problem, state, weight : as solved last, and 1 / sigma of every observation (K,)
+    problem, state, weight
+        Of the last solve, with weights 1 / sigma (K,) of all observations [1/px].
     residual : (2, K)
         Projected - observed [px].
     rows : (n,)
-        Observations to test, ascending: of those that count, at known points.
+        Observations to test, ascending: inliers of control points.
     """
     structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
     bounds = np.searchsorted(structure.view[rows], np.arange(structure.num_views + 1))
@@ -206,7 +205,7 @@ def image_test(
 
 
 def _take_off(left: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
-    """Subtract the part of the cameras' uncertainty from the waiting observations, and clear them."""
+    """Subtract the variances by the cameras from `left` for the observations that wait, and clear the list."""
     if not waiting:
         return
     index, parts = zip(*waiting, strict=True)

@@ -1,9 +1,9 @@
-"""Which observations agree before any camera has moved: for blocks in which many of a view's moved together.
+"""Consensus of observations before the adjustment, for blocks in which many observations of a view moved together.
 
-Moving clouds, or a repeated pattern, shift a good part of one view's tie points by the same amount. Least squares, also
-robust, then starts in the middle. Two views' rays miss each other by an offset across the epipolar line that changes
-slowly over the image, whatever the cameras are wrong by: so for every pair of views the largest set of observations
-whose offsets lie on one plane is looked for, and an observation that most of its partners contradict is put aside.
+Moving clouds, or a repeated pattern, shift many tie points of one view by the same amount. Least squares, also robust,
+then converge to a mean of both groups. Whatever the errors of two cameras, the epipolar offsets of their matches change
+slowly over the image. Therefore the largest set of matches whose offsets lie on one plane is found for every pair of
+views (RANSAC), and an observation that disagrees in most of its pairs is excluded.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from barpc.sensor.curve import cross
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose epipolar offsets fall into two groups; the pair does not determine which is right."""
+    """A pair of views whose epipolar offsets have two modes; the pair does not determine which is right."""
 
     views: tuple[int, int]  # the pair
     share: float  # part of the matches in the smaller group
-    apart: float  # across the epipolar lines [px]
+    apart: float  # distance of the modes, across the epipolar lines [px]
 
 
 def two_groups(structure: Structure, residual: Array, by_point: Array, use: BoolArray) -> tuple[TwoGroups, ...]:
-    """Find the pairs of views whose offsets across the epipolar lines (of observations in use) have two centres."""
+    """Find the pairs of views whose epipolar offsets, of observations in use, are a mixture of two normals."""
     many = np.repeat(np.diff(structure.pair_bounds) >= MANY, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
     offset = _across(residual, by_point, structure.first[rows], structure.second[rows])
@@ -43,7 +43,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
     with np.errstate(all="ignore"):
         z = offset - np.repeat(by_pair @ offset / count, count)
         square, cube, fourth = (by_pair @ (z * z * more) / count for more in (1.0, z, z * z))
-        # Sarle's coefficient is 1/3 for a normal distribution, 5/9 for a uniform one: beyond the middle
+        # Sarle's bimodality coefficient: 1/3 for a normal distribution, 5/9 for a uniform one; their mean is the limit
         maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= MANY)):
         share, apart, gain = two_normals(z[bounds[pair] : bounds[pair + 1]])
@@ -54,10 +54,11 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
 
 
 def two_normals(z: Array) -> tuple[float, float, float]:
-    """Return the smaller share, distance and gain [nats] of two normal distributions of one width over one.
+    """Fit two normal distributions of equal width to values z (n,), by expectation maximisation.
 
-    The likeliest ones of values z (n,), found by expectation and maximisation; the distance, in the unit of the values,
-    is 0 where the centres are less than two standard deviations apart, and all is 0 where one takes everything.
+    Returned are the share of the smaller one, the distance of the centres, and the gain of log-likelihood over one
+    normal [nats]. Share and distance are 0 where the centres are less than two standard deviations apart; all is 0
+    where one distribution has all values.
     """
     z = z - z.mean()
     whole = float((z**2).mean())
@@ -86,9 +87,9 @@ def two_normals(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Return the observations (K,) in use without those that most of their partners contradict.
+    """Return `use` (K,) without the observations that disagree with most other observations of their points.
 
-    Of observed col, row `xy` (2, K), residuals (2, K) with points anywhere near and `sigma` (K,), all [px].
+    `xy` (2, K) are observed col, row; the residuals (2, K) are at approximate points; `sigma` (K,) is stated. All [px].
     """
     first, second = structure.first, structure.second
     offset = _across(residual, projected.by_point, first, second)
@@ -113,7 +114,7 @@ def agreeing(
 
 
 def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Return the offset across the epipolar line (Q,) [px], which no motion of the point absorbs."""
+    """Return the epipolar offsets (Q,) [px] of pairs of observations: they do not depend on the ground point."""
     offset = np.empty(len(first))
     for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
@@ -127,7 +128,7 @@ def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray)
 
 
 def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> BoolArray:
-    """Return the largest set of offsets (n,) that lie on a plane over the image, by random triples and refits."""
+    """Return the largest set of offsets (n,) on one plane over the image (RANSAC, then least squares)."""
     low, high = place.min(axis=1, keepdims=True), place.max(axis=1, keepdims=True)
     design = np.vstack([np.ones(len(offset)), 2.0 * (place - low) / np.maximum(high - low, 1.0) - 1.0])
     rng = np.random.default_rng(seed)

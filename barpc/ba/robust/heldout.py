@@ -1,8 +1,8 @@
-"""Check points and check tie points, which are kept out of the adjustment and measure it.
+"""Check points and check tie points: they are kept out of the adjustment and measure its accuracy.
 
-Survivors of a rejection agree because the others were cut. A tenth of the tracks, drawn from all alike, is kept out
-before; triangulated by the adjusted cameras they tell what those are worth, wrong matches and all: their figures are
-those of a mixture of right ones, which scatter, and wrong ones, which lie anywhere.
+Inliers of an adjustment agree because the others were rejected. Therefore a tenth of all tracks is kept out before, and
+triangulated by the adjusted cameras. Wrong matches are among them, so their noise is estimated as that of a mixture of
+normal errors (right matches) and uniform ones (wrong matches).
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
 _CHECK_SHARE = 0.1
-_STEPS_A_PIXEL = 4.0  # so coarse that rounding draws hardly another track
-_NOTHING = float(np.finfo(np.float64).tiny)  # of a variance: residuals may be exactly zero
+_STEPS_A_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel, so that the last digits change hardly any draw
+_NOTHING = float(np.finfo(np.float64).tiny)  # least variance, where all residuals are zero
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residuals of the tracks that were kept out of the adjustment."""
+    """Residuals of check tie points, and the noise of each view by them."""
 
     residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
-    index: IntArray  # (Q,) their points
-    points: Array  # (Q, 3) where these are, ECEF [m]
-    noise: Array  # (N,) observed over stated standard deviation of every view's; NaN with too few
-    rms: Array  # (N,) the same as a root mean square of residuals [px]
+    index: IntArray  # (Q,) numbers of their points
+    points: Array  # (Q, 3) these points, ECEF [m]
+    noise: Array  # (N,) observed over stated standard deviation in each view; NaN with too few observations
+    rms: Array  # (N,) RMS residual of right matches by this noise [px]
 
     @property
     def error(self) -> float:
-        """Observed over stated standard deviation, all views alike; NaN where none is known."""
+        """Root mean square of `noise` over the views; NaN where none is known."""
         return _mean_square(self.noise)
 
     @property
     def whole_rms(self) -> float:
-        """Root mean square residual of all views alike [px]; NaN where none is known."""
+        """Root mean square of `rms` over the views [px]; NaN where none is known."""
         return _mean_square(self.rms)
 
 
@@ -57,9 +57,10 @@ def _mean_square(values: Array) -> float:
 
 
 def keep_out(block: Block) -> BoolArray:
-    """Return the observations (K,) of about every tenth track, to be kept out.
+    """Return the mask (K,) of the observations of about every tenth track, to be kept out of the adjustment.
 
-    They are drawn by their image positions alone, so that neither the order of rows nor the names of views matter.
+    Tracks are drawn by a hash of their image coordinates, so the choice does not depend on the order of rows or views.
+    Tracks that a view with few observations needs are not drawn.
     """
     few = np.bincount(block.view[block.use], minlength=len(block.views)) < MANY
     needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
@@ -73,14 +74,14 @@ def keep_out(block: Block) -> BoolArray:
 
 
 def splitmix64(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """Return the numbers as if drawn at random (the finalizer of SplitMix64, Steele et al. 2014)."""
+    """Return pseudo-random hashes of numbers (the finalizer of SplitMix64, Steele et al. 2014)."""
     numbers = (numbers ^ (numbers >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     numbers = (numbers ^ (numbers >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return numbers ^ (numbers >> np.uint64(31))
 
 
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """Return a problem with other observations, and the points (Q, 3) that cameras of unknowns (N, q) give them."""
+    """Return the problem with the observations of `block`, and its points (Q, 3) triangulated by cameras (N, q)."""
     index, structure = block.own_points
     cameras = problem.cameras.seeing(block.xy)
     part = replace(problem, cameras=cameras, structure=structure, xy=block.xy, point_prior=None, _room=[])
@@ -89,9 +90,10 @@ def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Arr
 
 
 def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the points (P, 3) of observations of sigma (K,) [px] by a robust loss, and the weights (K,) by it.
+    """Triangulate points (P, 3) with a robust loss; return them and the robust weights (K,).
 
-    The cameras, of unknowns (N, q), are linear between these and the points `first`.
+    `params` (N, q) are the camera unknowns and `sigma` (K,) [px] the standard deviations. The cameras are linearised at
+    the points `first`.
     """
     xy, counted = problem.xy, np.ones(len(sigma))
     projected = problem.project_points(params, first)  # near the end: from here it is linear
@@ -105,7 +107,7 @@ def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """Measure the check observations of a block under cameras of unknowns (N, q) of a problem."""
+    """Measure the check tie points of `block` by cameras with unknowns (N, q)."""
     views = len(block.views)
     if not len(block.view):
         unknown = np.full(views, np.nan)
@@ -127,16 +129,20 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 
 
 def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
-    """Return the observed over stated standard deviation of observations, half of which may be wrong.
+    """Return the observed over stated standard deviation (N,) in each view, where half of the matches may be wrong.
+
+    Right matches are chi-square distributed and wrong ones uniform up to the largest residual; the parameters are found
+    by expectation maximisation. The uniform density is at least `NEAR_LIMIT` nats below the peak of the other, or right
+    matches in its tails would count as wrong.
 
     Parameters
     ----------
-    squared : (K,), |r|^2 over its expectation under the stated deviations
-    freedom : (K,), degrees of freedom of each
-    view : (K,), 0 .. N - 1, ascending; each has one at least
-
-    Expectation and maximisation of a chi-square about zero, and of a uniform density of residuals as far as the
-    farthest goes; it is `NEAR_LIMIT` nats lower at least, or what is right would count as wrong by its tails.
+    squared : (K,)
+        Squared residuals over their expectation under the stated standard deviations.
+    freedom : (K,)
+        Degrees of freedom of each observation.
+    view : (K,)
+        View numbers 0 .. N - 1, ascending; each has at least one observation.
     """
     half = 0.5 * np.maximum(freedom, 1.0)  # of two views all scatter across the epipolar line
     starts = np.flatnonzero(np.diff(view, prepend=-1))
@@ -151,7 +157,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
         np.full(len(count), WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1]),
     )
     farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
-    moves = np.ones(len(count), dtype=bool)  # of a view that stands nothing changes any more
+    moves = np.ones(len(count), dtype=bool)  # views that have not converged
     for _ in range(ITERATIONS):
         peak = np.maximum(farthest - half * np.log(variance)[view], NEAR_LIMIT)
         right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
@@ -167,9 +173,9 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
 
 
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
-    """Return whether cameras with more unknowns meet the held-out tracks of a block better than others do.
+    """Return whether the residuals of the check tracks of `block` are significantly smaller in `one` than in `other`.
 
-    Track by track, as the same noise is in both; where one is wrong, by no more than so much.
+    Robust losses are compared track by track, as both have the same matching errors.
     """
     if not len(block.point) or not one.error < other.error:
         return False
@@ -180,10 +186,10 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 
 
 def is_admitted(tried: HeldOut, before: HeldOut, block: Block, evidence: float = 0.0) -> bool:
-    """Return whether a model with more unknowns, or fewer observations, is taken over another.
+    """Return whether a model with more unknowns, or fewer observations, is preferred to another.
 
-    With evidence of all observations for it [nats] unless residuals of the check tracks of a block grow; without, where
-    these shrink.
+    With significant `evidence` of all observations [nats]: unless residuals of the check tracks of `block` grow.
+    Without: only if these shrink.
     """
     return not is_better(before, tried, block) if evidence > SURE else is_better(tried, before, block)
 

@@ -1,4 +1,4 @@
-"""Rounds of solving: robust with a shrinking scale, then rejection, then least squares on the rest."""
+"""Outlier rejection: robust steps with a shrinking scale, then passes of rejection and least squares."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_SMOOTH_SEEN = 0.3  # sigmas: a smooth part that is smaller is taken from each view by itself
-_MIN_NOISE_RATIO = 0.5  # of the stated sigmas, while outliers are about
-_MANY_CUT = 0.01  # of the observations: more are looked at again
-_SAMPLED_VIEWS = 10  # from which a sample of the observations is searched first
+_SMOOTH_SEEN = 0.3  # sigmas: a larger smooth part is fitted to all views together with the points
+_MIN_NOISE_RATIO = 0.5  # least noise of the robust steps, over the stated standard deviations
+_MANY_CUT = 0.01  # share of rejected observations from which they are triangulated again
+_SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(Minimum):
-    """The end of the rounds: the last minimum, and its observations there."""
+    """The result of the passes: the last minimum, its observations and residuals."""
 
     problem: Problem  # with the priors on points as they ended
     residual: Array  # (2, K) projected - observed [px]
@@ -55,20 +55,20 @@ class Outcome(Minimum):
     inlier: BoolArray  # (K,) observations in the final solve
     noise: float  # observed over stated standard deviation
     passes: int  # rounds of cutting
-    told: Array  # (N,) what tie points tell of each view [1/px^2]
-    prior: PriorTest  # how the corrections compare with the priors given, and what the priors became
-    smooth: SmoothTest  # what is smooth in the residuals that are left
+    told: Array  # (N,) information of the tie points of each view: sum of their squared weights [1/px^2]
+    prior: PriorTest  # comparison of the corrections with the given priors, and the estimated priors
+    smooth: SmoothTest  # of the final residuals
     by_point: Array  # (2, 3, K) derivatives of the image points by the points at the end [px/m]
-    # floor [px] -> intervals of images that stand out there, once they were looked for
+    # cache: noise floor [px] -> significant intervals of the images
     standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:
-    """Robust rounds, cuts and the final least squares, with the observations in use (K,) to start with.
+    """Robust steps, rejection and the final least squares, from the observations `use` (K,).
 
-    Outliers are judged by their residuals less the smooth part of every view: a
-    camera that the unknowns cannot follow yet does not make its tie points wrong. Where a solve with fewer unknowns
-    is `known`, it told them: robust rounds would let go of what the further unknowns are to follow.
+    Observations are rejected by their residuals without the smooth part of their view: a systematic error of a camera
+    does not make its tie points wrong. If the outcome of fewer unknowns is `known`, its inliers are the start, and
+    there are no robust steps: these would reject observations that the further unknowns explain.
     """
 
     def __init__(
@@ -92,15 +92,15 @@ class Rounds:
         earlier = problem.joint_prior
         told = 0.0 if earlier is None else earlier.told
         self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference, told)
-        # where an earlier block knows some of the observations
+        # joint prior of an earlier block, and the observations that are in it
         self.earlier, self.again = (None if block.known is None else earlier), block.known
         alike = Resemblance.of(block)
         self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
         given, control = problem.camera_prior, heights.has_control
         shown = None if earlier is None else earlier.shown
         self.variances = Variances.of(given, unknowns, options, control, block.views, shown, heights.widest)
-        self.learnt: PriorTest | None = None  # with what the present priors were learnt
-        # what the same unknowns ended with is gone on with: cut, accuracies, misfit
+        self.learnt: PriorTest | None = None  # test by which the present priors were estimated
+        # the known outcome has the same unknowns: its inliers, priors and misfit are kept
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
             self.problem, use = (replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier)
@@ -118,7 +118,7 @@ class Rounds:
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
-        """Repeat the rounds until nothing changes, or pass `once`."""
+        """Repeat passes until inliers, weights and priors are constant; with `once` one pass only."""
         if self.robust and not self.is_known:
             self._search()
         while True:
@@ -127,13 +127,13 @@ class Rounds:
                 return outcome
 
     def _search(self) -> None:
-        """Run the robust rounds, under priors widened for unexpected corrections."""
+        """Run the robust steps, with wider priors on the cameras."""
         start = replace(self.problem, camera_prior=self.variances.for_search())
         given = self.state, self.residual, self.projected
         self.state, self.residual, self.counted, self.noise, self.projected = self._sampled(start) or _robust(
             start, self.observations, given, self.use, self.smooth
         )
-        # with those that are cut next: a view of which many are displaced must not hold the others
+        # observations to be rejected count: a view with many displaced ones must not constrain the others
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
@@ -169,7 +169,7 @@ class Rounds:
         return replace(few.state, points=points), residual, counted, few.noise, projected
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
-        """Return one pass; the outcome where it is the last."""
+        """Reject observations, solve, and estimate priors and noise; return the outcome of the last pass, else None."""
         was_in_use = self.use
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
@@ -189,7 +189,7 @@ class Rounds:
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
         settled = self._weights_stand()
-        # what is known of the place goes with what is shared, and nothing else learns of it
+        # a common error of the views changes the accuracy of the scene, which nothing else shows
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes >= TRIED or (settled and (same or not self.robust)):
@@ -219,12 +219,12 @@ class Rounds:
         return self.noise if self.options.estimate_noise else 1.0
 
     def _weights_stand(self) -> bool:
-        """Return whether the noise and the misfit of this solution would weigh observations as they were for it."""
+        """Return whether the new noise and misfit leave the weights of the observations unchanged."""
         next_weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)[self.use]
         return bool((np.abs(self.weight[self.use] / next_weight - 1.0) < STANDS).all())
 
     def _cut(self) -> None:
-        """Cut observations by residuals without their smooth part."""
+        """Reject observations by their residuals without the smooth part."""
         if self.robust:
             scatter = self._scatter() if self.scatter is None else self.scatter
             s = self.observations.squared(scatter, self.use.astype(np.float64))
@@ -232,7 +232,7 @@ class Rounds:
             self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
-        """Return the least squares of the observations in use; the second pass, which always comes, is exact."""
+        """Solve the least squares of the observations in use; exactly from the second pass on."""
         again = self.passes > 1 or self.goes_on
         tolerance = TOLERANCE if again or not self.robust else STANDS
         self.weight = weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)
@@ -249,7 +249,7 @@ class Rounds:
         return replace(found, state=self.state, ahead=None)
 
     def _estimate_noise(self) -> SmoothTest:
-        """Return the noise, and the systematic residuals, of the observations in use."""
+        """Estimate the noise and the misfit of the observations in use; return the test of their smooth part."""
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
         if self.robust:
@@ -262,14 +262,14 @@ class Rounds:
         return tested
 
     def _by_points(self) -> Projected:
-        """Return the projection of the state with derivatives by the points at least."""
+        """Return the projection of the state, with derivatives by the points."""
         return self.projected or self.problem.project_points(self.state.params, self.state.points)
 
     def _scatter(self, fit: SmoothFit | None = None) -> Array:
-        """Return the residuals (2, K) [px] without the smooth parts of all views that see a point.
+        """Return the residuals (2, K) [px] without the smooth parts of all views.
 
-        A point shares what one of its views is wrong by among all of them, and relief moves the rows of the views
-        against each other: so the smooth parts are found view by view and the points follow, until they stand.
+        The error of one view is shared by all observations of a point. Therefore smooth parts and points are estimated
+        in turns (backfitting).
         """
         residual, counted, sigma = self.residual, self.counted, self.observations.sigma
         part = self.smooth.part(residual, counted, fit)
@@ -283,10 +283,10 @@ class Rounds:
 
 
 def downweighting(block: Block, heights: PointConstraints) -> Array:
-    """Return the factors (P,) on the noise of a point's observations: an unused control point has no weight.
+    """Return the factors (P,) on the standard deviation of each point's observations: large for unused control points.
 
-    Those of many points marked a pixel off in one image would pull it away from its tie points, which together count
-    for so much only. Points that are seen in an image without tie points are what ties that.
+    The weight of all tie points of a view is limited, so many unused points marked with the same error would move it.
+    Points in an image without tie points keep their weight: they alone connect it.
     """
     alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
     faint = np.zeros(block.num_points, dtype=bool)
@@ -304,12 +304,12 @@ def _robust(
     use: BoolArray,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
-    """Take reweighted steps while the loss's scale shrinks to three standard deviations of the noise.
+    """Take reweighted steps while the scale of the loss shrinks to three standard deviations of the noise.
 
-    The state, its residuals, how much every observation counts, the noise, and what is kept of the state's projection.
-    The noise is a median that counts observations by their weights and so leaves the wrong ones behind, but not below
-    what the best fifth of all shows, nor below half of the stated noise, or a few that fit by chance would be left.
-    Control points do not count where there are others: while nothing holds their places they fit too well.
+    Returned are the state, its residuals (2, K), the robust weights (K,), the noise, and the projection of the state.
+    The noise is a weighted median of the residuals, but at least that of the best fifth of them and half of the stated
+    one: else only a few observations that fit by chance would keep their weight. It is estimated without control
+    points where there are other observations, as free points fit too well.
     """
     state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
@@ -326,24 +326,24 @@ def _robust(
         counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)
-        near = scale <= SURELY / SHRINK * noise  # a step from the end
+        near = scale <= SURELY / SHRINK * noise  # the last step but one
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
     return state, residual, counted, noise, projected
 
 
 def _observation_weights(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
-    """Return the weight of each observation (K,)."""
+    """Return the robust weight (K,) of each observation in use; 1 for those that are not rejected."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
 def retriangulate_rejected(
     problem: Problem, state: State, residual: Array, use: BoolArray, weight: Array, projected: Projected | None = None
 ) -> tuple[State, Array]:
-    """Return the state with wholly cut tracks triangulated anew by the present cameras, and their residuals
-    (2, K); `projected`, of the state, is brought up to it in place.
+    """Triangulate the tracks without inliers again by the present cameras; return the state and residuals (2, K).
 
-    Nothing moved them since; with what they were cut for mended, they may come back.
+    Their points did not follow the cameras since they were rejected; with these corrected, they may be inliers.
+    `projected`, of the state, is updated in place.
     """
     structure = problem.structure
     dead = structure.sum_points(use[None].astype(np.float64))[0] == 0
@@ -365,7 +365,7 @@ def retriangulate_rejected(
 
 
 def weighted_median(values: Array, weights: Array) -> float:
-    """Return the median of `values` (n,), each counted as often as its weight (n,) says; 1 where all weigh nothing."""
+    """Return the weighted median of `values` (n,) with `weights` (n,); 1 if all weights are zero."""
     order = np.argsort(values)
     total = np.cumsum(weights[order])
     if not len(total) or not total[-1] > 0:

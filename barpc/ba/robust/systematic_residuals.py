@@ -1,9 +1,8 @@
-"""The smooth part of the residuals of a view, fitted before any rejection and tested at the end.
+"""The smooth part of the residuals of each view: it is removed before outliers are rejected, and tested at the end.
 
-Noise and wrong matches scatter; what a camera model cannot follow (jitter, optics, a crop that was turned) is a
-smooth function of the image. An outlier test that does not know the difference takes the second for the first. So
-the residuals of every view are split into a smooth part, a spline over the row and low polynomials of the column
-fitted by weighted least squares, and the scatter around it.
+Noise and wrong matches scatter. Errors that a camera model cannot represent (jitter, distortion, a wrong rotation) are
+smooth functions of the image, and would be rejected as outliers. Therefore the residuals of each view are split into a
+smooth part, fitted by weighted least squares (a spline over the rows, low polynomials of the columns), and the scatter.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor.image_corrections import bsplines
 
 SmoothFit = dict[int, tuple[slice, Array]]
-"""View -> where its observations are, coefficients (2, NUM_TERMS) of their smooth part."""
+"""View -> slice of its observations, coefficients (2, NUM_TERMS) of their smooth part."""
 
 SPLINES = 14
-"""Cubic B-splines over the rows of an image: what changes over a tenth of it, or more slowly, is smooth."""
+"""Number of cubic B-splines over the rows of an image: changes over a tenth of the rows or more are smooth."""
 
-NUM_TERMS = SPLINES + 4  # and col, col^2, col^3, row col
-_PER_TERM = 10  # observations a term, or the view is left as it is
-_BEND = 1e-2  # of a spline's weight: rows without observations continue what their neighbours show
+NUM_TERMS = SPLINES + 4  # splines, and col, col^2, col^3, row col
+_PER_TERM = 10  # least observations for each term; views with fewer have no smooth part
+_BEND = 1e-2  # weight of the second differences of splines, over that of a spline: it bridges rows without observations
 _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
 
 
@@ -38,17 +37,17 @@ _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=
 class Resemblance:
     """Correlation of the noise of a block's K observations.
 
-    Registered points resemble each other: their templates overlap, and seasons, suns and terrains err over many of
-    them. What is smooth in a reference's residuals is therefore not all of the camera: of points whose templates share
-    half of their pixels half of the noise is the same, and together they are worth `MAX_INDEPENDENT_ERRORS` independent
-    ones at most.
+    Points registered to a reference image have correlated errors: their templates overlap, and seasons, shadows and
+    terrain have the same effect on many of them. A smooth part of their residuals is therefore not the camera's alone.
+    The correlation of two points is the overlap of their templates, and all together count as at most
+    `MAX_INDEPENDENT_ERRORS` independent ones.
     """
 
-    of_reference: BoolArray  # (K,)
-    place: Array  # (2, K) where a reference's points lie, east, north [m]
+    of_reference: BoolArray  # (K,) observations of reference points
+    place: Array  # (2, K) east, north of reference points [m]
     width: float  # of their templates [m]
-    share: Array  # (K,) how much of an independent observation each is where it counts with its neighbours
-    precision: Array  # (K,) their weight beside the view's tie points: variances' ratio, times `share`
+    share: Array  # (K,) effective number of independent observations that each counts for, at most 1
+    precision: Array  # (K,) `share` times the variance of the view's tie points over its own
 
     @classmethod
     def of(cls, block: Block) -> Resemblance | None:
@@ -89,28 +88,27 @@ class Resemblance:
 
 @dataclass(frozen=True, eq=False)
 class SmoothTest:
-    """The smooth part of every view's residuals, and whether it is more than chance."""
+    """The smooth part of the residuals of each view, and its significance."""
 
-    # (N,) root mean square of the smooth part over the view's observations, both coordinates together, less
-    # what noise alone would leave [px]; 0 for a view with too few observations
+    # (N,) RMS of the smooth part over the observations, both coordinates together, less its expectation for noise alone
+    # [px]; 0 for a view with too few observations
     rms: Array
-    # (N,) probability that noise alone leaves as much (F-test); 1 for a view with too few observations
+    # (N,) p-value of an F test of the smooth part; 1 for a view with too few observations
     significance: Array
-    # (N,) part of the smooth part's square that the row alone explains; NaN where nothing was fitted
+    # (N,) share of the square of the smooth part that the splines over the rows explain; NaN where none was fitted
     by_row: Array
-    # (N,) error that an observation shares with its neighbour in the row, or in the column where that is more
-    # [px]: waves and steps that are too fine for the smooth part are in it, too. 0 where it is not
-    # significant
+    # (N,) common error of neighbours along the rows, or along the columns if larger [px]: jitter and steps too fine
+    # for the smooth part are in it; 0 where it is not significant
     shared: Array
-    # (N,) part of the square of a camera's error that its residuals show: points, and heights, take the rest
+    # (N,) share of the square of a camera error that residuals show; points and heights absorb the rest
     redundancy: Array | float = 1.0
 
     def of_cameras(self) -> Array:
-        """Return the errors (N,) of the cameras themselves that residuals show in part: smooth, or shared [px]."""
+        """Return the systematic errors (N,) of the cameras [px]: smooth, or shared by neighbours, over redundancy."""
         return np.maximum(self.rms, self.shared) / np.sqrt(self.redundancy)
 
     def misfit(self) -> Array:
-        """Return the smooth parts (N,) [px] beyond chance, which scattered wrong observations leave, too."""
+        """Return the RMS (N,) of significant smooth parts [px]; 0 of others."""
         return np.where(self.found(0.0), self.rms, 0.0)
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
@@ -119,9 +117,9 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of a block's views, of observations at `xy` (2, K) [px], which may resemble each other.
+    """The smooth model of the views of a block, for observations at `xy` (2, K) [px].
 
-    Only those that `tells` (K,) are looked at.
+    `alike` is the correlation of their noise; observations outside the mask `tells` (K,) are not used.
     """
 
     def __init__(
@@ -164,9 +162,9 @@ class Smooth:
         return out
 
     def test(self, residual: Array, use: BoolArray, fit: SmoothFit | None = None) -> SmoothTest:
-        """Test whether the residuals (2, K) [px] of the observations in use hold more than scatter.
+        """Test the smooth part of the residuals (2, K) [px] of the observations in use.
 
-        What is too fine for the smooth part is not looked for.
+        `shared` is not tested here, see `test_neighbours`.
         """
         n = self.structure.num_views
         rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
@@ -184,7 +182,7 @@ class Smooth:
             explained = float((smooth**2).sum())
             along = (coefficients[:, :SPLINES] @ basis[:SPLINES]) * root
             by_row[v] = min(float((along**2).sum()) / max(explained, 1e-30), 1.0)
-            if count <= terms + 1.0:  # as few as these tell no curve from noise
+            if count <= terms + 1.0:  # no degrees of freedom are left
                 continue
             left = float(((residual[:, rows] * root) ** 2).sum()) - explained
             scatter = max(left / (count - terms), 1e-30)
@@ -195,7 +193,7 @@ class Smooth:
     def test_neighbours(
         self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
     ) -> SmoothTest:
-        """Test the correlation of neighbours too, in views with a fit, of a redundancy (N,)."""
+        """Return the test with `shared`, the correlation of neighbours, in views with a smooth part."""
         kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
         shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
         last = view[1:]
@@ -218,7 +216,7 @@ class Smooth:
         return np.asarray(np.bincount(view, values, self.structure.num_views))
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray, pairs: Array) -> tuple[Array, Array]:
-        """Return the products (n - 1,) of neighbours (n,) beyond the noise that they share; their numbers (N,)."""
+        """Return the products (n - 1,) of neighbours without their common noise, and effective numbers (N,)."""
         assert self.alike is not None
         first, second = order[:-1], order[1:]
         view, same = self.structure.view[second], self.alike.correlation(first, second)
@@ -228,7 +226,7 @@ class Smooth:
         return beyond / np.maximum(size, 1e-12)[view], self._sums(view, self.alike.share[second] * pairs)
 
     def fit(self, residual: Array, weight: Array) -> SmoothFit:
-        """Fit the smooth part of the residuals, of views with enough observations that count."""
+        """Fit the smooth part of residuals (2, K) [px] with weights (K,), in views with enough observations."""
         weight = weight * self._tells
         counts = self.structure.sum_views(weight[None])[:, 0]
         views = np.flatnonzero(counts >= _PER_TERM * NUM_TERMS)

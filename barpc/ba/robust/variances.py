@@ -1,13 +1,11 @@
-"""Priors on the cameras that learn from the block: variance components, and views that are odd.
+"""Estimation of the prior standard deviations of the cameras: variance components, and views with larger errors.
 
-A prior's standard deviation is a guess. What the observations say about it is the size of the corrections that they
-determine: with the posterior covariance C of unknowns whose prior is s, gamma = n - trace(C) / s^2 of them are
-determined, and their squares sum to gamma s^2 on average (MacKay 1992, "Bayesian Interpolation", eq. 4.8). That holds
-for each kind of unknowns by itself: those that move an image's middle, of which an accuracy is stated; turns about the
-line of sight, which tie points determine well and which say nothing of the place; drifts degree by degree.
-Where the sum of the first is larger than chance allows, some prior was too narrow: that of one view, if its correction
-alone explains it (every view that would is held possible: three in a row along the flight do not determine it), else
-that of all.
+With the posterior covariance C of n unknowns of prior standard deviation s, gamma = n - trace(C) / s^2 of them are
+determined by the observations, and their squares have the expectation gamma s^2 (MacKay 1992, "Bayesian Interpolation",
+eq. 4.8). This holds for each kind of unknowns: those that move the position of an image, whose accuracy is stated;
+rotations about the line of sight; drifts, by degree. Where the squares of the first kind are significantly too large,
+the prior was too narrow: of one odd view, if its correction alone explains them, else of all views. Several views may
+be odd alternatively, as three in a row along the flight do not determine which is.
 """
 
 from __future__ import annotations
@@ -34,52 +32,52 @@ from barpc.scene import BoolArray, IntArray, View
 
 logger = logging.getLogger(__name__)
 
-_LIKELIER = -np.log(LEVEL)  # but one odd view is named where all being worse than stated is as improbable beside it
-_CENTRE_MOTION_SHARE = 0.01  # of a rotation, as drift: the centre it turns about flies some km while an image is taken
-_LOW = 0.1  # then as much is let be as leaves what is seen this likely: a prior too narrow bends all heights alike
-SAME_PRIOR = 0.2  # change of a standard deviation, as a logarithm, below which a block is not solved again
-_MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is said
+_LIKELIER = -np.log(LEVEL)  # nats: log evidence of odd views over that of wider priors of all, for which they are named
+_CENTRE_MOTION_SHARE = 0.01  # drift by a rotation: its centre moves by some km while an image is taken
+_LOW = 0.1  # a cautious standard deviation is the largest with this probability: too narrow a prior bends all heights
+SAME_PRIOR = 0.2  # log change of a standard deviation below which a block is not solved again
+_MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is estimated
 
 
 @dataclass(frozen=True, eq=False)
 class PriorTest:
-    """Comparison of the views' corrections with the priors that were given."""
+    """Comparison of the corrections of the cameras with the given priors, and the factors on these."""
 
-    # squared constant corrections (rotation, translation) over the variances given, over their degrees of
-    # freedom: about 1 where the priors hold. NaN where the observations determine nothing
+    # sum of squared constant corrections (rotation, translation) over the given variances, over the degrees of freedom:
+    # about 1 where the priors hold; NaN where the observations determine none
     ratio: float
-    freedom: float  # constant unknowns that the observations determine
-    scale: Array  # (N,) by how much the standard deviations given were widened; 1: not at all
-    odd: BoolArray  # (N,) views whose camera alone explains the corrections. More than one: any of them would
-    # standard deviation of the drift's coefficients in use, degree by degree [m]
+    freedom: float  # number of constant unknowns that the observations determine
+    scale: Array  # (N,) factors on the given standard deviations; 1: unchanged
+    odd: BoolArray  # (N,) views whose correction alone explains the ratio; of several, any may be the one
+    # estimated standard deviation of the drift coefficients, by degree [m]
     drift_sigma: tuple[float, ...]
-    shared: float = 1.0  # by how much standard deviations that RPCs state were widened, as all views share what is off
-    # what the corrections show, with those of an earlier block (see `Variances.shown`)
+    shared: float = 1.0  # factor on standard deviations that RPCs state, for an error that all views have in common
+    # sums of squares of this block and earlier ones (see `Variances.shown`)
     shown: Array | None = None
-    failed: bool = False  # the matrix could not be factorised: nothing was learnt
-    # by how much those of the drift's degrees, and of turns about the lines of sight, were widened
+    failed: bool = False  # the matrix could not be factorised: nothing was estimated
+    # factors on the standard deviations of the drift, by degree, and of rotations about the lines of sight
     wide: tuple[float, ...] = (1.0,)
 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProblem:
-    """The problem near a minimum, quadratic: its cost, minimum and covariance under other priors."""
+    """The quadratic approximation of a problem at its minimum: evidence and solution under other priors."""
 
     problem: Problem
     minimum: Minimum
 
     @property
     def small(self) -> bool:
-        """Whether it can be solved many times."""
+        """Whether the block is small enough to be solved many times."""
         return len(self.problem.free) <= SMALL
 
     def change(self, now: CameraPrior, prior: CameraPrior) -> Array:
-        """Return the change of the information (N, q, q) from one prior to another; that of fixed views is 0."""
+        """Return the change of the prior information (N, q, q) from one prior to another; 0 for fixed views."""
         free = self.problem.free.reshape(now.sigma.shape)
         return (prior.precision() - now.precision()) * free[..., None]
 
     def under(self, prior: CameraPrior) -> tuple[float, Array, Covariance]:
-        """Return the evidence (logarithm, but for a constant), unknowns (N, q) and covariance under other priors."""
+        """Return the log evidence (up to a constant), the unknowns (N, q) and their covariance under another prior."""
         now, reduced, start = self.problem.camera_prior, self.minimum.reduced, self.minimum.state.params
         change, free = self.change(now, prior), self.problem.free
         other = reduced.with_diagonal(change)
@@ -94,13 +92,13 @@ class QuadraticProblem:
         return -0.5 * (cost + volume), start + step, covariance
 
     def posterior(self, prior: CameraPrior) -> _Posterior:
-        """Return the information on every view under other priors."""
+        """Return the posterior under another prior."""
         evidence, params, covariance = self.under(prior)
         return _Posterior(self, evidence, params - prior.mean, covariance.of_views(), prior, covariance)
 
 
 def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
-    """Return the logarithms (N,) of the determinants of proper priors on free unknowns; others add nothing."""
+    """Return the log determinants (N,) of the prior covariances of free unknowns; improper priors add nothing."""
     sigma = prior.sigma
     use = free.reshape(sigma.shape) & np.isfinite(sigma)
     along = (prior.turn**2 * use * np.log(prior.wider)).sum(axis=1)
@@ -109,7 +107,7 @@ def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Posterior:
-    """The information on every view under some priors: other priors of a view are an update of rank q."""
+    """The posterior of each view under a prior; another prior on a view is an update of rank q."""
 
     around: QuadraticProblem
     evidence: float  # logarithm, but for a constant
@@ -120,7 +118,7 @@ class _Posterior:
     updates: tuple[tuple[Array, Array], ...] = ()
 
     def together(self, views: IntArray, prior: CameraPrior) -> _Posterior:
-        """Return the same under other priors of some views (n,), all of them: by the update of `alone`."""
+        """Return the posterior under another prior on the views (n,), all at once."""
         n, q = self.offset.shape
         place = unknowns_of(views, q)
         columns = self.covariance.columns(place)
@@ -166,16 +164,16 @@ class _Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Variances:
-    """The priors of a block and those of them that may be estimated."""
+    """The given priors of a block, and which of them are estimated."""
 
     given: CameraPrior  # with the standard deviations as they were given
     unknowns: Unknowns  # which unknown is what
-    learns: bool  # whether the standard deviations of constants and drifts may change
-    cautious: bool  # rather too wide than too narrow: no control holds the scene
-    stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
-    # (4 + D, 2) of an earlier block, whose views have no prior of their own here: squared corrections over the
-    # variances given, and their freedom, of the place, of those that are stated, of the drift degree by degree, and
-    # along the lines of sight; in the third row the number of views that state
+    learns: bool  # whether the standard deviations of constants and drifts are estimated
+    cautious: bool  # estimates are rather too wide than too narrow, as there is no control
+    stated: BoolArray | None = None  # (N,) views whose RPCs state an accuracy that is in use; None: none does
+    # (4 + D, 2) sums of an earlier block, whose views have no prior of their own here: squared corrections over the
+    # given variances, and degrees of freedom. Rows: position; position of views with a stated accuracy; number of these
+    # views; drift by degree; rotations about the lines of sight
     shown: Array | None = None
     widest: Array | None = None  # (D + 1,) largest factors of drifts and turns, of tie points alone
 
@@ -190,7 +188,7 @@ class Variances:
         shown: Array | None = None,
         widest: tuple[float, ...] | None = None,
     ) -> Variances:
-        """Return the priors to be learnt by the options, with control points or without."""
+        """Return the variances of a block, to be estimated as the options state."""
         learns = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
@@ -208,14 +206,14 @@ class Variances:
 
     @property
     def learn_waves(self) -> bool:
-        """Whether there are splines or steps, whose sizes are always learnt."""
+        """Whether there are splines or steps, whose standard deviations are always estimated."""
         return self.unknowns.waves is not None
 
     @cached_property
     def _kinds(self) -> Array:
-        """(2 + D, q + 1) which unknowns are of which kind: the place, the drift by degree, the turns.
+        """Mask (2 + D, q + 1) of unknowns by kind: position, drift by degree, rotation about the line of sight.
 
-        The last is a turn about the line of sight, which the constants are without.
+        The last unknown is that rotation; the others are without it.
         """
         kinds = np.zeros((2 + self._degrees, self.given.sigma.shape[1] + 1))
         kinds[0, : self.constants] = kinds[-1, -1] = 1.0
@@ -227,16 +225,16 @@ class Variances:
         return slice(self.constants + 3 * degree, self.constants + 3 * degree + 3)
 
     def for_search(self) -> CameraPrior:
-        """Return the wider priors used while outliers are looked for, so that unexpected drift is not cut."""
+        """Return the wider priors of the robust steps, so that observations of a large drift are not rejected."""
         return self._prior(np.ones(len(self.given.sigma)), np.append(np.full(self._degrees, TIMES), 1.0))
 
     def learnt(
         self, problem: Problem, minimum: Minimum, last: PriorTest | None = None, exact: bool = False
     ) -> tuple[CameraPrior, PriorTest]:
-        """Estimate the priors that the block supports, in its linearisation at a minimum.
+        """Estimate the priors in the linearisation of a problem at its minimum.
 
-        `last` is what the priors of the problem were learnt with, where they were. A large block's variances are
-        probed unless they are to be `exact`.
+        `last` is the test by which the present priors were estimated. In a large block variances are estimated from
+        random probes, unless `exact`.
         """
         try:
             return self._learnt(problem, minimum, last, exact)
@@ -264,7 +262,7 @@ class Variances:
         total, freedom = (float(x) for x in self._sums(params, known)[0])
         ratio = total / freedom if freedom > _MIN_FREEDOM else float("nan")
         shared = self._shared(params, known)
-        # constants of a large block that were widened take from the drift, which need not stand again
+        # wider constants of a large block reduce its drift, which need not converge again
         stands = not around.small and last is not None and bool((last.scale > 1.0).any())
         for _ in range(ITERATIONS if self.learns or self.learn_waves else 0):
             before = prior
@@ -272,7 +270,7 @@ class Variances:
                 self = self._going_on(self._waves(params, known, prior.sigma))
             wide = self._beside(params, known, last) if self.learns else wide
             prior = self._prior(scale, wide)
-            # a drift or a turn larger than thought looks like a place that is: it is learnt before that is asked
+            # a large drift or rotation looks like a wrong position: its size is estimated first
             other, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
             stands |= same_prior(prior, other, least, slice(self.constants, self.constants + 3 * self._degrees))
             if stands and self.learns and self._too_large(params, known, scale):
@@ -298,12 +296,11 @@ class Variances:
         return replace(prior, sigma=sigma), tested
 
     def _shared(self, params: Array, known: Array) -> Array:
-        """Return the factors (N,) by which views that state an accuracy are widened, as they share the error
-        that they state.
+        """Return the factors (N,) on the standard deviations of views with a stated accuracy, for their common error.
 
-        Views that were adjusted together agree: what each is off by, they all are. Independent errors would leave
-        them as large a part of the variance stated as their corrections show, at most. The rest does not average:
-        n views of two unknowns (rotation, translation) a direction would tell the place sqrt(n / 2) times too well.
+        Views that were adjusted together have the same error. The share of independent errors in the stated variance is
+        at most that of the corrections. The rest does not average: n views of two unknowns in each direction (rotation,
+        translation) would state the position sqrt(n / 2) times too accurately.
         """
         wider = np.ones(len(params))
         if self.stated is None or not self.learns:
@@ -315,7 +312,7 @@ class Variances:
         return wider
 
     def _of_stated(self, params: Array, known: Array) -> Array:
-        """Return the second and third row of `shown` (2, 2), of an earlier block and of this."""
+        """Return the second and third row of `shown` (2, 2), of earlier blocks and this one."""
         assert self.stated is not None
         of_place = self._by_view(params, known)[:, self.stated, 0].sum(axis=1)
         count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
@@ -327,18 +324,18 @@ class Variances:
         return np.zeros((4 + self._degrees, 2)) if self.shown is None else self.shown
 
     def _showing(self, params: Array, known: Array) -> Array:
-        """Return `shown` for a later run: by this block and those before it."""
+        """Return `shown` for a later run: the sums of this block and earlier ones."""
         rest = self._before[1:3] if self.stated is None else self._of_stated(params, known)
         return np.insert(self._sums(params, known), [1, 1], rest, axis=0)
 
     def _going_on(self, sigma: Array) -> Variances:
-        """Return the priors with splines and steps as large as in the standard deviations (N, q)."""
+        """Return the variances with the standard deviations (N, q) of splines and steps as given ones."""
         part, given = self.unknowns.in_waves, self.given.sigma.copy()
         given[:, part] = sigma[:, part]
         return replace(self, given=replace(self.given, sigma=given))
 
     def _waves(self, params: Array, known: Array, sigma: Array) -> Array:
-        """Return the standard deviations (N, q), splines and steps as large as each view's show."""
+        """Return the standard deviations (N, q) with those of splines and steps estimated for each view."""
         assert self.unknowns.waves is not None
         first, bands = self.unknowns.in_waves.start, self.unknowns.waves.bands
         out = sigma.copy()
@@ -352,9 +349,7 @@ class Variances:
         return out
 
     def _prior(self, scale: Array, wide: Array) -> CameraPrior:
-        """Return the priors given, constants wider by `scale` (N,), drifts and turns about the lines of sight by
-        `wide` (D + 1,).
-        """
+        """Return the given prior with factors `scale` (N,) on constants and `wide` (D + 1,) on drifts and rotations."""
         sigma = self.given.sigma.copy()
         sigma[:, : self.constants] *= scale[:, None]
         for degree, factor in enumerate(wide[:-1]):
@@ -362,7 +357,7 @@ class Variances:
             sigma[:, part] *= factor
             if degree == 0 and self.learns:
                 sigma[:, part] = np.hypot(sigma[:, part], _CENTRE_MOTION_SHARE * sigma[:, :3])
-        # where a place is less known than stated, a turn is not known better
+        # a rotation is not better known than the position
         return replace(self.given, sigma=sigma, wider=np.maximum(wide[-1] / scale, 1.0)[:, None])
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
@@ -383,27 +378,28 @@ class Variances:
         return np.hstack([across, (turn**2).sum(axis=1, keepdims=True) - along / prior.wider**2]).clip(0.0, 1.0)
 
     def _by_view(self, params: Array, known: Array) -> Array:
-        """Return the squared unknowns of every view and kind over the variances given, their freedom (2, N, 2 + D)."""
+        """Return squared corrections over given variances and degrees of freedom, by view and kind (2, N, 2 + D)."""
         off = (params - self.given.mean) / self.given.sigma
         along = (self.given.turn * off).sum(axis=1, keepdims=True)
         seen = np.hstack([off - along * self.given.turn, along])
         return np.stack([np.where(known > 0, seen**2, 0.0), known]) @ self._kinds.T
 
     def _sums(self, params: Array, known: Array) -> Array:
-        """Return the same of all views and those of an earlier block (2 + D, 2)."""
+        """Return the sums of `_by_view` over all views and earlier blocks (2 + D, 2)."""
         return np.asarray(self._by_view(params, known).sum(axis=1).T + np.delete(self._before, [1, 2], axis=0))
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
-        """Return whether the corrections are larger than chance allows."""
+        """Return whether the corrections of the position are significantly larger than their prior."""
         squares, free = self._before[0]
         total, freedom = self._by_view(params, known)[..., 0]
         total, freedom = (total / scale**2).sum() + squares / float(np.min(scale)) ** 2, freedom.sum() + free
         return freedom > _MIN_FREEDOM and float(chdtrc(freedom, total)) < LEVEL
 
     def _widened(self, around: QuadraticProblem, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
-        """Return the factors (N,) by which each view's prior is widened, and the views that are odd.
+        """Return the factors (N,) on the prior of each view, and the mask of odd views.
 
-        Explanations are compared where each is likeliest, and priors are then as wide as they may be.
+        Two explanations are compared by evidence, each at its most likely factors: wider priors of all views, or of a
+        few odd ones. The factors returned are cautious ones.
         """
         n, free = len(params), around.problem.free
         total, freedom = self._by_view(params, known)[..., 0]
@@ -421,22 +417,24 @@ class Variances:
         both, beyond, together = self._odd(around, wide, careful)
         if self.cautious:
             together = max(together, around.under(self._prior(usual, wide))[0])
-        # turns of all views explain what a wrong one shows: it is looked for without
+        # rotations of all views would explain the error of an odd one: they are not widened here
         few, odd, alone = self._odd(around, np.append(wide[:-1], 1.0), np.ones(n), together)
         if alone >= together + _LIKELIER:
             return few, odd
-        # which the others need not be as wide for
+        # the factor of the others is estimated without these
         both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond], self.cautious))
         return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # priors that cover either
 
     def _common(self, total: Array, freedom: Array, careful: bool) -> float:
-        """Return the factor by which the priors of views are widened together, by their squares and freedoms (n,)."""
+        """Return the common factor on the priors of views, from squares and degrees of freedom (n,)."""
         squares, free = self._before[0] + np.array([total.sum(), freedom.sum()])
         return float(np.sqrt(max(self._likely(squares, free, careful), 1.0)))
 
     def _likely(self, total: float, freedom: float, careful: bool) -> float:
-        """Return a variance, in units of the one given, by squares and their freedom, that given counting for a few;
-        if one is `careful`, the largest that still makes so few squares likely enough.
+        """Return the estimate of a variance over the given one, which counts as a few observations.
+
+        `total` is the sum of squares over the given variance. With `careful` it is the largest variance with a
+        probability of `_LOW`.
         """
         likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
         if not careful or freedom <= _MIN_FREEDOM:
@@ -446,12 +444,11 @@ class Variances:
     def _odd(
         self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
     ) -> tuple[Array, BoolArray, float]:
-        """Find a few views whose cameras explain the corrections beside those of `usual` widened priors (N,), by
-        forward selection: the factors, the views and the evidence for them.
+        """Find odd views by forward selection, beside the factors `usual` (N,) of the others.
 
-        One is added of those that share points, at a time, where it is likelier than its choice among all views. Where
-        there is the evidence of a rival, one at least is chosen, and none once they cannot come near it: what further
-        ones add becomes less.
+        Returned are the factors (N,), the mask of odd views, and the log evidence less the price of the choice. In each
+        step the best view of each neighbourhood (views that share points) is added, if its gain exceeds the price. With
+        the evidence of a `rival`, at least one is chosen; the search ends once further views cannot reach it.
         """
         n = len(usual)
         odd, chosen, scale = np.zeros(n, dtype=bool), usual.copy(), usual.copy()
@@ -476,7 +473,7 @@ class Variances:
         return scale, odd, known.evidence - count * price
 
     def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:
-        """Return the evidence (N,) for each view being odd as well, and the factor that its prior then needs."""
+        """Return the log evidence (N,) with each view odd in addition, and the factor on its prior."""
         prior = self._prior(np.maximum(scale, GROSS), wide)
         _, offset, blocks = known.alone(prior)
         seen = self._share(blocks, prior, known.around.problem.free)
@@ -485,13 +482,12 @@ class Variances:
         return known.alone(self._prior(size, wide))[0], size
 
     def _beside(self, params: Array, known: Array, last: PriorTest | None) -> Array:
-        """Return the factors (D + 1,) on the standard deviations of the drift and of turns about the lines of sight,
-        the given ones counting for a few.
+        """Return the factors (D + 1,) on the standard deviations of drifts and rotations about the lines of sight.
 
-        No more than so many times those of the `last` linearisation, which holds no further: a mode that hardly
-        anything determines would grow without end.
+        They are at most `TIMES` those of the `last` linearisation, as modes that are hardly determined would grow
+        without limit.
         """
-        waves = self.unknowns.waves  # of which splines and steps follow what else bends heights
+        waves = self.unknowns.waves  # splines and steps represent what else bends heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = [
             self._likely(total, freedom, careful and float(chdtrc(freedom, total)) < CHANCE)
@@ -502,7 +498,7 @@ class Variances:
 
 
 def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:
-    """Return the largest (N,) of the values of every view and of those that it shares points with."""
+    """Return the maximum (N,) of `values` over each view and the views that it shares points with."""
     i, j = pairs.T
     out = values.copy()
     np.maximum.at(out, i, values[j])
@@ -511,7 +507,7 @@ def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:
 
 
 def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
-    """Return whether every view (N,) has the largest value of those that it shares points with; the first of equals."""
+    """Return the mask (N,) of views with the largest value among those they share points with; of equals the first."""
     i, j = pairs.T
     tops: BoolArray = values == _neighbour_maximum(values, pairs)
     tops[j[tops[i] & tops[j]]] = False
@@ -519,10 +515,9 @@ def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
-    """Return whether the standard deviations of two priors differ by less than a share; infinite ones are
-    infinite in both.
+    """Return whether the standard deviations of two priors differ by less than `share` (as logarithms).
 
-    Of all unknowns, or a part; those along the lines of sight among them.
+    Those of all unknowns or of `part`, and of rotations about the lines of sight. Infinite ones are not compared.
     """
     one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
     finite = np.isfinite(one) & np.isfinite(other)

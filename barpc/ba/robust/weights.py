@@ -1,4 +1,4 @@
-"""How much observations count: the robust loss, stated sigmas, the observed noise.
+"""Weights of observations: by the robust loss, stated standard deviations, and the observed noise.
 
 The loss rho(s) is of a squared, normalised residual s = (|r| / scale)^2. The adjustment minimises sum scale^2 rho(s) by
 reweighting: an observation's squared weight is rho'(s), so that the gradient of the weighted problem is the gradient
@@ -16,15 +16,15 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
-MEDIAN = 0.55  # of |r|^2 over its expectation: chi-square with 1 (two views) to 2 (many) degrees of freedom
-_LARGEST_MISFIT = 3.0  # px: or a misfit would loosen the view that causes it
+MEDIAN = 0.55  # median of |r|^2 over its mean: chi-square with 1 (two views) to 2 (many) degrees of freedom
+_LARGEST_MISFIT = 3.0  # px: a larger one would remove all weight from the view that causes it
 _LITTLE_NOISE = 0.04
 """Standard deviation of tie points [px] below which their common error shrinks with it: half of it at most, where the
 noise floor is 0.02 px. Real images show a fifth of 0.1 px."""
 
 
 def geman_mcclure(s: Array) -> tuple[Array, Array]:
-    """Return rho(s) = s / (1 + s) and its derivative, 1 at 0: an outlier's pull vanishes."""
+    """Return the loss of Geman and McClure, rho(s) = s / (1 + s), and its derivative."""
     return s / (1.0 + s), 1.0 / (1.0 + s) ** 2
 
 
@@ -54,10 +54,9 @@ class Observations:
         self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
 
     def is_spared(self, squared: Array) -> BoolArray:
-        """Return the observations (K,) of control points, which are tested at the end instead of cut, unless
-        grossly wrong.
+        """Return the mask (K,) of observations that are not rejected here: of control and reference points.
 
-        Those of a reference agree with each other: how far the cameras are off says nothing of them.
+        Control points are tested at the end, unless they are gross errors; reference points were tested before.
         """
         return np.asarray((self.is_control & (squared < GROSS**2)) | self.of_reference)
 
@@ -83,7 +82,7 @@ class Observations:
         return freedom
 
     def mean_freedom(self, use: BoolArray) -> Array:
-        """Return the mean of that of the observations in use of each view (N,); 2 where there are none."""
+        """Return the mean of `freedom` over the observations in use of each view (N,); 2 where there are none."""
         counted = use.astype(np.float64)
         total, count = self.structure.sum_views(np.stack([counted * self.freedom(counted), counted])).T
         return np.where(count > 0, total / np.maximum(count, 1.0), 2.0)
@@ -94,10 +93,10 @@ class Observations:
         return np.where(np.isfinite(s), s, np.inf)
 
     def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
-        """Return the weights 1 / sigma (K,) [1/px], tie points under the cap; 0 where not used.
+        """Return the weights 1 / sigma (K,) [1/px]; 0 of observations not in use.
 
-        The error that a view's tie points have in common is `noise_floor`, or less where they scatter little. What its
-        camera cannot follow, `misfit` (N,) [px], does not average away either: it is as good as `SPLINES` independent
+        The total weight of the tie points of a view is limited, as they have a common error: `noise_floor`, or less
+        where they scatter little, and the `misfit` (N,) [px] of its camera model, which counts as `SPLINES` independent
         errors.
         """
         weight: Array = use / (self.sigma * noise)
@@ -112,7 +111,7 @@ class Observations:
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
     def told_by(self, weight: Array) -> Array:
-        """Return the information of tie points of weights (K,) [1/px] on each view, or that before (N,) [1/px^2]."""
+        """Return the information (N,) of the tie points of each view [1/px^2], at least that of an earlier block."""
         return np.maximum(self._of_ties(weight), self.told)
 
     def _of_ties(self, weight: Array) -> Array:
@@ -120,10 +119,9 @@ class Observations:
         return np.asarray(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0])
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
-        """Estimate the observed over stated standard deviation of the observations in use; 1 where there are
-        too few.
+        """Estimate the observed over stated standard deviation of tie points in use; 1 if they are too few.
 
-        `fitted` further parameters have been taken out of the residuals.
+        `fitted` is the number of further parameters that the residuals were fitted with.
         """
         use = use & ~self.is_control & ~self.of_reference
         whitened = residual[:, use] / self.sigma[use]
@@ -135,7 +133,7 @@ class Observations:
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 
     def tied(self, use: BoolArray) -> BoolArray:
-        """Return `use` without the only observations of points, but those with a prior."""
+        """Return `use` without single observations of points that have no prior."""
         structure = self.structure
         count = np.bincount(structure.point[use], minlength=structure.num_points)
         return use & ((count >= 2) | self.has_prior)[structure.point]
