@@ -2,8 +2,8 @@
 
 Two images show a displacement only across their epipolar lines. Behind an edge, rows are displaced along the axis of
 the rows (lost lines, clocks that jump: no platform turns by pixels between two lines), columns along that of the
-columns (detectors that overlap less than calibrated). The nearer the lines lie to that axis, the larger a displacement
-stays below the limit of detection. Where heights are known from a DEM, it is at most what these would not show.
+columns (detectors that overlap less than calibrated). The smaller the angle between epipolar lines and axis, the larger
+is the displacement that tie points do not show. Heights known from a DEM are a second limit of this displacement.
 """
 
 from __future__ import annotations
@@ -21,49 +21,55 @@ from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_un
 from barpc.base.statistics import CRITICAL, MANY, OUTLIER, SURE, robust_spread
 
 CHANCES = np.array([0.14, 0.05])
-"""Probability that columns, rows of an image are displaced: (n + 1/2) / (N + 1), Jeffreys' estimate. Of N = 10 real
-images of line scanners with independent points (Pleiades 5, QuickBird 1, Sentinel-2 2, Reunion 2) n = 1 has a step
-between detectors, none of rows."""
+"""Probabilities that columns, and that rows, of an image are displaced.
+
+They are Jeffreys' estimates (n + 1/2) / (N + 1) from N = 10 real images of line scanners with independent points
+(Pleiades 5, QuickBird 1, Sentinel-2 2, Reunion 2). n = 1 of them has displaced columns (a step between detectors), and
+n = 0 displaced rows.
+"""
 LARGEST_STEPS = np.array([1.0, 5.0])
-"""Largest of these displacements [px], evenly distributed below: detectors are calibrated in flight to a fraction of a
-pixel; more lines than these show as a tear in the image itself."""
-_LEAST_SHOWN = 1.0  # px: a line; heights of woods and houses may look like smaller displacements
-_EDGES = 16  # places of the edge along an axis, alike probable
+"""Largest displacements of columns and of rows [px]; smaller ones have a uniform distribution.
+
+Detectors are calibrated in flight to a fraction of a pixel. A larger displacement of rows is visible as a tear in the
+image.
+"""
+_LEAST_SHOWN = 1.0  # px: one row; the heights of woods and houses can have the same effect as smaller displacements
+_EDGES = 16  # number of equally probable positions of the edge along an axis
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A displacement of a part of an image that heights known from elsewhere show, and not the tie points."""
+    """A displacement of part of an image: heights from another source show it, but tie points do not."""
 
     view: int
     axis: int  # 0: columns, 1: rows
     edge: float  # [px]
     pixels: float
-    metres: float  # of heights behind the edge
+    metres: float  # error of heights behind the edge
 
 
 @dataclass(frozen=True, eq=False)
 class UnseenSteps:
-    """Displacements of columns and rows that two images would not have shown."""
+    """Largest displacements of columns and rows that two images do not show."""
 
     sizes: Array  # (2, 2) width and height of the views [px]
-    pixels: Array  # (2, 2) the largest, along columns and rows of each view [px]
-    metres: Array  # (2, 2) by how much heights behind it are off [m]
-    shown: Shown | None = None  # by heights known from elsewhere
+    pixels: Array  # (2, 2) displacements of columns and rows of each view [px]
+    metres: Array  # (2, 2) errors of heights behind the edges [m]
+    shown: Shown | None = None  # displacement shown by heights from another source
 
     def heights(self, image: Array, pull: Array) -> Array:
-        """Return the errors of heights (n, k) [m] by one standard deviation of k independent displacements.
+        """Return the errors of heights (n, k) [m] caused by k independent displacements of one standard deviation.
 
-        `image` (n, 2, 2) are the image points of n ground points in both views, `pull` (n, 2, 2) the derivative of
-        their heights by these.
+        `image` (n, 2, 2) are the image points of n ground points in both views. `pull` (n, 2, 2) are the derivatives of
+        the heights by the coordinates of these.
         """
-        # mean square of an even distribution up to the largest possible, of those that are not seen
+        # mean square of displacements that are not seen, if all are uniform between 0 and the largest
         sigma = np.sqrt(CHANCES / _EDGES * self.pixels**3 / (3.0 * LARGEST_STEPS))
         return np.asarray((sigma[..., None] * _steps(image, self.sizes) * pull[..., None]).reshape(len(pull), -1))
 
 
 def _steps(image: Array, sizes: Array) -> Array:
-    """Return whether image points (n, 2, 2) lie behind each edge (n, 2, 2, `_EDGES`)."""
+    """Return 1 where image points (n, 2, 2) lie behind an edge, else 0, for each edge (n, 2, 2, `_EDGES`)."""
     edges = (np.arange(_EDGES) + 0.5) / _EDGES
     return np.asarray((image / sizes)[..., None] > edges, dtype=np.float64)
 
@@ -78,16 +84,16 @@ def unseen_steps(
     sizes : (2, 2), of the views [px]
     ground, image, pull : (n, 3), (n, 2, 2), (n, 2, 2), tie points and derivatives as for `UnseenSteps.heights`
     limits : (float, float)
-        Standard deviation of their epipolar offsets, and the offset in common that is tolerated [px].
-    known : (n,), heights known from elsewhere [m]; NaN: unknown
+        Standard deviation of the epipolar offsets of the tie points, and their tolerated common offset [px].
+    known : (n,), heights from another source [m]; NaN: unknown
     """
-    # component of either axis across the epipolar lines, along which heights change
+    # components of both axes across the epipolar lines; the gradients of heights have the direction of these lines
     across = pull[:, :, ::-1] * [1.0, -1.0] / np.linalg.norm(pull, axis=2, keepdims=True)
     steps, found, (sigma, floor) = _steps(image, sizes), np.zeros((2, 2)), limits
-    least = np.sqrt(2.0 * (SURE + price(2) + SIZE_PRICE))  # standard deviations of a step that is found
+    least = np.sqrt(2.0 * (SURE + price(2) + SIZE_PRICE))  # least detected step, in standard deviations
     shown, by_heights = _by_heights(ground, steps * pull[..., None], known)
     for v, axis in np.ndindex(2, 2):
-        smooth = np.vander(2.0 * image[:, v, axis] / sizes[v, axis] - 1.0, DRIFTS)  # which cameras follow
+        smooth = np.vander(2.0 * image[:, v, axis] / sizes[v, axis] - 1.0, DRIFTS)  # absorbed by the cameras
         seen, even = (_beside(smooth, s) for s in (steps[:, v, axis] * across[:, v, axis, None], steps[:, v, axis]))
         size = np.linalg.norm(seen, axis=0) / np.sqrt(sigma**2 + floor**2 * (even**2).sum(axis=0))
         limit = least / np.maximum(size, least / LARGEST_STEPS[axis])
@@ -100,9 +106,10 @@ def unseen_steps(
 
 
 def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None, Array]:
-    """Return the displacement that known heights (n,) show, if any, and the least (2, 2, k) that they would [px].
+    """Return the displacement that known heights (n,) show, and the limits (2, 2, k) of those that they do not [px].
 
-    `rises` (n, 2, 2, k) are the heights [m] by a pixel of each. Smooth errors of heights are left to the cameras.
+    The displacement is None if they show none. `rises` (n, 2, 2, k) are the errors of heights [m] by a displacement of
+    one pixel. Smooth errors of heights are removed first: they are errors of the cameras.
     """
     limits, fits = np.full(rises.shape[1:], np.inf), np.isfinite(known)
     if fits.sum() < MANY:
@@ -117,7 +124,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
     pixels = columns.T @ off / square
     best = int(np.argmax(pixels**2 * square))
     left = off - columns[:, best] * pixels[best]
-    # errors of a DEM are alike over hundreds of metres
+    # errors of a DEM are correlated over hundreds of metres
     alike = variance_inflation(at[fits], np.column_stack([left, left]))
     sigma = np.sqrt(left @ left / len(left) * alike / square)
     v, axis, edge = np.unravel_index(best, limits.shape)
@@ -127,14 +134,14 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
 
 
 def _beside(smooth: Array, columns: Array) -> Array:
-    """Return the residuals of columns (n, k) after a fit of smooth ones (n, m)."""
+    """Return the residuals of columns (n, k) after a least-squares fit of smooth columns (n, m)."""
     return np.asarray(columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0])
 
 
 def with_unseen(gauge: GaugeReport, points: Array, heights: Array, held: bool) -> GaugeReport:
-    """Return the accuracy of a scene with the errors (n, k) [m] of heights at points (n, 3), ECEF [m].
+    """Return the report on a scene with the errors (n, k) [m] of heights at points (n, 3), ECEF [m], added.
 
-    Where the scene is `held` by control, a plane of them is corrected with it.
+    If control constrains the scene (`held`), it corrects shifts, tilts, turn and scale; the errors only bend the scene.
     """
     middle = points.mean(axis=0)
     local = (points - middle) @ enu_basis(ground_from_ecef(middle)).T / gauge.radius

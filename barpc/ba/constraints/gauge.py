@@ -27,16 +27,19 @@ from barpc.base.statistics import MANY, SAMPLE
 from barpc.scene import BoolArray, IntArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
-"""Motions of the scene [m]: shift; tilts, turn and scale as displacements at the radius of the scene; twist and bends
-as height ranges over the scene: heights proportional to east x north, to the squares of east and of north, each without
-its best-fitting plane. A rotation that changes with the row (drift) causes the latter."""
+"""Motions of the scene [m].
+
+Shifts are displacements. Tilts, turn and scale are displacements at the radius of the scene. Twist and bends are ranges
+over the scene of heights proportional to east x north, east^2 and north^2, each minus its best-fitting plane. Rotations
+of cameras that change with the row (drift) cause twist and bends.
+"""
 SIMILAR = MOTIONS.index("twist")
 """Number of motions that keep the shape of the scene; the others, from here on, bend it."""
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")
 """Sources of information: camera priors as delivered, or of an earlier run; fixed views; GCPs; the DEM or assumed
 altitudes, with their common errors; a reference orthoimage, with its common errors; altimetry (heights without image
 coordinates)."""
-_OF_HEIGHTS = 3  # with a reference: common errors of the terrain, before those of the orthoimage
+_OF_HEIGHTS = 3  # number of common errors of the DEM if there is a reference; those of the orthoimage follow
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,11 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
 def _assembled_report(
     covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | float], radius: float
 ) -> GaugeReport:
-    """`motions`: derivative by unknowns, covariance with these fixed, derivative by common errors with these fixed."""
+    """Return the report of a scene moved by `shift` (3,), east, north, up [m].
+
+    `motions` are the derivatives of the motions by the camera unknowns, and, with these fixed, the covariance of the
+    motions and their derivatives by common errors.
+    """
     by_unknown, own, direct = motions
     motion_covariance = by_unknown @ covariance.of_noise.solve(by_unknown.T) + own
     if covariance.shared is not None:
@@ -115,7 +122,7 @@ def _assembled_report(
 
 
 def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> Array | float:
-    """Return the derivative of the motions (10, k) by errors that images have in common, with the cameras fixed."""
+    """Return the derivatives (10, k) of the motions by errors common to several images, with the cameras fixed."""
     if covariance.shared is None:
         return 0.0
     chunks = ((pick[:, part], covariance.shared.of_points(index[part])) for part in parts(len(index), MANY))
@@ -123,12 +130,13 @@ def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> A
 
 
 def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:
-    """Return the derivative of the motions (10, N q) by camera unknowns, and their covariance with these fixed.
+    """Return the derivatives (10, N q) of the motions by camera unknowns, and their covariance with these fixed.
 
-    `pick` (10, n, 3) is their derivative by the points of `use`, `share` the sampled part of all points.
+    `pick` (10, n, 3) are the derivatives of the motions by the points of the mask `use`. `share` is the number of these
+    sampled points over that of all points.
     """
     reduced, index = covariance.reduced, np.flatnonzero(use)
-    # L^-1 of each motion's weights: dX = -L^-T Y dp
+    # with V = L L^T and Y = L^-1 W^T, dX = -L^-T Y dp; the derivatives of the motions are multiplied by L^-T
     whitened = solve_lower(reduced.lower[:, index], pick.transpose(2, 0, 1)).transpose(2, 0, 1)
     by_camera = by_cameras(reduced.structure, reduced.cross, index, whitened)
     flat = whitened.reshape(-1, len(MOTIONS))
@@ -145,7 +153,7 @@ def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, sha
 def motions_of_moves(local: Array) -> Array:
     """Return the matrix (10, n, 3) from displacements of points, east, north, up, to least-squares `MOTIONS`.
 
-    `local` (n, 3) are the points relative to their middle, in radii of the scene. Motions that the points do not
+    `local` (n, 3) are the points relative to their centre, in radii of the scene. Motions that the points do not
     determine are 0.
     """
     n = len(local)
@@ -186,7 +194,7 @@ def datum_shares(
     Parameters
     ----------
     covariance : Covariance, at the solution
-    by_unknown : (10, N q), motions by the unknowns of the cameras
+    by_unknown : (10, N q), derivatives of the motions by the unknowns of the cameras
     problem, state, weight : of the last solve; weight (K,) is 1 / sigma of each observation
     known : (int, int), indices of the first GCP and of the first reference point
     """

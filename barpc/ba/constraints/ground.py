@@ -30,16 +30,21 @@ from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 from barpc.sensor.curve import cross
 
 FIRST_PLACED = NUM_BENDS
-"""Index of the first common error of altimetry; those before it are of a DEM, or of a DEM and a reference."""
-DEM_BIAS = 20.0  # m: common error of a DEM, if not stated
-KNOWN_BIAS = 5.0  # m: the same, if its vertical datum is known
+"""Index of the first common error of altimetry. Those before it are of a DEM, and of a reference if there is one."""
+DEM_BIAS = 20.0  # m: standard deviation of the common error of a DEM, if not stated
+KNOWN_BIAS = 5.0  # m: the same, if the vertical datum of the DEM is known
 MAX_INDEPENDENT_ERRORS = 25.0  # effective number of independent points of a DEM or reference with correlated errors
-_ALTITUDE_SIGMA = 1.0  # m: keeps weak points at an altitude; 0.05 m across rays at 0.01 degrees is 290 m in height
+# m: constrains points with a small convergence angle, where an error of 0.05 m across rays 0.01 degrees apart is 290 m
+# in height
+_ALTITUDE_SIGMA = 1.0
 _FLAT_SIGMA = 50.0  # m: least prior sigma of altitudes without a DEM
 
 
 def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
-    """Concatenate priors on different points, with equal columns of common errors as the same; None: all are empty."""
+    """Concatenate priors on different points; None if all are empty.
+
+    Columns of common errors with the same index are the same error.
+    """
     given = [prior for prior in priors if prior is not None and len(prior.index)]
     if not given:
         return None
@@ -82,9 +87,9 @@ def terrain_heights(
 ) -> PointPrior:
     """Return priors that constrain points `index` (Q,) of (P, 3) to the local tangent planes of a DEM.
 
-    `sigma` [m] is that of single heights, `common_sigma` [m] that of a common offset, and of tilts at the edges of the
-    scene. These edges are those of the points, or of `span` (n, 3) [m] if other priors share the errors. For points
-    that are `level` (Q,) the slope is ignored. Points without a DEM height are left out.
+    `sigma` [m] is the standard deviation of single heights. `common_sigma` [m] is that of the common offset, and of
+    common tilts at the edges of the scene. The edges are those of the points, or of `span` (n, 3) [m] if other priors
+    share the errors. The slope is ignored at points in the mask `level` (Q,). Points without a DEM height are left out.
     """
     ground = ground_from_ecef(points[index])
     alt = terrain(ground[:, 0], ground[:, 1])
@@ -172,12 +177,12 @@ class TerrainTest:
     bias: float  # standard deviation of its common error [m]
     sigma: float = np.nan  # standard deviation of single heights, estimated from the tie points [m]; NaN: as stated
     alike: float = 1.0  # number of correlated heights that weigh as one independent height
-    gains: tuple[float, ...] = ()  # weight (0 to 1) of its relief at each scale, the finest first
-    relief: float = np.nan  # its relief as a multiple of the tie points'
-    shows: bool = True  # whether that ratio may be 1; else it is of another terrain, and not used
-    agrees: bool = True  # the same with the adjusted tie points
-    is_known: bool = True  # whether its vertical datum is known
-    # (3,) offset and tilts, east and north, of the tie points above it before the adjustment [m]
+    gains: tuple[float, ...] = ()  # weight (0 to 1) of the relief of the DEM at each scale, the finest first
+    relief: float = np.nan  # relief of the DEM over that of the tie points
+    shows: bool = True  # whether this ratio is consistent with 1; else the DEM is of another terrain, and not used
+    agrees: bool = True  # whether the ratio is consistent with 1 for the adjusted tie points
+    is_known: bool = True  # whether the vertical datum of the DEM is known
+    # (3,) offset, and tilts east and north, of the tie points above the DEM before the adjustment [m]
     delivered: tuple[float, ...] = (np.nan,) * 3
     beyond: tuple[float, ...] = (np.nan,) * 3  # `delivered` over the standard deviations of DEM and cameras
 
@@ -238,9 +243,13 @@ class PointConstraints:
     def _height_priors(self, points: Array) -> PointPrior | None:
         """Return the height priors of tracks without altimetry; None: there are none.
 
-        DEM with an accuracy estimated from tie points: all tracks; if of another terrain, as without a DEM. DEM as
-        given: all tracks, sigma enlarged for correlation. DEM not compared yet: weak tracks. No DEM: weak tracks, at
-        the median altitude of the others, or the middle of the altitude range.
+        The tracks that get a prior depend on the DEM:
+
+        - Accuracy estimated from tie points: all tracks. A DEM of another terrain is ignored, as without a DEM.
+        - Accuracy as given: all tracks. With a reference or a comparison, sigma is enlarged for correlated errors.
+        - Not compared with tie points yet: weak tracks.
+        - No DEM: weak tracks. They are constrained to the median altitude of the other tracks, or to the middle of the
+          altitude range.
         """
         weak, weighted = self.weak[self.tracks], self._weighted_dem(points)
         free = np.ones(len(weak), dtype=bool)
@@ -273,8 +282,8 @@ class PointConstraints:
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
             sigma = high - low
-        # a wide common sigma: altitudes of the other tracks may be biased, and those of an RPC only limit the range;
-        # the cameras determine it
+        # the common sigma is wide, so that the cameras determine the common altitude: the other tracks may be biased,
+        # and the altitude range of an RPC is only a limit
         return flat_heights(points, index, float(middle), max(float(sigma), _FLAT_SIGMA), highest - lowest)
 
     @property

@@ -29,16 +29,19 @@ from barpc.scene import BoolArray, IntArray
 from barpc.scene import Terrain as Terrain
 
 SLOPE_STEP = 15.0  # m: slopes of the DEM are differences over twice this distance
-SURFACE_DEGREE = 3  # degree of the smooth surface of common errors, which takes the smooth part of the DEM whole
+SURFACE_DEGREE = 3  # degree of the polynomial surface of common errors; this part of the DEM is used with a gain of 1
 _SURFACE_POWERS = [(n - j, j) for n in range(SURFACE_DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
 NUM_BENDS = len(_SURFACE_POWERS)
 _DEM_NODES = 300  # of the grid for smoothing, along the longer side of the scene: 30 m apart for 10 km
-_DEM_MARGIN = 300.0  # m around the scene at least, also tolerance of altitudes: cameras may be wrong by it
-_VARIANCE_CELLS = (6, 10, 16)  # along the longer side of the scene: 36 sums give a variance to a quarter
-_WIDEST = _VARIANCE_CELLS[-1]  # the largest standard deviation of smoothing is the smallest of these cells
-_HILLS = 45.0  # least number of independent slopes: 49-133 in scenes with valid gains, 33 in 250 m of SRTM
-_EDGE_TO_RMS_DISTANCE = 2.0  # distance of the edges of a scene over the RMS distance of its points, at most about
-_MAX_RELIEF_DIFFERENCE = 0.5  # of the relief ratio of DEM and tie points from 1: beyond, the DEM is of another terrain
+_DEM_MARGIN = 300.0  # m: least margin around the scene, and tolerance of altitudes, for errors of the cameras
+# cells along the longer side of the scene; sums over 6 x 6 cells determine a variance to a quarter of its size
+_VARIANCE_CELLS = (6, 10, 16)
+_WIDEST = _VARIANCE_CELLS[-1]  # longer side of the scene over the largest width of smoothing
+_HILLS = 45.0  # least number of independent slopes; scenes with valid gains have 49 to 133, and 250 m of SRTM have 33
+# about the largest distance of the edges of a scene from its centre, over the RMS distance of its points
+_EDGE_TO_RMS_DISTANCE = 2.0
+# largest difference from 1 of the relief of a DEM over that of the tie points; beyond it the DEM is of another terrain
+_MAX_RELIEF_DIFFERENCE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +52,12 @@ class Bands:
     origin: Array  # (2,) lon, lat of the first node [deg]
     unit: Array  # (2,) metres per degree
     step: float  # m between nodes
-    smoothed: tuple[Array, ...]  # smoothed DEMs, each twice as wide as the one before
+    smoothed: tuple[Array, ...]  # DEMs, each smoothed with twice the width of the one before
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
         """Split a DEM into bands of scales over ground points (n, 3)."""
-        from scipy.ndimage import gaussian_filter  # a tenth of a second, of blocks with a DEM alone
+        from scipy.ndimage import gaussian_filter  # imported here: it takes a tenth of a second
 
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
         low, high = np.percentile(np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0)  # wrong matches lie far out
@@ -114,12 +117,15 @@ def terrain_slopes(terrain: Terrain, ground: Array) -> Array:
 
 
 def _differences(layers: Array) -> Array:
-    """Return the bands (K, ...) of ever smoother layers (K, ...): each minus the next, the last itself."""
+    """Return the bands (K, ...) of ever smoother layers (K, ...).
+
+    A band is a layer minus the next one. The last band is the last layer.
+    """
     return np.concatenate([layers[:-1] - layers[1:], layers[-1:]])
 
 
 def quadratic_basis(at: Array) -> Array:
-    """Return the monomials (n, `NUM_BENDS`) of the smooth surface at positions (n, 2)."""
+    """Return the monomials (n, `NUM_BENDS`), up to `SURFACE_DEGREE`, of the smooth surface at positions (n, 2)."""
     x, y = at.T
     return np.column_stack([x**i * y**j for i, j in _SURFACE_POWERS])
 
@@ -142,8 +148,8 @@ class RegularisedDem:
     gains: Array  # (K,) weight of each band, the finest first
     sigma: float  # standard deviation of single altitudes [m]
     alike: float  # number of correlated heights that weigh as one independent height
-    relief: float  # the DEM's relief as a multiple of the tie points'
-    shows: bool  # whether that may be 1; else the DEM is of another terrain
+    relief: float  # relief of the DEM over that of the tie points
+    shows: bool  # whether this ratio is consistent with 1; else the DEM is of another terrain
 
     @property
     def effective_sigma(self) -> float:
@@ -158,12 +164,15 @@ class Relief:
     bands: Bands | None  # None: too few points
     tell: BoolArray  # (P,) points with heights from rays that are more accurate than the DEM
     delivered: Array  # (3,) offset and tilts, east and north, of points above the DEM, delivered cameras [m]
-    fit: Array  # (3, P) its derivative by the heights of the points
+    fit: Array  # (3, P) derivatives of `delivered` by the heights of the points
     cameras: Array  # (3,) standard deviation of `delivered` by the camera priors [m]; NaN: unknown
     posts: Array | None = None  # (P, 4) indices of the grid posts of the DEM around each point, if it is a grid
 
     def beyond(self, bias: float) -> Array:
-        """Return `delivered` over its standard deviations (3,), with `bias` [m] that of the DEM."""
+        """Return the absolute values (3,) of `delivered` over their standard deviations.
+
+        `bias` [m] is the standard deviation of the common error of the DEM.
+        """
         return np.asarray(np.abs(self.delivered) / np.hypot(self.cameras, bias))
 
     def common_sigma(self, bias: float) -> Array:
@@ -177,9 +186,9 @@ class Relief:
     def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
         """Compare a DEM with ground points (P, 3) from rays alone.
 
-        The `strong` (P,) ones have heights with standard deviations `sharp` (P,) [m]. Those are used whose deviation is
-        below that of DEM heights: the larger of `stated` [m] and the observed one. Tilts are heights at the RMS
-        distance of the points from their middle.
+        Rays determine the heights of the points in the mask `strong` (P,), with standard deviations `sharp` (P,) [m].
+        Points are used if `sharp` is below the standard deviation of DEM heights: the larger of `stated` [m] and the
+        observed one. Tilts are stated as heights at the RMS distance of the points from their centre.
         """
         index = np.flatnonzero(strong)
         off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
@@ -203,16 +212,20 @@ class Relief:
         return cls(bands, tell, delivered, fit, unknown, posts)
 
     def independent(self, points: IntArray) -> float:
-        """Return an upper limit of independent DEM heights at points (n,): the number of grid posts around them."""
+        """Return an upper limit of the number of independent DEM heights at points (n,).
+
+        The limit is the number of grid posts around the points, or infinity if the DEM is not a grid.
+        """
         return np.inf if self.posts is None else float(len(np.unique(self.posts[points])))
 
 
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> RegularisedDem | None:
-    """Estimate the accuracy of a DEM at the points `index` (n,), at ground (n, 3); None with too few heights of rays.
+    """Estimate the accuracy of a DEM at the points `index` (n,), with ground coordinates (n, 3).
 
-    `stated` [m] is the standard deviation of single DEM heights. Points with accurate heights are constrained to their
-    own height, less the part of the difference that a motion or a bend of the scene explains. The rest is an error of
-    the DEM, and does not act on the rays.
+    `stated` [m] is the standard deviation of single DEM heights. Part of the difference between the height of a point
+    and the weighted DEM is explained by a motion or a bend of the scene. A point with an accurate height is constrained
+    to its own height minus this part. The rest of the difference is an error of the DEM, and does not move the point.
+    The result is None if too few points have heights from rays.
     """
     if relief.bands is None:
         return None
@@ -256,7 +269,7 @@ class _Compared:
 
     gains: Array  # (K,) of the bands
     rising: Array  # (n, 2) slopes of the weighted sum of the bands
-    part: Array  # (n,) part that a motion and a bend of the scene explain [m]
+    part: Array  # (n,) part of the heights that a motion and a bend of the scene explain [m]
     left: Array  # (n,) residuals [m]
     fits: BoolArray  # (n,) inliers among the points used
     unknowns: int
@@ -265,12 +278,13 @@ class _Compared:
 def _compared(
     at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray, independent: float
 ) -> _Compared:
-    """Regress heights `above` (n,) [m] on bands (n, K) of slopes (K, n, 2), with a motion and a bend (n, m).
+    """Regress the heights `above` (n,) [m] of points at (n, 2) on the bands of a DEM, with a motion and a bend.
 
-    Only points that `tell` (n,) are used. If the number of independent slopes, at most `independent`, is too small to
-    distinguish hills from errors, the bands are not used.
+    `bent` (n, K) are the heights of the bands, and `slopes` (K, n, 2) their slopes. `smooth` (n, m) are the shapes of
+    the bend. Only the points in the mask `tell` (n,) are used. The number of independent slopes is at most
+    `independent`. If it is too small to distinguish hills from errors of the DEM, the gains of all bands are zero.
     """
-    from scipy.optimize import lsq_linear  # a fifth of a second, of blocks with a DEM alone
+    from scipy.optimize import lsq_linear  # imported here: it takes a fifth of a second
 
     gains, fits, both, use_bands = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
     for _ in range(BACKFITTING):
@@ -278,7 +292,7 @@ def _compared(
         hills = fits.sum() / variance_inflation(at[fits], rising[fits] - rising[fits].mean(axis=0))
         use_bands = use_bands and min(hills, independent) > _HILLS
         moved = smooth
-        if use_bands:  # shift, turn, scale
+        if use_bands:  # motion: shift, rotation, scale
             moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
             free = both[fits] - moved[fits] @ _least_squares_fit(moved[fits], both[fits])
             gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
@@ -293,7 +307,7 @@ def _compared(
 
 
 def _middling(values: Array) -> BoolArray:
-    """Return the mask of n values that are no outliers about their median."""
+    """Return the mask (n,) of the values (n,) that are not outliers about their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= OUTLIER * robust_spread(off))
 
@@ -305,7 +319,8 @@ def _least_squares_fit(design: Array, values: Array) -> Array:
 def variance_inflation(at: Array, pull: Array) -> float:
     """Return the number of correlated points at (n, 2) that weigh as one, from their gradients `pull` (n, 2).
 
-    The largest ratio, over sizes of cells, of squared sums over cells to those of independent gradients.
+    The gradients are summed over the cells of a grid. The sum of the squared sums is divided by its expectation for
+    independent gradients: the sum of their squares. The largest ratio of several grids is returned, at least 1.
     """
     size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
     for count in _VARIANCE_CELLS:
@@ -317,9 +332,9 @@ def variance_inflation(at: Array, pull: Array) -> float:
 
 
 def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]:
-    """Return the ratio of the relief of a DEM (n,) to that of ground points (n, 3), and whether it may be 1.
+    """Return the ratio of the relief of a DEM (n,) to that of ground points (n, 3), and whether it can be 1.
 
-    For adjusted points: only an offset and tilts are removed. `stated` [m] is the sigma of single DEM heights.
+    The points are adjusted, so only an offset and tilts are removed. `stated` [m] is the sigma of single DEM heights.
     """
     if len(dem) < MANY:
         return float("nan"), True
@@ -331,7 +346,11 @@ def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]
 
 
 def _relief_ratio(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
-    """Return the ratio of a DEM relief (n,) to that of tie points (n,) [m], and whether it may be 1."""
+    """Return the ratio of a DEM relief (n,) to that of tie points (n,) [m], and whether it can be 1.
+
+    The ratio cannot be 1 if its difference from 1 is large and significant, and the difference of the heights is much
+    larger than `stated` [m].
+    """
     seen = above - smooth @ _least_squares_fit(smooth, above)
     size = max(float(seen @ seen), 1e-12)
     times = float(relief @ seen) / size

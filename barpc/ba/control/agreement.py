@@ -25,15 +25,18 @@ from barpc.base.geodesy import Array, enu_basis, parts
 from barpc.base.statistics import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 
-UNCONSTRAINED_SIGMA = 1e4  # m: holds no camera, but keeps a point of one ray from diverging
-_MAX_SET_POINTS = 50_000  # points of sets at a time: some 25 MB
-_SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # of understated standard deviations; beyond the last a point is wrong
-# sampling ends where the probability that all samples of three had outliers is that of all samples with half wrong
+# m: prior standard deviation of a point without control. It constrains no camera, and bounds a point with one ray.
+UNCONSTRAINED_SIGMA = 1e4
+_MAX_SET_POINTS = 50_000  # points in one batch, summed over its sets; about 25 MB
+_SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # candidate factors by which standard deviations are understated
+# Probability that all samples of three points contain an outlier, if half of the points are outliers. Sampling ends
+# where this probability is reached with the largest share of agreeing points found.
 _ENOUGH = (1.0 - 0.5**3) ** (TRIALS // 2)
 ODDS = float(-np.log(LEVEL))
-"""Log of the prior odds against a wrong point, and against each factor e of understated standard deviations [nats].
+"""Log of the prior odds against a wrong point [nats].
 
-A set must also exceed a contradicting set by it.
+The log prior of standard deviations understated by a factor f is -ODDS ln f. The log evidence of the best set must also
+exceed that of a smaller contradicting set by ODDS.
 """
 
 
@@ -44,7 +47,7 @@ class Agreement:
     Parameters
     ----------
     used : (G,)
-        Mask of the points that agree with each other.
+        Mask of the points used: those that agree with each other, and those that cannot be compared.
     sets : tuple of (G,)
         Two contradicting sets of equal evidence, neither of which is used; empty where one set is used.
     scale : float
@@ -52,8 +55,8 @@ class Agreement:
     alike : bool
         Whether two or more unused points agree with each other: they may have another datum.
     torn : (2,)
-        RMS of check tie points without and with control [px], where the control agrees with itself but raises it, so
-        that no point is used; else empty.
+        RMS of check tie points without and with control [px], if the control points agree with each other but raise
+        this RMS. No point is used then. Empty otherwise.
     """
 
     used: BoolArray
@@ -106,7 +109,7 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
     points : (P, 3)
         Adjusted points, ECEF [m].
     faint : (P,)
-        Factors on the standard deviation of the observations of each point in that solution.
+        Factors by which that solution multiplied the standard deviations of the observations of each point.
     """
     gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
     count, q = len(gcps.names), covariance.num_unknowns
@@ -134,10 +137,18 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
 
 
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
-    """Find the control points to use, among those that two or more rays triangulate, `told` (G,).
+    """Find the control points to use.
 
-    Points that cannot be compared are used with the others. All sets of up to twelve points are compared; of more
-    points, the sets that agree with three points drawn at random.
+    All sets are compared if there are up to twelve points. With more points, the sets compared are those that agree
+    with three points drawn at random.
+
+    Parameters
+    ----------
+    offsets : Offsets
+        Of G control points.
+    told : (G,)
+        Mask of the points with two or more rays. The other points cannot be compared. They are used too, unless two
+        sets contradict each other.
     """
     given = np.flatnonzero(told)
     if len(given) < 2:
@@ -175,7 +186,7 @@ class _SubsetSearch:
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
         self.masks, self.score = np.zeros((0, self.count), dtype=bool), np.zeros(0)
-        self.factors = np.zeros((0, 2))  # by which accuracies and motions are too good where a set is likeliest
+        self.factors = np.zeros((0, 2))  # of standard deviations and of motions, at the largest evidence
         every = self.count * 2**self.count <= _MAX_SET_POINTS
         if every:
             numbers = np.arange(1, 2**self.count)
@@ -219,7 +230,7 @@ class _SubsetSearch:
                 mask = np.zeros(count, dtype=bool)
                 mask[rng.choice(count, 3, replace=False)] = True
                 for _ in range(2):
-                    if mask.any():  # no set tells nothing, and contradicts no point
+                    if mask.any():  # an empty set would accept every point
                         mask = SetEvidence(some, mask[None], scale).deviations(every)[0][0] < CRITICAL**2
                 found += [mask] if mask.any() else []
                 most = max(most, float(mask.mean()))
@@ -260,7 +271,8 @@ class _SubsetSearch:
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
         """Return the evidence (B,) of sets (B, G), and the factors (B, 2) of standard deviations and motions.
 
-        The evidence is minus infinity for sets that cannot contradict the best.
+        The evidence is minus infinity for a set whose upper limit is 2 SURE or more below the largest evidence. Such a
+        set cannot contradict the best.
         """
         best = self.score.max(initial=-np.inf)
         score, factors = np.full(len(masks), -np.inf), np.ones((len(masks), 2))
@@ -281,9 +293,20 @@ class _SubsetSearch:
 
 
 class SetEvidence:
-    """Evidence (B,) that the points of sets (B, G) agree, and the predictions of every point by a set.
+    """Evidence that the points of sets agree, and the predictions of all points by each set.
 
-    Points agree to `times` their standard deviations, and the cameras' motions are `motions` times as large as told.
+    Parameters
+    ----------
+    offsets : Offsets
+        Of G control points.
+    masks : (B, G)
+        Points of each set.
+    times : float
+        Factor on the standard deviations of the points.
+    motions : float
+        Factor on the standard deviations of the motions, except the shifts.
+    sums : (B, r + 1, r + 1), optional
+        Sums of `Offsets.products` over each set.
     """
 
     def __init__(
@@ -296,7 +319,7 @@ class SetEvidence:
         information = np.eye(r) + sums[:, :r, :r] * np.outer(factor, factor) / self.variance
         lower = np.linalg.cholesky(information)
         inverse = np.linalg.inv(lower)
-        self._root = factor[:, None] * np.swapaxes(inverse, 1, 2)  # (B, r, r) motions once the set is known
+        self._root = factor[:, None] * np.swapaxes(inverse, 1, 2)  # (B, r, r) of their covariance given the set
         self._mean = (inverse @ (sums[:, :r, r] * factor / self.variance)[..., None])[..., 0]
         self.squares = sums[:, r, r] / self.variance - (self._mean**2).sum(axis=1)
         volume = 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
@@ -304,9 +327,9 @@ class SetEvidence:
         self._inside = -0.5 * (self.squares + volume) - of_points - ODDS * np.log(times * motions)
 
     def deviations(self, points: IntArray) -> tuple[Array, Array]:
-        """Return the squared deviations (B, n) of points from their prediction by each set, over its covariance.
+        """Return the squared Mahalanobis distances (B, n) of points from their predictions by each set.
 
-        Also returned: the log determinants (B, n) of these covariances.
+        Also returned are the log determinants (B, n) of the covariances of these predictions.
         """
         left, turned = self._seen(points)
         return _deviation(left, self._spread(turned))
@@ -325,9 +348,9 @@ class SetEvidence:
         return np.asarray(self._inside - least * (~self.masks).sum(axis=1))
 
     def gains(self, points: IntArray) -> Array:
-        """Return the gains (n,) of the evidence of the only set by moving each point into it, or out of it.
+        """Return the gains (n,) of log evidence by moving each point into the set, or out of it.
 
-        Each is an update of rank three of the predictions (Woodbury).
+        There must be only one set. Each move is an update of rank three of the predictions (Woodbury).
         """
         inside, out = self.masks[0, points], np.flatnonzero(~self.masks[0])
         left, turned = self._seen(points)
@@ -335,7 +358,7 @@ class SetEvidence:
         own = self._spread(turned, sign)
         squared, volume = (part[0] for part in _deviation(left, own))
         unit = 3.0 * np.log(self.variance)
-        beside = np.where(inside, 2.0 * unit - volume, volume)  # of what the others tell of a point
+        beside = np.where(inside, 2.0 * unit - volume, volume)  # of the prediction by the set's other points
         gain = sign * (_anywhere(squared, beside) - 0.5 * squared - 1.5 * np.log(2.0 * np.pi))
         gain += inside * unit - 0.5 * volume
         if not len(out):
@@ -356,7 +379,10 @@ class SetEvidence:
         return np.asarray(gain)
 
     def _seen(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
-        """Return the deviations (B, n, 3) of points from their prediction by sets, and motions (B, n, 3, r)."""
+        """Return the deviations (B, n, 3) of points from their predictions by each set.
+
+        Also returned are the products (B, n, 3, r) of their motions and the root of the motions' covariance.
+        """
         motions, root = self.offsets.motions[points], self._root[part]
         turned = (motions.reshape(-1, motions.shape[2]) @ root).reshape(len(root), *motions.shape)
         return self.offsets.own[points] - (turned @ self._mean[part, None, :, None])[..., 0], turned
@@ -375,9 +401,10 @@ def _deviation(left: Array, spread: Array) -> tuple[Array, Array]:
 
 
 def _anywhere(squared: Array, volume: Array | float) -> Array:
-    """Return minus the log density of wrong points, from squared deviations and log determinants of covariances.
+    """Return minus the log density of wrong points, plus their log prior odds `ODDS`.
 
-    The density is uniform in the logarithm of the deviation, from one to 10,000 standard deviations.
+    The density is uniform in the logarithm of the deviation, from one to 10,000 standard deviations. The arguments are
+    the squared Mahalanobis distances from the predictions, and the log determinants of the predictions' covariances.
     """
     ball = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
     return np.asarray(1.5 * np.log(np.maximum(squared, 1.0)) + ball + 0.5 * volume + ODDS)

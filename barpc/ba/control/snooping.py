@@ -24,7 +24,7 @@ from barpc.base.geodesy import Array, enu_basis
 from barpc.base.statistics import CHANCE, CRITICAL, KEPT, RIDGE
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
-CHECKED = 0.1  # least redundancy of a point that is checked by more than the priors on the cameras
+CHECKED = 0.1  # least redundancy of a checked point; the priors on the cameras alone give less
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,12 @@ class ControlTest:
 
     @property
     def checked(self) -> bool:
-        """Whether any point used has redundancy."""
+        """Whether any point used has a redundancy above `CHECKED`."""
         return bool((self.redundancy[self.used] > CHECKED).any())
 
     @property
     def agrees(self) -> bool:
-        """Whether all tests are passed: of single points, of all together, and no two sets contradict each other."""
+        """Whether every point used passes its test, all points pass the global test, and no sets contradict."""
         status = [self.status(g) for g in range(len(self.used))]
         return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
@@ -76,7 +76,7 @@ class ControlTest:
 
     @property
     def torn(self) -> tuple[float, ...]:
-        """RMS of check tie points without and with control [px], where control distorts the block; else empty."""
+        """RMS of check tie points without and with control [px], if control distorts the block. Empty otherwise."""
         return () if self.agreed is None else self.agreed.torn
 
     def status(self, point: int) -> str:
@@ -96,15 +96,15 @@ def control_test(
     covariance : Covariance
         Of the solution.
     points : (P, 3)
-        Adjusted, ECEF [m]; from `first` on the GCPs.
+        Adjusted tie points and, from index `first`, control points, ECEF [m].
     first : int
-        Number of tracks.
+        Index of the first control point: the number of tracks.
     gcps : GroundPoints
         As given.
     agreed : Agreement
         Which points were used, and with which factor on their standard deviations.
     faint : (G,)
-        Factors on the standard deviations of their observations.
+        Factors by which that solution multiplied the standard deviations of the observations of each control point.
     """
     count, used, sigmas = len(gcps.names), agreed.used, gcps.sigma * agreed.scale
     seen = np.bincount(gcps.point, minlength=count)
@@ -154,8 +154,8 @@ def image_test(
 ) -> Array:
     """Return Baarda's w (n,) of image observations: the larger of |col| and |row| over its standard deviation.
 
-    A whitened residual has the covariance 1 - J C J^T, with C the joint covariance of camera and point. NaN where it
-    is zero.
+    A whitened residual has the covariance I - J C J^T. C is the joint covariance of the cameras and the point. w is
+    NaN if both variances are zero.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def image_test(
     inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
     place = {} if reduced.common is None else {int(p): n for n, p in enumerate(reduced.common.index)}
     left = np.empty((len(rows), 2))
-    waiting: list[tuple[int, Array]] = []  # rows (2, N q) of the derivative by all cameras, solved for together
+    waiting: list[tuple[int, Array]] = []  # observation, its derivatives (2, N q) by all cameras
     for n, k in enumerate(rows.tolist()):
         p = int(structure.point[k])
         together = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
@@ -205,7 +205,7 @@ def image_test(
 
 
 def _take_off(left: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
-    """Subtract the variances by the cameras from `left` for the observations that wait, and clear the list."""
+    """Subtract the variances due to the cameras from `left`, for the observations in `waiting`, and clear the list."""
     if not waiting:
         return
     index, parts = zip(*waiting, strict=True)

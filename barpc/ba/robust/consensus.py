@@ -32,7 +32,7 @@ class TwoGroups:
 
 
 def two_groups(structure: Structure, residual: Array, by_point: Array, use: BoolArray) -> tuple[TwoGroups, ...]:
-    """Find the pairs of views whose epipolar offsets, of observations in use, are a mixture of two normals."""
+    """Find the pairs of views whose epipolar offsets are a mixture of two normals, from the observations in use."""
     many = np.repeat(np.diff(structure.pair_bounds) >= MANY, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
     offset = _across(residual, by_point, structure.first[rows], structure.second[rows])
@@ -87,8 +87,10 @@ def two_normals(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Return `use` (K,) without the observations that disagree with most other observations of their points.
+    """Return `use` (K,) without the observations that disagree with the most other observations of their points.
 
+    Two observations of a point disagree if their epipolar offset is not on the plane of their pair of views. The worst
+    observations of each point are removed repeatedly, until no two observations disagree.
     `xy` (2, K) are observed col, row; the residuals (2, K) are at approximate points; `sigma` (K,) is stated. All [px].
     """
     first, second = structure.first, structure.second
@@ -118,7 +120,7 @@ def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray)
     offset = np.empty(len(first))
     for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
-        rays = cross(one[0], one[1]), cross(two[0], two[1])  # of a ray only the other's image moves
+        rays = cross(one[0], one[1]), cross(two[0], two[1])  # a point moved along one ray moves only in the other image
         of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
         normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
         four = np.concatenate([residual.take(first[part], axis=1), residual.take(second[part], axis=1)])
@@ -128,7 +130,7 @@ def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray)
 
 
 def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> BoolArray:
-    """Return the largest set of offsets (n,) on one plane over the image (RANSAC, then least squares)."""
+    """Return the mask (n,) of the largest set of offsets on one plane over the image (RANSAC, then least squares)."""
     low, high = place.min(axis=1, keepdims=True), place.max(axis=1, keepdims=True)
     design = np.vstack([np.ones(len(offset)), 2.0 * (place - low) / np.maximum(high - low, 1.0) - 1.0])
     rng = np.random.default_rng(seed)

@@ -1,8 +1,8 @@
 """Check points and check tie points: they are kept out of the adjustment and measure its accuracy.
 
 Inliers of an adjustment agree because the others were rejected. Therefore a tenth of all tracks is kept out before, and
-triangulated by the adjusted cameras. Wrong matches are among them, so their noise is estimated as that of a mixture of
-normal errors (right matches) and uniform ones (wrong matches).
+triangulated by the adjusted cameras. These tracks contain wrong matches. Their errors are therefore modelled as a
+mixture, normal for right matches and uniform for wrong ones. The noise is that of the right matches.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
 _CHECK_SHARE = 0.1
-_STEPS_A_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel, so that the last digits change hardly any draw
-_NOTHING = float(np.finfo(np.float64).tiny)  # least variance, where all residuals are zero
+_STEPS_A_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel: changes of their last digits alter few draws
+_NOTHING = float(np.finfo(np.float64).tiny)  # least variance; reached if all residuals are zero
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residuals of check tie points, and the noise of each view by them."""
+    """Residuals of check tie points, and the noise of each view estimated from them."""
 
-    residual: Array  # (2, H) projected - observed [px], points triangulated by the cameras
+    residual: Array  # (2, H) projected - observed [px]; the points are triangulated by the cameras
     index: IntArray  # (Q,) numbers of their points
     points: Array  # (Q, 3) these points, ECEF [m]
     noise: Array  # (N,) observed over stated standard deviation in each view; NaN with too few observations
-    rms: Array  # (N,) RMS residual of right matches by this noise [px]
+    rms: Array  # (N,) expected RMS residual of right matches with this noise [px]
 
     @property
     def error(self) -> float:
-        """Root mean square of `noise` over the views; NaN where none is known."""
+        """Root mean square of `noise` over the views; NaN if it is known for no view."""
         return _mean_square(self.noise)
 
     @property
     def whole_rms(self) -> float:
-        """Root mean square of `rms` over the views [px]; NaN where none is known."""
+        """Root mean square of `rms` over the views [px]; NaN if it is known for no view."""
         return _mean_square(self.rms)
 
 
@@ -81,7 +81,10 @@ def splitmix64(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
 
 
 def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """Return the problem with the observations of `block`, and its points (Q, 3) triangulated by cameras (N, q)."""
+    """Return the problem with only the observations of `block`, and the triangulated points (Q, 3) of `block`.
+
+    The points are triangulated by cameras with unknowns (N, q). They have no prior.
+    """
     index, structure = block.own_points
     cameras = problem.cameras.seeing(block.xy)
     part = replace(problem, cameras=cameras, structure=structure, xy=block.xy, point_prior=None, _room=[])
@@ -96,9 +99,9 @@ def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -
     the points `first`.
     """
     xy, counted = problem.xy, np.ones(len(sigma))
-    projected = problem.project_points(params, first)  # near the end: from here it is linear
+    projected = problem.project_points(params, first)  # close to the solution: the projection is linear from here
     points = problem.triangulate(first, projected, 1.0 / sigma)
-    for _ in range(STEPS):  # of three views that do not agree two may
+    for _ in range(STEPS):  # the loss can reject one of three views
         residual = projected.image - xy
         residual += (projected.by_point * problem.structure.of_points(points - first)).sum(axis=1)
         counted = geman_mcclure((residual**2).sum(axis=0) / (CRITICAL * sigma) ** 2)[1]
@@ -129,11 +132,12 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
 
 
 def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
-    """Return the observed over stated standard deviation (N,) in each view, where half of the matches may be wrong.
+    """Return the observed over stated standard deviation (N,) of right matches in each view.
 
-    Right matches are chi-square distributed and wrong ones uniform up to the largest residual; the parameters are found
-    by expectation maximisation. The uniform density is at least `NEAR_LIMIT` nats below the peak of the other, or right
-    matches in its tails would count as wrong.
+    Up to half of the matches may be wrong. Squared residuals of right matches are chi-square distributed; residuals of
+    wrong ones are uniform up to the largest. The parameters are found by expectation maximisation. The log density of
+    wrong matches is at least `NEAR_LIMIT` nats below the peak of that of right matches. Otherwise right matches in the
+    tails would count as wrong.
 
     Parameters
     ----------
@@ -144,7 +148,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     view : (K,)
         View numbers 0 .. N - 1, ascending; each has at least one observation.
     """
-    half = 0.5 * np.maximum(freedom, 1.0)  # of two views all scatter across the epipolar line
+    half = 0.5 * np.maximum(freedom, 1.0)  # at least 1: two views have residuals across the epipolar line only
     starts = np.flatnonzero(np.diff(view, prepend=-1))
     count = np.diff(starts, append=len(view)).astype(np.float64)
     ordered = squared[np.lexsort((squared, view))]
@@ -175,7 +179,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
 def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
     """Return whether the residuals of the check tracks of `block` are significantly smaller in `one` than in `other`.
 
-    Robust losses are compared track by track, as both have the same matching errors.
+    The robust losses of each track are compared, because both adjustments have the same matching errors.
     """
     if not len(block.point) or not one.error < other.error:
         return False
@@ -186,10 +190,11 @@ def is_better(one: HeldOut, other: HeldOut, block: Block) -> bool:
 
 
 def is_admitted(tried: HeldOut, before: HeldOut, block: Block, evidence: float = 0.0) -> bool:
-    """Return whether a model with more unknowns, or fewer observations, is preferred to another.
+    """Return whether a model with more unknowns, or fewer observations, is preferred to the one before.
 
-    With significant `evidence` of all observations [nats]: unless residuals of the check tracks of `block` grow.
-    Without: only if these shrink.
+    `evidence` is the log evidence of all observations for the model [nats]. If it is significant, the model is
+    preferred unless the residuals of the check tracks of `block` grow significantly. Otherwise it is preferred only if
+    these residuals shrink significantly.
     """
     return not is_better(before, tried, block) if evidence > SURE else is_better(tried, before, block)
 
@@ -210,7 +215,10 @@ class CheckResiduals:
     ground: Array
 
     def rms(self) -> tuple[Array, Array]:
-        """Return the RMS col, row (2,) [px]; east, north, up (3,) [m], NaN without a triangulated point."""
+        """Return the RMS of col, row (2,) [px], and that of east, north, up (3,) [m].
+
+        The RMS of east, north, up is NaN if no point is triangulated.
+        """
         known = np.isfinite(self.ground).all(axis=1)
         ground = np.full(3, np.nan)
         if known.any():
@@ -224,7 +232,7 @@ def check_residuals(sensors: Sequence[SensorModel], points: GroundPoints) -> Che
     Parameters
     ----------
     sensors : sequence of SensorModel
-        One a view: `Adjustment.sensors`, or the delivered ones.
+        One for each view: `Adjustment.sensors`, or the sensors as delivered.
     points : GroundPoints
         Check points.
 

@@ -39,9 +39,9 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_SMOOTH_SEEN = 0.3  # sigmas: a larger smooth part is fitted to all views together with the points
+_SMOOTH_SEEN = 0.3  # RMS, in sigmas, above which smooth parts and points are estimated in turns
 _MIN_NOISE_RATIO = 0.5  # least noise of the robust steps, over the stated standard deviations
-_MANY_CUT = 0.01  # share of rejected observations from which they are triangulated again
+_MANY_CUT = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
 _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
@@ -49,12 +49,12 @@ _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 class Outcome(Minimum):
     """The result of the passes: the last minimum, its observations and residuals."""
 
-    problem: Problem  # with the priors on points as they ended
+    problem: Problem  # with the final priors on the points
     residual: Array  # (2, K) projected - observed [px]
-    weight: Array  # (K,) 1 / sigma of the observations, as solved last [1/px]
+    weight: Array  # (K,) 1 / sigma of the observations in the last solve [1/px]
     inlier: BoolArray  # (K,) observations in the final solve
-    noise: float  # observed over stated standard deviation
-    passes: int  # rounds of cutting
+    noise: float  # observed over stated standard deviation of the observations
+    passes: int  # number of passes of rejection and least squares
     told: Array  # (N,) information of the tie points of each view: sum of their squared weights [1/px^2]
     prior: PriorTest  # comparison of the corrections with the given priors, and the estimated priors
     smooth: SmoothTest  # of the final residuals
@@ -67,8 +67,9 @@ class Rounds:
     """Robust steps, rejection and the final least squares, from the observations `use` (K,).
 
     Observations are rejected by their residuals without the smooth part of their view: a systematic error of a camera
-    does not make its tie points wrong. If the outcome of fewer unknowns is `known`, its inliers are the start, and
-    there are no robust steps: these would reject observations that the further unknowns explain.
+    does not make its tie points wrong. `known` is the outcome of an adjustment with fewer unknowns. If it is given, the
+    passes start from its inliers, without robust steps. These would reject observations that the added unknowns
+    explain.
     """
 
     def __init__(
@@ -109,12 +110,12 @@ class Rounds:
         self.use = self.observations.tied(use & self.everything)
         self.counted = (self.use if known is None else self.use & known.inlier).astype(np.float64)
         self.is_known = known is not None
-        self.projected = projected  # of the state, until the first pass moves it
+        self.projected = projected  # projection of the state; None if it was not computed
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
         self.misfit: Array | float = 0.0
         if known is not None and self.goes_on and self.robust:
             self.misfit = known.smooth.misfit()
-        self.scatter: Array | None = None  # residuals without smooth parts, where they are known
+        self.scatter: Array | None = None  # residuals without smooth parts; None: not computed yet
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
@@ -133,14 +134,16 @@ class Rounds:
         self.state, self.residual, self.counted, self.noise, self.projected = self._sampled(start) or _robust(
             start, self.observations, given, self.use, self.smooth
         )
-        # observations to be rejected count: a view with many displaced ones must not constrain the others
+        # include the observations that will be rejected: they reduce the weight of a view with many outliers
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
-        """Return the result of `_robust` with cameras of a sample: of tracks drawn until each view has `MANY`.
+        """Return the result of `_robust`, with the cameras estimated from a sample of the tracks.
 
-        None with few views or a joint prior, where the sample is a quarter of all, and where a view lost significantly
-        more of it than the others: so few observations have no smooth part.
+        Tracks are drawn until each view has `MANY` observations. The result is None if there are few views, a joint
+        prior, or a reference image. It is None if the sample is a quarter of all observations or more. It is also None
+        if a view lost a significantly larger share of its sample than the others: its smooth part cannot be
+        estimated from so few observations.
         """
         structure, use = start.structure, self.use
         if structure.num_views < _SAMPLED_VIEWS or self.smooth.alike is not None or start.joint_prior is not None:
@@ -169,7 +172,10 @@ class Rounds:
         return replace(few.state, points=points), residual, counted, few.noise, projected
 
     def _cut_and_solve(self, once: bool) -> Outcome | None:
-        """Reject observations, solve, and estimate priors and noise; return the outcome of the last pass, else None."""
+        """Reject observations, solve, and estimate priors and noise.
+
+        The outcome is returned by the last pass only; else None.
+        """
         was_in_use = self.use
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
         if self.robust and self.passes and many_cut:
@@ -189,7 +195,7 @@ class Rounds:
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
         settled = self._weights_stand()
-        # a common error of the views changes the accuracy of the scene, which nothing else shows
+        # an error common to all views affects the accuracy of the scene, but no residual: its prior must converge
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
         if once or self.passes >= TRIED or (settled and (same or not self.robust)):
@@ -232,7 +238,7 @@ class Rounds:
             self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
-        """Solve the least squares of the observations in use; exactly from the second pass on."""
+        """Minimise the squared residuals of the observations in use; to full convergence from the second pass on."""
         again = self.passes > 1 or self.goes_on
         tolerance = TOLERANCE if again or not self.robust else STANDS
         self.weight = weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)
@@ -268,8 +274,8 @@ class Rounds:
     def _scatter(self, fit: SmoothFit | None = None) -> Array:
         """Return the residuals (2, K) [px] without the smooth parts of all views.
 
-        The error of one view is shared by all observations of a point. Therefore smooth parts and points are estimated
-        in turns (backfitting).
+        A smooth error of one view also moves the points, and so the residuals of the other views. Smooth parts that are
+        not small are therefore estimated in turns with the points (backfitting).
         """
         residual, counted, sigma = self.residual, self.counted, self.observations.sigma
         part = self.smooth.part(residual, counted, fit)
@@ -283,10 +289,11 @@ class Rounds:
 
 
 def downweighting(block: Block, heights: PointConstraints) -> Array:
-    """Return the factors (P,) on the standard deviation of each point's observations: large for unused control points.
+    """Return the factors (P,) on the standard deviations of the observations of each point.
 
-    The weight of all tie points of a view is limited, so many unused points marked with the same error would move it.
-    Points in an image without tie points keep their weight: they alone connect it.
+    The factor is `GROSS` for unused control points, else 1. The total weight of the tie points of a view is limited.
+    Without the factor, many unused points with the same marking error would therefore move the view. Points in an image
+    without tie points keep their weight: they alone connect the image.
     """
     alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
     faint = np.zeros(block.num_points, dtype=bool)
@@ -307,9 +314,10 @@ def _robust(
     """Take reweighted steps while the scale of the loss shrinks to three standard deviations of the noise.
 
     Returned are the state, its residuals (2, K), the robust weights (K,), the noise, and the projection of the state.
-    The noise is a weighted median of the residuals, but at least that of the best fifth of them and half of the stated
-    one: else only a few observations that fit by chance would keep their weight. It is estimated without control
-    points where there are other observations, as free points fit too well.
+    The noise is estimated from the weighted median of the squared residuals. It has two lower limits: the noise of the
+    best fifth of the residuals, and half of the stated noise. Without these limits, only a few observations that fit by
+    chance would keep their weight. Control points are left out of the estimate if there are other observations, because
+    free points fit too well.
     """
     state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
@@ -333,7 +341,7 @@ def _robust(
 
 
 def _observation_weights(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
-    """Return the robust weight (K,) of each observation in use; 1 for those that are not rejected."""
+    """Return the robust weights (K,): 0 for unused observations, 1 for spared ones, else that of the loss."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 
@@ -342,8 +350,8 @@ def retriangulate_rejected(
 ) -> tuple[State, Array]:
     """Triangulate the tracks without inliers again by the present cameras; return the state and residuals (2, K).
 
-    Their points did not follow the cameras since they were rejected; with these corrected, they may be inliers.
-    `projected`, of the state, is updated in place.
+    The points of these tracks have not been adjusted since they were rejected, but the cameras have. After a new
+    triangulation their observations may be inliers. `projected` is the projection of the state; it is updated in place.
     """
     structure = problem.structure
     dead = structure.sum_points(use[None].astype(np.float64))[0] == 0

@@ -2,7 +2,8 @@
 
 Noise and wrong matches scatter. Errors that a camera model cannot represent (jitter, distortion, a wrong rotation) are
 smooth functions of the image, and would be rejected as outliers. Therefore the residuals of each view are split into a
-smooth part, fitted by weighted least squares (a spline over the rows, low polynomials of the columns), and the scatter.
+smooth part and the scatter. The smooth part is fitted by weighted least squares. It is a spline over the rows plus
+polynomials of low degree of the columns.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ SmoothFit = dict[int, tuple[slice, Array]]
 """View -> slice of its observations, coefficients (2, NUM_TERMS) of their smooth part."""
 
 SPLINES = 14
-"""Number of cubic B-splines over the rows of an image: changes over a tenth of the rows or more are smooth."""
+"""Number of cubic B-splines over the rows of an image. They represent changes over a tenth of the rows or more."""
 
 NUM_TERMS = SPLINES + 4  # splines, and col, col^2, col^3, row col
-_PER_TERM = 10  # least observations for each term; views with fewer have no smooth part
-_BEND = 1e-2  # weight of the second differences of splines, over that of a spline: it bridges rows without observations
+_PER_TERM = 10  # least number of observations per term; views with fewer have no smooth part
+# weight of the second differences of spline coefficients, relative to the mean weight of a coefficient by the
+# observations; it determines the spline over rows without observations
+_BEND = 1e-2
 _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
 
 
@@ -39,19 +42,19 @@ class Resemblance:
 
     Points registered to a reference image have correlated errors: their templates overlap, and seasons, shadows and
     terrain have the same effect on many of them. A smooth part of their residuals is therefore not the camera's alone.
-    The correlation of two points is the overlap of their templates, and all together count as at most
-    `MAX_INDEPENDENT_ERRORS` independent ones.
+    The correlation of two points is the overlap of their templates. For each term of the smooth part, all reference
+    points of a view count as at most `MAX_INDEPENDENT_ERRORS` independent observations.
     """
 
     of_reference: BoolArray  # (K,) observations of reference points
     place: Array  # (2, K) east, north of reference points [m]
     width: float  # of their templates [m]
-    share: Array  # (K,) effective number of independent observations that each counts for, at most 1
-    precision: Array  # (K,) `share` times the variance of the view's tie points over its own
+    share: Array  # (K,) number of independent observations to which each is equivalent, at most 1
+    precision: Array  # (K,) `share` times the variance of the tie points of the view over that of the observation
 
     @classmethod
     def of(cls, block: Block) -> Resemblance | None:
-        """Return the noise correlation of observations, beside smooth errors; None without reference."""
+        """Return the noise correlation of the observations of a block; None if it has no reference image."""
         given = block.reference
         if given is None:
             return None
@@ -65,7 +68,7 @@ class Resemblance:
         for view in np.unique(block.view[rows]):
             own = np.flatnonzero(rows & (block.view == view))
             ties = ~rows & (block.view == view)
-            asked = own[:: -(-len(own) // MANY)]  # they lie on a grid
+            asked = own[:: -(-len(own) // MANY)]  # a sample: the points lie on a grid
             alike = found.overlap(asked[:, None], own[None]).sum(axis=1).mean()
             share[own] = 1.0 / (alike + len(own) / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
@@ -90,25 +93,29 @@ class Resemblance:
 class SmoothTest:
     """The smooth part of the residuals of each view, and its significance."""
 
-    # (N,) RMS of the smooth part over the observations, both coordinates together, less its expectation for noise alone
-    # [px]; 0 for a view with too few observations
+    # (N,) RMS length of the smooth part over the observations [px]; its expectation for noise alone is subtracted from
+    # its square; 0 for a view with too few observations
     rms: Array
     # (N,) p-value of an F test of the smooth part; 1 for a view with too few observations
     significance: Array
-    # (N,) share of the square of the smooth part that the splines over the rows explain; NaN where none was fitted
+    # (N,) share of the sum of squares of the smooth part that the splines over the rows explain; NaN for a view without
+    # a fit
     by_row: Array
-    # (N,) common error of neighbours along the rows, or along the columns if larger [px]: jitter and steps too fine
-    # for the smooth part are in it; 0 where it is not significant
+    # (N,) RMS error shared by neighbouring observations [px]: the larger of that in order of columns and that in order
+    # of rows. It contains jitter and steps too fine for the smooth part. 0 if it is not significant
     shared: Array
-    # (N,) share of the square of a camera error that residuals show; points and heights absorb the rest
+    # (N,) share of the square of a camera error that appears in the residuals; points and heights absorb the rest
     redundancy: Array | float = 1.0
 
     def of_cameras(self) -> Array:
-        """Return the systematic errors (N,) of the cameras [px]: smooth, or shared by neighbours, over redundancy."""
+        """Return the systematic errors (N,) of the cameras [px].
+
+        Each is the larger of `rms` and `shared`, over the square root of the redundancy.
+        """
         return np.maximum(self.rms, self.shared) / np.sqrt(self.redundancy)
 
     def misfit(self) -> Array:
-        """Return the RMS (N,) of significant smooth parts [px]; 0 of others."""
+        """Return the RMS (N,) of significant smooth parts [px]; 0 for views without one."""
         return np.where(self.found(0.0), self.rms, 0.0)
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
@@ -117,9 +124,10 @@ class SmoothTest:
 
 
 class Smooth:
-    """The smooth model of the views of a block, for observations at `xy` (2, K) [px].
+    """Model of the smooth parts of the residuals of all views, for observations at `xy` (2, K) [px].
 
-    `alike` is the correlation of their noise; observations outside the mask `tells` (K,) are not used.
+    `alike` is the correlation of the noise of the observations. Observations outside the mask `tells` (K,) are not
+    used.
     """
 
     def __init__(
@@ -154,7 +162,7 @@ class Smooth:
     def part(self, residual: Array, weight: Array, fit: SmoothFit | None = None) -> Array:
         """Return the smooth part (2, K) of residuals (2, K) [px], fitted with weights (K,) >= 0.
 
-        Zero for views with too few observations that count.
+        It is zero for views with too few observations of positive weight.
         """
         out = np.zeros_like(residual)
         for rows, coefficients in (self.fit(residual, weight) if fit is None else fit).values():
@@ -193,7 +201,10 @@ class Smooth:
     def test_neighbours(
         self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
     ) -> SmoothTest:
-        """Return the test with `shared`, the correlation of neighbours, in views with a smooth part."""
+        """Return the test with `shared` and `redundancy` added.
+
+        `shared` is the square root of the mean product of the residuals of neighbours, in views with a smooth part.
+        """
         kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
         shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
         last = view[1:]
@@ -216,7 +227,10 @@ class Smooth:
         return np.asarray(np.bincount(view, values, self.structure.num_views))
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray, pairs: Array) -> tuple[Array, Array]:
-        """Return the products (n - 1,) of neighbours without their common noise, and effective numbers (N,)."""
+        """Subtract the expectation for correlated noise from the products (n - 1,) of the residuals of neighbours.
+
+        Also returned are the numbers (N,) of independent pairs to which the pairs of each view are equivalent.
+        """
         assert self.alike is not None
         first, second = order[:-1], order[1:]
         view, same = self.structure.view[second], self.alike.correlation(first, second)

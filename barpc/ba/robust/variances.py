@@ -4,8 +4,8 @@ With the posterior covariance C of n unknowns of prior standard deviation s, gam
 determined by the observations, and their squares have the expectation gamma s^2 (MacKay 1992, "Bayesian Interpolation",
 eq. 4.8). This holds for each kind of unknowns: those that move the position of an image, whose accuracy is stated;
 rotations about the line of sight; drifts, by degree. Where the squares of the first kind are significantly too large,
-the prior was too narrow: of one odd view, if its correction alone explains them, else of all views. Several views may
-be odd alternatively, as three in a row along the flight do not determine which is.
+the prior was too narrow: of one odd view, if its correction alone explains them, else of all views. Several views can
+be alternatives: the observations of three views in a row along the flight do not determine which of them is odd.
 """
 
 from __future__ import annotations
@@ -32,9 +32,13 @@ from barpc.scene import BoolArray, IntArray, View
 
 logger = logging.getLogger(__name__)
 
-_LIKELIER = -np.log(LEVEL)  # nats: log evidence of odd views over that of wider priors of all, for which they are named
-_CENTRE_MOTION_SHARE = 0.01  # drift by a rotation: its centre moves by some km while an image is taken
-_LOW = 0.1  # a cautious standard deviation is the largest with this probability: too narrow a prior bends all heights
+# nats: least gain of log evidence of wider priors on odd views alone, over wider priors on all views
+_LIKELIER = -np.log(LEVEL)
+# drift caused by a rotation, over the rotation: the projection centre moves by some km while an image is taken
+_CENTRE_MOTION_SHARE = 0.01
+# a cautious standard deviation is the upper confidence limit with this probability of error; too narrow a prior bends
+# all heights
+_LOW = 0.1
 SAME_PRIOR = 0.2  # log change of a standard deviation below which a block is not solved again
 _MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is estimated
 
@@ -48,7 +52,7 @@ class PriorTest:
     ratio: float
     freedom: float  # number of constant unknowns that the observations determine
     scale: Array  # (N,) factors on the given standard deviations; 1: unchanged
-    odd: BoolArray  # (N,) views whose correction alone explains the ratio; of several, any may be the one
+    odd: BoolArray  # (N,) views whose corrections alone explain the ratio; some can be alternatives
     # estimated standard deviation of the drift coefficients, by degree [m]
     drift_sigma: tuple[float, ...]
     shared: float = 1.0  # factor on standard deviations that RPCs state, for an error that all views have in common
@@ -86,7 +90,7 @@ class QuadraticProblem:
         offset = start - now.mean
         pulled = (change @ offset[..., None])[..., 0]
         step = -covariance.solve(pulled.ravel()).reshape(start.shape)
-        # the data's own cost rises by -step (change moved), as the new minimum is where both pull alike
+        # with N the present normal matrix, N step = -change (offset + step) at the new minimum; the cost rises by this:
         cost = float(((offset + step) * pulled).sum())
         volume = factor.log_determinant + float(_log_variance(prior, free).sum())
         return -0.5 * (cost + volume), start + step, covariance
@@ -107,18 +111,18 @@ def _log_variance(prior: CameraPrior, free: BoolArray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Posterior:
-    """The posterior of each view under a prior; another prior on a view is an update of rank q."""
+    """The posterior of each view under a prior. Another prior on one view is an update of rank q."""
 
     around: QuadraticProblem
-    evidence: float  # logarithm, but for a constant
+    evidence: float  # log evidence, up to a constant
     offset: Array  # (N, q) unknowns minus their priors' means
     blocks: Array  # (N, q, q) covariance of every view's unknowns
     prior: CameraPrior
-    covariance: Covariance  # without the updates (N q, m), (m, m) that were made since
+    covariance: Covariance  # before the `updates`, pairs of matrices (N q, m) and (m, m)
     updates: tuple[tuple[Array, Array], ...] = ()
 
     def together(self, views: IntArray, prior: CameraPrior) -> _Posterior:
-        """Return the posterior under another prior on the views (n,), all at once."""
+        """Return the posterior under another prior on the views (n,), changed in one update."""
         n, q = self.offset.shape
         place = unknowns_of(views, q)
         columns = self.covariance.columns(place)
@@ -144,10 +148,11 @@ class _Posterior:
         )
 
     def alone(self, prior: CameraPrior) -> tuple[Array, Array, Array]:
-        """Return evidence (N,), offset (N, q) and covariance (N, q, q) of every view if its prior alone were another.
+        """Return evidence (N,), offset (N, q) and covariance (N, q, q), each with another prior on that view alone.
 
-        With its change D of precision and its covariance C the determinant of all grows by |I + D C|, and the
-        inverse changes by C_v M C_v^T, M = (I + D C)^-1 D (matrix determinant lemma, Woodbury).
+        D is the change of the prior precision of the view, and C its covariance. The determinant of the normal matrix
+        grows by the factor |I + D C|. The covariance of all unknowns decreases by C_v M C_v^T, with M = (I + D C)^-1 D
+        and C_v the columns of the view (matrix determinant lemma, Woodbury).
         """
         change = self.around.change(self.prior, prior)
         system = np.eye(change.shape[1]) + change @ self.blocks
@@ -167,15 +172,15 @@ class Variances:
     """The given priors of a block, and which of them are estimated."""
 
     given: CameraPrior  # with the standard deviations as they were given
-    unknowns: Unknowns  # which unknown is what
+    unknowns: Unknowns  # meaning of each unknown
     learns: bool  # whether the standard deviations of constants and drifts are estimated
-    cautious: bool  # estimates are rather too wide than too narrow, as there is no control
+    cautious: bool  # whether estimates are upper confidence limits, as there is no control
     stated: BoolArray | None = None  # (N,) views whose RPCs state an accuracy that is in use; None: none does
-    # (4 + D, 2) sums of an earlier block, whose views have no prior of their own here: squared corrections over the
-    # given variances, and degrees of freedom. Rows: position; position of views with a stated accuracy; number of these
-    # views; drift by degree; rotations about the lines of sight
+    # (4 + D, 2) sums of an earlier block: squared corrections over the given variances, and degrees of freedom. The
+    # views of that block have no prior of their own here. Rows: position; position of views with a stated accuracy;
+    # number of these views, and 0; drift by degree; rotations about the lines of sight
     shown: Array | None = None
-    widest: Array | None = None  # (D + 1,) largest factors of drifts and turns, of tie points alone
+    widest: Array | None = None  # (D + 1,) upper limits, by tie points alone, of factors of drifts and rotations
 
     @classmethod
     def of(
@@ -197,7 +202,7 @@ class Variances:
 
     @property
     def constants(self) -> int:
-        """Constant unknowns of a view."""
+        """Number of constant unknowns of a view."""
         return self.unknowns.constants if self.unknowns.geometric else 0
 
     @property
@@ -213,7 +218,7 @@ class Variances:
     def _kinds(self) -> Array:
         """Mask (2 + D, q + 1) of unknowns by kind: position, drift by degree, rotation about the line of sight.
 
-        The last unknown is that rotation; the others are without it.
+        The last column is this rotation. The columns before are the q unknowns, after this rotation is projected out.
         """
         kinds = np.zeros((2 + self._degrees, self.given.sigma.shape[1] + 1))
         kinds[0, : self.constants] = kinds[-1, -1] = 1.0
@@ -238,7 +243,7 @@ class Variances:
         """
         try:
             return self._learnt(problem, minimum, last, exact)
-        except np.linalg.LinAlgError as error:  # priors so wide that rounding is what holds the weakest mode
+        except np.linalg.LinAlgError as error:  # priors so wide that rounding dominates the weakest mode
             logger.info("the priors of the cameras are left as they are: %s", error)
             n = len(minimum.state.params)
             ones, none = (1.0,) * (1 + self._degrees), np.zeros(n, dtype=bool)
@@ -262,7 +267,7 @@ class Variances:
         total, freedom = (float(x) for x in self._sums(params, known)[0])
         ratio = total / freedom if freedom > _MIN_FREEDOM else float("nan")
         shared = self._shared(params, known)
-        # wider constants of a large block reduce its drift, which need not converge again
+        # large block whose priors on constants were widened: its drift shrinks, and need not converge before the test
         stands = not around.small and last is not None and bool((last.scale > 1.0).any())
         for _ in range(ITERATIONS if self.learns or self.learn_waves else 0):
             before = prior
@@ -298,9 +303,10 @@ class Variances:
     def _shared(self, params: Array, known: Array) -> Array:
         """Return the factors (N,) on the standard deviations of views with a stated accuracy, for their common error.
 
-        Views that were adjusted together have the same error. The share of independent errors in the stated variance is
-        at most that of the corrections. The rest does not average: n views of two unknowns in each direction (rotation,
-        translation) would state the position sqrt(n / 2) times too accurately.
+        Views that their supplier adjusted together have a common error. The independent errors are estimated from the
+        corrections, as an upper limit of their share in the stated variance. The rest is the common error, which the
+        mean of many views does not reduce. With independent priors on n views, each with two unknowns in each direction
+        (rotation, translation), the standard deviation of the position would be sqrt(n / 2) times too small.
         """
         wider = np.ones(len(params))
         if self.stated is None or not self.learns:
@@ -312,7 +318,7 @@ class Variances:
         return wider
 
     def _of_stated(self, params: Array, known: Array) -> Array:
-        """Return the second and third row of `shown` (2, 2), of earlier blocks and this one."""
+        """Return the second and third rows (2, 2) of `shown`, summed over earlier blocks and this one."""
         assert self.stated is not None
         of_place = self._by_view(params, known)[:, self.stated, 0].sum(axis=1)
         count = np.count_nonzero(known[self.stated, : self.constants].any(axis=1))
@@ -329,7 +335,7 @@ class Variances:
         return np.insert(self._sums(params, known), [1, 1], rest, axis=0)
 
     def _going_on(self, sigma: Array) -> Variances:
-        """Return the variances with the standard deviations (N, q) of splines and steps as given ones."""
+        """Return a copy whose given prior has the standard deviations (N, q) of splines and steps."""
         part, given = self.unknowns.in_waves, self.given.sigma.copy()
         given[:, part] = sigma[:, part]
         return replace(self, given=replace(self.given, sigma=given))
@@ -341,7 +347,7 @@ class Variances:
         out = sigma.copy()
         for band in range(int(bands.max()) + 1):
             rows = first + np.flatnonzero(bands == band)
-            learnt = np.isfinite(sigma[:, rows[0]])  # those of an earlier block are in its matrix
+            learnt = np.isfinite(sigma[:, rows[0]])  # infinite: the prior is in the matrix of an earlier block
             squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
             common = (NOISE_FLOOR**2 + squares.sum()) / (1.0 + freedom.sum())
             size = np.sqrt((STATED_FREEDOM * common + squares) / (STATED_FREEDOM + freedom))
@@ -357,7 +363,7 @@ class Variances:
             sigma[:, part] *= factor
             if degree == 0 and self.learns:
                 sigma[:, part] = np.hypot(sigma[:, part], _CENTRE_MOTION_SHARE * sigma[:, :3])
-        # a rotation is not better known than the position
+        # the factor on a rotation is at least that on the position
         return replace(self.given, sigma=sigma, wider=np.maximum(wide[-1] / scale, 1.0)[:, None])
 
     def _known(self, covariance: Covariance, prior: CameraPrior, exact: bool = True) -> Array:
@@ -378,14 +384,17 @@ class Variances:
         return np.hstack([across, (turn**2).sum(axis=1, keepdims=True) - along / prior.wider**2]).clip(0.0, 1.0)
 
     def _by_view(self, params: Array, known: Array) -> Array:
-        """Return squared corrections over given variances and degrees of freedom, by view and kind (2, N, 2 + D)."""
+        """Return the squared corrections and the degrees of freedom (2, N, 2 + D) of each view and kind.
+
+        The squared corrections are divided by the given variances.
+        """
         off = (params - self.given.mean) / self.given.sigma
         along = (self.given.turn * off).sum(axis=1, keepdims=True)
         seen = np.hstack([off - along * self.given.turn, along])
         return np.stack([np.where(known > 0, seen**2, 0.0), known]) @ self._kinds.T
 
     def _sums(self, params: Array, known: Array) -> Array:
-        """Return the sums of `_by_view` over all views and earlier blocks (2 + D, 2)."""
+        """Return the sums (2 + D, 2) of `_by_view` over all views and earlier blocks."""
         return np.asarray(self._by_view(params, known).sum(axis=1).T + np.delete(self._before, [1, 2], axis=0))
 
     def _too_large(self, params: Array, known: Array, scale: Array) -> bool:
@@ -398,8 +407,9 @@ class Variances:
     def _widened(self, around: QuadraticProblem, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
         """Return the factors (N,) on the prior of each view, and the mask of odd views.
 
-        Two explanations are compared by evidence, each at its most likely factors: wider priors of all views, or of a
-        few odd ones. The factors returned are cautious ones.
+        Two explanations are compared by their evidence: wider priors on all views, or on a few odd views alone. Each is
+        evaluated at its most likely factors. If neither is significantly better, the factors are the larger of both.
+        The factors returned are upper confidence limits where the estimates are `cautious`.
         """
         n, free = len(params), around.problem.free
         total, freedom = self._by_view(params, known)[..., 0]
@@ -421,20 +431,21 @@ class Variances:
         few, odd, alone = self._odd(around, np.append(wide[:-1], 1.0), np.ones(n), together)
         if alone >= together + _LIKELIER:
             return few, odd
-        # the factor of the others is estimated without these
+        # the factor of the other views is estimated without the odd ones
         both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond], self.cautious))
-        return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # priors that cover either
+        return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # wide enough for both
 
     def _common(self, total: Array, freedom: Array, careful: bool) -> float:
-        """Return the common factor on the priors of views, from squares and degrees of freedom (n,)."""
+        """Return the common factor on the priors of views, at least 1, from squares and degrees of freedom (n,)."""
         squares, free = self._before[0] + np.array([total.sum(), freedom.sum()])
         return float(np.sqrt(max(self._likely(squares, free, careful), 1.0)))
 
     def _likely(self, total: float, freedom: float, careful: bool) -> float:
-        """Return the estimate of a variance over the given one, which counts as a few observations.
+        """Return the estimate of a variance over the given variance.
 
-        `total` is the sum of squares over the given variance. With `careful` it is the largest variance with a
-        probability of `_LOW`.
+        `total` is the sum of squares over the given variance. The given variance has the weight of `STATED_FREEDOM`
+        observations. With `careful`, the estimate is at least the upper confidence limit with a probability of error of
+        `_LOW`.
         """
         likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
         if not careful or freedom <= _MIN_FREEDOM:
@@ -444,11 +455,14 @@ class Variances:
     def _odd(
         self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
     ) -> tuple[Array, BoolArray, float]:
-        """Find odd views by forward selection, beside the factors `usual` (N,) of the others.
+        """Find odd views by forward selection; the other views have the factors `usual` (N,).
 
-        Returned are the factors (N,), the mask of odd views, and the log evidence less the price of the choice. In each
-        step the best view of each neighbourhood (views that share points) is added, if its gain exceeds the price. With
-        the evidence of a `rival`, at least one is chosen; the search ends once further views cannot reach it.
+        In each step the view with the largest log evidence in each neighbourhood (views that share points) is chosen,
+        if its gain exceeds the price, ln N. Views that explain the residuals as well as a chosen one are odd too.
+        Returned are the factors (N,), the mask of odd views, and the log evidence minus the price of each choice.
+
+        `rival` is the log evidence of another explanation. If it is given, at least one view is chosen. The search
+        fails, with a log evidence of minus infinity, once further views cannot reach the rival.
         """
         n = len(usual)
         odd, chosen, scale = np.zeros(n, dtype=bool), usual.copy(), usual.copy()
@@ -465,7 +479,7 @@ class Variances:
             if not tops.any():
                 break
             chosen_near = _neighbour_maximum(np.where(tops, evidence, -np.inf), pairs)
-            as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # explain as well as one that is
+            as_good = (chosen_near > -np.inf) & (evidence > chosen_near - SURE)  # as likely as the view chosen near it
             odd, scale = odd | as_good, np.where(as_good, np.maximum(size, scale), scale)
             chosen[tops] = size[tops]
             known = known.together(np.flatnonzero(tops), self._prior(chosen, wide))
@@ -473,7 +487,7 @@ class Variances:
         return scale, odd, known.evidence - count * price
 
     def _alone(self, known: _Posterior, wide: Array, scale: Array) -> tuple[Array, Array]:
-        """Return the log evidence (N,) with each view odd in addition, and the factor on its prior."""
+        """Return the log evidence (N,) with each view as an additional odd view, and the factors (N,) on its prior."""
         prior = self._prior(np.maximum(scale, GROSS), wide)
         _, offset, blocks = known.alone(prior)
         seen = self._share(blocks, prior, known.around.problem.free)
@@ -484,10 +498,10 @@ class Variances:
     def _beside(self, params: Array, known: Array, last: PriorTest | None) -> Array:
         """Return the factors (D + 1,) on the standard deviations of drifts and rotations about the lines of sight.
 
-        They are at most `TIMES` those of the `last` linearisation, as modes that are hardly determined would grow
-        without limit.
+        They are at most `TIMES` those of the `last` linearisation, and at most `widest`. Without a limit, the factors
+        of drifts and rotations that the observations hardly determine would grow with every linearisation.
         """
-        waves = self.unknowns.waves  # splines and steps represent what else bends heights
+        waves = self.unknowns.waves  # no caution with splines or steps: they represent bent heights
         careful = self.cautious and not (waves and (waves.count or waves.edges.size))
         factors = [
             self._likely(total, freedom, careful and float(chdtrc(freedom, total)) < CHANCE)
@@ -507,7 +521,10 @@ def _neighbour_maximum(values: Array, pairs: IntArray) -> Array:
 
 
 def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
-    """Return the mask (N,) of views with the largest value among those they share points with; of equals the first."""
+    """Return the mask (N,) of views with the largest value among the views that share points with them.
+
+    Of views with equal values, only the first is in the mask.
+    """
     i, j = pairs.T
     tops: BoolArray = values == _neighbour_maximum(values, pairs)
     tops[j[tops[i] & tops[j]]] = False
@@ -515,9 +532,10 @@ def _first_of_largest(values: Array, pairs: IntArray) -> BoolArray:
 
 
 def same_prior(a: CameraPrior, b: CameraPrior, share: float, part: slice | None = None) -> bool:
-    """Return whether the standard deviations of two priors differ by less than `share` (as logarithms).
+    """Return whether the logarithms of the standard deviations of two priors differ by less than `share`.
 
-    Those of all unknowns or of `part`, and of rotations about the lines of sight. Infinite ones are not compared.
+    The standard deviations of all unknowns are compared, or those of `part`. Rotations about the lines of sight are
+    always compared. Infinite standard deviations are not compared.
     """
     one, other = (prior.sigma[:, slice(None) if part is None else part] for prior in (a, b))
     finite = np.isfinite(one) & np.isfinite(other)

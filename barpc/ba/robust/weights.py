@@ -16,11 +16,14 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
-MEDIAN = 0.55  # median of |r|^2 over its mean: chi-square with 1 (two views) to 2 (many) degrees of freedom
-_LARGEST_MISFIT = 3.0  # px: a larger one would remove all weight from the view that causes it
+MEDIAN = 0.55  # median of |r|^2 over its mean, for a chi-square of 1 (two views) to 2 (many) degrees of freedom
+_LARGEST_MISFIT = 3.0  # px: upper limit; a larger misfit would take all weight from the view that causes it
 _LITTLE_NOISE = 0.04
-"""Standard deviation of tie points [px] below which their common error shrinks with it: half of it at most, where the
-noise floor is 0.02 px. Real images show a fifth of 0.1 px."""
+"""Standard deviation of tie points [px] below which the noise floor is reduced in proportion to it.
+
+With a noise floor of 0.02 px, the common error is then half of the standard deviation. In real images it is about a
+fifth, at 0.1 px.
+"""
 
 
 def geman_mcclure(s: Array) -> tuple[Array, Array]:
@@ -42,9 +45,9 @@ class Observations:
     ) -> None:
         self.structure, self.sigma, self.noise_floor = problem.structure, sigma, noise_floor
         self.is_tie = is_tie
-        self.told = told  # (N,) by an earlier block's tie points of its views [1/px^2]
+        self.told = told  # (N,) information of the tie points of each view in an earlier block [1/px^2]
         waves = problem.cameras.unknowns.waves
-        # errors that neighbours share are others in every stretch of a spline, of columns and of rows
+        # number of intervals of the splines, over columns and rows: common errors of neighbours differ between them
         self.stretches = 1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
@@ -54,23 +57,26 @@ class Observations:
         self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
 
     def is_spared(self, squared: Array) -> BoolArray:
-        """Return the mask (K,) of observations that are not rejected here: of control and reference points.
+        """Return the mask (K,) of observations that the robust loss does not reject: of control and reference points.
 
-        Control points are tested at the end, unless they are gross errors; reference points were tested before.
+        Control points without a gross error are tested at the end. Reference points were tested before.
         """
         return np.asarray((self.is_control & (squared < GROSS**2)) | self.of_reference)
 
     def is_near(self, squared: Array, scale: float) -> BoolArray:
-        """Return the observations (K,) within a number of standard deviations; a reference's by their own limit."""
+        """Return the mask (K,) of observations within `scale` standard deviations.
+
+        `squared` (K,) are squared normalised residuals. The limit of reference points is always `OUTLIER`, and that of
+        control points `GROSS` or more.
+        """
         near = np.where(self.of_reference, squared <= OUTLIER**2, squared <= scale * scale)
         return np.asarray(near | (self.is_control & (squared < GROSS**2)))
 
     def freedom(self, counted: Array) -> Array:
-        """Return the degrees of freedom (K,) left of an observation once its point is estimated, 1/2 (two
-        views) to 2.
+        """Return the degrees of freedom (K,) of observations after their points are estimated: 1/2 (two views) to 2.
 
-        `counted` (K,) says how much each observation counts; a track with one that counts for nothing is a
-        track of the others.
+        `counted` (K,) are robust weights, 0 to 1. An observation of weight 0 does not add to the number of views of its
+        point.
         """
         structure = self.structure
         largest = np.zeros(structure.num_points)
@@ -95,14 +101,15 @@ class Observations:
     def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
         """Return the weights 1 / sigma (K,) [1/px]; 0 of observations not in use.
 
-        The total weight of the tie points of a view is limited, as they have a common error: `noise_floor`, or less
-        where they scatter little, and the `misfit` (N,) [px] of its camera model, which counts as `SPLINES` independent
-        errors.
+        The total weight of the tie points of a view is limited, because they have common errors. One has the standard
+        deviation `noise_floor`, or less where the tie points scatter little. The other is the `misfit` (N,) [px] of the
+        camera model of the view, taken as `SPLINES` independent errors.
         """
         weight: Array = use / (self.sigma * noise)
         own, ties = self._of_ties(weight), self._of_ties(use.astype(np.float64))
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
-        common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2  # of copies, too: none is exact
+        # at least a tenth of the noise floor, also for copies of an image
+        common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2
         floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
@@ -121,7 +128,7 @@ class Observations:
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
         """Estimate the observed over stated standard deviation of tie points in use; 1 if they are too few.
 
-        `fitted` is the number of further parameters that the residuals were fitted with.
+        `fitted` is the number of other parameters that were fitted to the residuals.
         """
         use = use & ~self.is_control & ~self.of_reference
         whitened = residual[:, use] / self.sigma[use]
