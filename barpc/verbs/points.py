@@ -186,7 +186,8 @@ def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: De
         points = np.concatenate([np.broadcast_to(part, (*lead, part.shape[-1])) for part in (points, level)], axis=-1)
     points = as_ground(points)
     if terrain is not None:
-        points = np.concatenate([points[..., :2], terrain(points[..., 0], points[..., 1])[..., None]], axis=-1)
+        height = terrain.covering(*points[..., :2].reshape(-1, 2).T).reshape(*points.shape[:-1], 1)
+        points = np.concatenate([points[..., :2], height], axis=-1)
     return points
 
 
@@ -241,7 +242,10 @@ def _run_altitudes(folder: Path, _changed: int) -> dict[str, float]:
 def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None) -> Array:
     """Return ground points (N, 3) of image points (N, 2), on the DEM where there is one, else at altitudes [m]."""
     if dem is not None:
-        return localize_on_terrain(camera.model, image, dem, camera.alt_range)
+        found = localize_on_terrain(camera.model, image, dem, camera.alt_range)
+        if np.isnan(found).all():
+            dem.covering(*camera.model.localize(image, np.full(len(image), camera.altitude))[:, :2].T)
+        return found
     return camera.model.localize(image, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image)))
 
 

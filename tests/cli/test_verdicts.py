@@ -130,7 +130,7 @@ def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
         asked.append((size, dem, margin))
         return 100.0 - margin, 100.0 + margin
 
-    monkeypatch.setattr(Dem, "open", lambda dem, geoid: (dem, geoid))
+    monkeypatch.setattr(Dem, "open", lambda dem, geoid: SimpleNamespace(covering=(dem, geoid)))
     monkeypatch.setattr("barpc.verbs.fitting.terrain_range", terrain_range)
     assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
     assert run("fit", source, "--dem", "d.tif", "--dem", "e.tif") == 0

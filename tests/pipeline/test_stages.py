@@ -238,20 +238,15 @@ def test_of_each_track_with_something_new_all_observations_are_kept(seed) -> Non
 # --- what is read before any work -------------------------------------------------------------------------
 
 
-def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(tmp_path, caplog, monkeypatch) -> None:
-    """Of GCPs and of check points, in the order given; a reference that is none stops the run here."""
-    for name in ("g.csv", "c.csv"):
-        (tmp_path / name).write_text("nothing\n")
-    given = RunOptions(gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True)
-    assert side_inputs(given, views()) is None
-    lines = [record.getMessage() for record in caplog.records]
-    assert [Path(line.split(",")[0]).name for line in lines] == ["g.csv", "c.csv"]
+def test_references_are_looked_at(monkeypatch) -> None:
+    """One that is none stops the run here."""
     read = []
     monkeypatch.setattr(inputs, "Sheet", SimpleNamespace(read=read.append))
-    monkeypatch.setattr(inputs, "_require_cover", lambda *given: None)
-    monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
+    monkeypatch.setattr(
+        inputs, "Dem", SimpleNamespace(open=lambda *given: SimpleNamespace(given=given, covering=np.hypot))
+    )
     with_all = RunOptions(dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"))
-    assert side_inputs(with_all, views()) == (("d.tif",), "g.gtx", "egm96")
+    assert side_inputs(with_all, views()).given == (("d.tif",), "g.gtx", "egm96")
     assert read == ["r.tif", "s.tif"]
 
 
