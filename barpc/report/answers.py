@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from barpc.base.errors import listed
 from barpc.base.statistics import LARGEST
+from barpc.report.ranking import GOOD_RMSE, MIN_PAIR_MATCHES, offset_of
 from barpc.report.records import flat_options
 from barpc.report.runfiles import ReliefWindow
 from barpc.report.summary import Summary
@@ -26,13 +27,6 @@ FOOTER = (
     "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
     "observations.csv, pairs.csv, footprints.geojson."
 )
-
-
-def of_images(views: Sequence[ViewEntry], agree: bool) -> str:
-    """Return how many images passed; `agree`: with tie points of adjusted cameras."""
-    passed = f"{sum(not view.advice for view in views)} of {counted(len(views), 'image')} passed."
-    measure = " Residuals measure how well the images agree with each other, not their accuracy on the ground."
-    return passed + measure * agree
 
 
 def of_map(by_length: Mapping[int, int] | Mapping[str, int], groups: int, lonely: Sequence[str]) -> str:
@@ -70,30 +64,24 @@ def of_surface(before: ReliefWindow, after: ReliefWindow) -> str:
     return f"{text} Heights of different pairs differ by {metres(before.nmad_m)} and {metres(after.nmad_m)} (NMAD)."
 
 
-def of_pairs(worst: PairEntry, offset: float | None, wanted: float, best: PairEntry | None, enough: int) -> str:
-    """Return the largest epipolar offset (RMS) [px], the limit of stereo, and the best pair for heights."""
+def of_pairs(worst: PairEntry, heights: bool) -> str:
+    """Return the largest epipolar offset (RMS) [px], the limit of stereo, and whether no pair determines `heights`."""
     fit = "Unknown: no camera of a pair projects the tie points of the other."
-    if offset is not None:
-        fit = f"Epipolar offsets are at most {offset:.3f} px (RMS; {worst.a} - {worst.b})."
-        fit += f" Stereo needs less than {wanted} px."
-    if best is None:
-        return (
-            f"{fit} No pair of images that passed has {enough} matches and a convergence angle that determines heights."
-        )
-    return (
-        f"{fit} The best pair for heights is {best.a} - {best.b}: one pixel of parallax is "
-        f"{metres(known(best.height_m_per_px))} of height."
-    )
+    if set(worst.offset_rms) != {None}:
+        fit = f"Epipolar offsets are at most {offset_of(worst):.3f} px (RMS; {worst.a} - {worst.b})."
+        fit += f" Stereo needs less than {GOOD_RMSE} px."
+    enough = f"{MIN_PAIR_MATCHES} matches and a convergence angle that determines heights"
+    none = f" No pair of images that passed has {enough}."
+    return fit + none * (not heights)
 
 
 def of_scene(scene: SceneEntry, tied: bool) -> str:
     """Return an introduction to the uncertainty of the scene; `tied`: with tie points."""
     text = "Tie points fix the images relative to each other, not on the Earth. " * tied
-    text += "The remaining uncertainty (1 sigma), the largest first."
     if scene.num_held_in_height:
         held = counted(scene.num_held_in_height, "tie point")
-        text += f" The heights of {held} with too small a convergence angle were constrained."
-    return text
+        text += f"The heights of {held} with too small a convergence angle were constrained."
+    return text.strip()
 
 
 def of_files(worst: float | None) -> str:
@@ -103,7 +91,7 @@ def of_files(worst: float | None) -> str:
         exact = "Not known for every image."
     elif worst > _ROUNDING:
         exact = f"To {worst:.1e} px over each image and its altitude range."
-    return f"{exact} Use these files in other tools: the old images still carry the old RPC."
+    return f"{exact} The old images still carry the old RPC."
 
 
 def of_run(summary: Summary) -> str:
@@ -127,8 +115,6 @@ def decisions(summary: Summary) -> list[str]:
             found.append(f"Each camera is corrected by {scene.model}.")
         found += [*_added(scene, views), *_drift(scene, options.get("adjust.drift"))]
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
-        if seen := [gcp for gcp in summary.gcps if gcp.images]:
-            found.append(f"{sum(gcp.used for gcp in seen)} of {len(seen)} visible GCPs constrain the block.")
     if (test := summary.control_test) is not None:
         found.append(
             f"{test.num_beyond} of {counted(test.num, 'residual')} of control points in the images are significant "
@@ -251,9 +237,6 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         counts = f"{used} used, {scene.num_held_out} check (independent of the adjustment), {cut} rejected as outliers"
         counts += f", {moving} excluded, as they move together" * bool(moving)
         yield f"Observations of tie points: {counts}."
-    if cut:
-        most = max(views, key=lambda view: (view.lost, view.name))
-        yield f"Most were rejected in {most.name}: {two_digits(100 * most.lost)} % of those used or rejected."
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:

@@ -17,10 +17,8 @@ import numpy as np
 from barpc.base.errors import visible
 from barpc.report import answers
 from barpc.report.maps import doubted, ground_map, largest_miss, residual_panels, template
-from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
+from barpc.report.pictures import PICTURE_KEY, image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.ranking import (
-    GOOD_RMSE,
-    MIN_PAIR_MATCHES,
     TABLE_ROWS_SHOWN,
     VERDICT_SENTENCES,
     flagged,
@@ -37,7 +35,7 @@ from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, Held
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, counted, largest, metres
+from barpc.report.summary.words import counted, largest, metres
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
@@ -133,7 +131,7 @@ _QUESTIONS = {
     "images": "Which images can I use?",
     "map": "Where are the images, and which are connected?",
     "random": "Are the residuals random?",
-    "pairs": "Do the pairs fit for stereo, and can heights be measured?",
+    "pairs": "Do the pairs fit for stereo and heights?",
     "surface": "Which ground do they reconstruct?",
     "moves": "How was each camera corrected?",
     "gauge": "How uncertain are position and shape of the scene?",
@@ -154,8 +152,10 @@ def _images_section(files: RunFiles) -> Section:
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    answer = answers.of_images(views, adjusted and _num_in_use(files) > 0)
-    return _section("images", answer, tables=[shown], **_panels(image_panels(files)))
+    agree = "Residuals measure how well the images agree with each other, not their accuracy on the ground. "
+    panels = image_panels(files)
+    answer = agree * (adjusted and _num_in_use(files) > 0) + PICTURE_KEY * bool(panels)
+    return _section("images", answer.strip(), tables=[shown], **_panels(panels))
 
 
 def _num_in_use(files: RunFiles) -> int:
@@ -228,12 +228,8 @@ def _pairs_section(files: RunFiles) -> Section | None:
     pairs, number = worst_pairs(files.summary.pairs), files.number
     if not pairs:
         return None
-    worst = max(pairs, key=offset_of)
-    sure = sure_pairs(files.summary.views, pairs)
-    heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
-    best = min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None)
-    offset = None if set(worst.offset_rms) == {None} else offset_of(worst)
-    answer = answers.of_pairs(worst, offset, GOOD_RMSE, best, MIN_PAIR_MATCHES)
+    heights = any(pair.height_m_per_px and pair.convergence_deg for pair in sure_pairs(files.summary.views, pairs))
+    answer = answers.of_pairs(max(pairs, key=offset_of), heights)
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
     return _section("pairs", answer, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
@@ -270,13 +266,12 @@ def _gauge_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
     if scene is None:
         return None
-    points = [f"{mode.words[0].upper()}{mode.words[1:]}." for mode in scene.weakest_modes[:NAMED] if mode.sigma_m]
     columns = DatumEntry.columns(scene.datum)
     tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
     tables += _tables_of("gcps", summary.gcps)
     tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
     tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)
-    return _section("gauge", answers.of_scene(scene, _num_in_use(files) > 0), points=points, tables=tables)
+    return _section("gauge", answers.of_scene(scene, _num_in_use(files) > 0), tables=tables)
 
 
 def _check_points_section(files: RunFiles) -> Section | None:

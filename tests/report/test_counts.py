@@ -101,5 +101,5 @@ def test_the_answers_of_the_page(views, pairs, tracks):
     made = [section for make in page.SECTIONS if (section := make(files)) is not None]
     assert len(made) >= 4
     for section in made:
-        spoken([section.answer, *section.points, *(words for _, words in section.charts)])
+        spoken([section.key, section.answer, *section.points, *(words for _, words in section.charts)])
     spoken(["decisions:", *decisions(summary)])  # of nothing none

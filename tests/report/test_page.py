@@ -82,7 +82,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
         "Which images can I use?",
         "Where are the images, and which are connected?",
         "Are the residuals random?",
-        "Do the pairs fit for stereo, and can heights be measured?",
+        "Do the pairs fit for stereo and heights?",
         "How was each camera corrected?",
         "How uncertain are position and shape of the scene?",
         "What was decided, and why?",

@@ -122,7 +122,7 @@ class ViewEntry(Record):
         "correction.ellipse.ce90_m stated_ce90_m"
     )
     DECISIONS: ClassVar = (
-        "name prior_scale num_observations num_check num_rejected num_moving systematic_px systematic_p "
+        "name prior_scale num_rejected num_moving systematic_px systematic_p "
         "neighbour_correlated_px correction.jitter_px correction.detector_px correction.step_px correction.sinusoid_px"
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
@@ -135,12 +135,6 @@ class ViewEntry(Record):
     def lost(self) -> float:
         """Share of its tie points that were rejected."""
         return self.num_rejected / max(self.num_rejected + self.num_observations, 1)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Its tie points by their names in all sentences and tables: in use, then others of which it has some."""
-        found = {"check": self.num_check, "rejected": self.num_rejected, "excluded": self.num_moving}
-        return {"used": self.num_observations, **{name: count for name, count in found.items() if count}}
 
     @property
     def reservation(self) -> str:
