@@ -93,7 +93,7 @@ def _run_pipeline(work: Callable[..., Any], flags: dict[str, Any], tell_of: Call
     kept.folder = Path(where[0]) if where and where[0] else None
     with at_work() as progress:
         result = work(images, *where, options, jobs=flags["jobs"], progress=kept.following(progress))
-        return (tell_of or _tell_result)(result)
+    return (tell_of or _tell_result)(result)
 
 
 def _tell_plan(plan: Plan) -> int:
