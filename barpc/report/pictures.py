@@ -13,7 +13,7 @@ from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, medians
 
-PICTURE_KEY = "On the pictures tie points in use are blue, others red."
+PICTURE_KEY = "On the pictures tie points in use are blue, their rejected observations red."
 _DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 
 
