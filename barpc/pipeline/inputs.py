@@ -331,7 +331,8 @@ def _with_altitudes(
         unknown &= ~known
     low, high = min(view.alt_range[0] for view in views), max(view.alt_range[1] for view in views)
     ground[unknown, 2], sigma[unknown, 2] = 0.5 * (low + high), (high - low) * np.sqrt(max(unknown.sum(), 1))
-    said = f"{what}: {int(unknown.sum())} constrain the images horizontally only; give their altitudes, or --dem"
+    many = " and" if unknown.sum() == count else f"; {int(unknown.sum())} of them"
+    said = f"{what}{many} constrain the images horizontally only: give their altitudes, or --dem"
     return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
 
 

@@ -112,7 +112,7 @@ def decisions(summary: Summary) -> list[str]:
     found = [*_matched(summary.pairs, options.get("tie.matcher"))]
     if scene is not None:
         if scene.model:
-            found.append(f"Each camera is corrected by {scene.model}.")
+            found.append(f"Each camera is corrected by {scene.model.replace('+', ' and ')}.")
         found += [*_added(scene, views), *_drift(scene, options.get("adjust.drift"))]
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
     if (test := summary.control_test) is not None:

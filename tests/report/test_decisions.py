@@ -124,7 +124,7 @@ def test_priors_hold_or_were_widened(record):
 
 
 def test_the_model_is_said(record):
-    assert "Each camera is corrected by rotation+translation." in said(record)
+    assert "Each camera is corrected by rotation and translation." in said(record)
 
 
 def test_what_was_cut_and_kept_out_is_counted(record):
