@@ -355,7 +355,7 @@ def _(s):
 
 @says(r"Each camera is corrected by (.*)\.")
 def _(s, model):
-    assert model == s.scene.model
+    assert model == s.scene.model.replace("+", " and ")
 
 
 @says(r"No additional parameters were needed: no image has significant systematic residuals\.")

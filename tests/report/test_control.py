@@ -9,7 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run, verdict
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.page import report_html
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.report import page, verdict
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
 from barpc.tie.reference import ReferenceControl, ViewMatch

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.summary import Summary
 from barpc.report.summary.block import ExplanationEntry, HeldOutEntry, JustificationEntry, LeftEntry
 from barpc.report.summary.ground_points import ControlTestEntry
