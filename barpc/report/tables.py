@@ -22,12 +22,13 @@ from barpc.pointio.names import cell
 from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
 from barpc.report.records import value_of
-from barpc.report.runfiles import MATCHES, OBSERVATION_COLUMNS, RESIDUALS, ROWS_TOGETHER
+from barpc.report.runfiles import MATCHES, OBSERVATION_COLUMNS, RESIDUALS
 from barpc.report.summary import Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.sensor.geometry import footprints
 
+ROWS_TOGETHER = 1 << 13  # rows of a table that are written at a time: 20 MB as numbers and texts of Python
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
