@@ -17,7 +17,6 @@ from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plai
 from barpc.base.geodesy import Array
 from barpc.base.manifest import LAST
 from barpc.base.safe_io import GEOJSON, SUMMARY, parse_json, read_json, read_text
-from barpc.pointio.tables import Texts, read_table
 from barpc.report.records import Number, Record, column, json_form
 from barpc.report.summary import SCHEMA, Summary
 from barpc.report.summary.words import NAMED, Share, Side
@@ -227,7 +226,7 @@ def _read_observations(path: Path, names: Sequence[str]) -> ObservationTable:
     numbers = np.stack([table[name] for name in OBSERVATION_COLUMNS[2:8]], axis=-1)
     index = {name: i for i, name in enumerate(names)}
 
-    def of_images(seen: Texts) -> IntArray:
+    def of_images(seen: Any) -> Any:
         return np.array([index[str(name)] for name in seen.different], dtype=np.int64)[seen.index]
 
     view, used = _parsed(path, table["view"], of_images), table["used"] == 1.0
@@ -243,6 +242,8 @@ def _read_points(path: Path) -> tuple[Array, IntArray]:
 
 def _read_columns(path: Path, header: Sequence[str], blank: Sequence[str], texts: Sequence[str] = ()) -> dict[str, Any]:
     """Return the columns of a table by their names: texts, numbers of tracks, and numbers, NaN for blank ones."""
+    from barpc.pointio.tables import read_table  # with what knows of heights: a summary alone needs none
+
     _, found = read_table(path, {name: (name,) for name in header}, header, texts=texts, blank=blank)
 
     def numbers(name: str) -> Array:

@@ -55,10 +55,10 @@ def run(tmp_path_factory) -> Path:
     ("words", "most"),
     [
         (["verify", "{run}"], 58),
-        (["report", "{run}"], 55),
+        (["report", "{run}"], 58),
         (["report", "{run}", "{run}"], 61),
-        (["export", "{run}", "{out}", "--to", "s2p"], 72),
-        (["export", "{run}", "{out}", "--to", "points"], 72),
+        (["export", "{run}", "{out}", "--to", "s2p"], 74),
+        (["export", "{run}", "{out}", "--to", "points"], 74),
         (["info", "{run}/view_00.vrt", "{run}/view_01.vrt"], 68),
         (["info", "{run}/view_00_RPC.TXT"], 60),
         (["project", "{run}/view_00_RPC.TXT", "5.4", "43.3", "100"], 60),
