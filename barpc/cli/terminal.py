@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from barpc.base.tasks import Progress
     from barpc.report import Summary
-    from barpc.report.summary import StepEntry
 
 
 EXIT_GATE = 3
@@ -119,7 +118,11 @@ def print_summary(summary: Summary) -> None:
     first, rest = results[:_FIRST], results[_FIRST:]
     head = summary.headline if summary.passed else f"{summary.headline[:-1]} (exit code {EXIT_GATE})."
     written = [f"Written to {summary.out_dir} (tables: -v, or report.html there)"] * bool(summary.out_dir)
-    steps = [line for step in summary.next if step.kind != "review" for line in _step_lines(step, folder)]
+    steps = list[str]()
+    for step in summary.next:
+        if step.kind != "review":
+            commands = (_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)
+            steps += [step.text, *commands]
     if _general("verbose"):
         for title, texts, more in _tables(summary):
             _echo_table(title, texts, width, more)
@@ -132,11 +135,6 @@ def print_summary(summary: Summary) -> None:
         wrong += [f"And {left} more: -v, or report.html."] * bool(left)
     echo(head, bold=True, fg=_COLORS[summary.status])
     _echo_lines([*first, *rest, *wrong, *written, *steps], width)
-
-
-def _step_lines(step: StepEntry, folder: str) -> list[str]:
-    """Return a step and its commands as lines, with the folder of the run."""
-    return [step.text, *(_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)]
 
 
 def _fitting(groups: Sequence[Sequence[str]], room: int, width: int | None) -> Iterator[list[str]]:

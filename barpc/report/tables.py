@@ -67,10 +67,6 @@ def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
     return _csv(RESIDUALS, rows)
 
 
-def _observations_csv(run: Run, _: Summary) -> Iterable[bytes]:
-    return _csv(OBSERVATION_COLUMNS, _observation_lines(run))
-
-
 def _observation_lines(run: Run) -> Iterator[str]:
     tracks, names = run.tracks, [cell(view.name) for view in run.views]
     rows = np.flatnonzero(np.isin(tracks.point, run.written_tracks))
@@ -153,15 +149,11 @@ def gcps_geojson(run: Run) -> bytes:
     return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
 
 
-def _matches_npz(run: Run, _: Summary) -> Iterable[bytes]:
-    return [matches_npz(run.tracks, [view.name for view in run.views])]
-
-
 TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
     "residuals.csv": _residuals_csv,
-    "observations.csv": _observations_csv,
+    "observations.csv": lambda run, _: _csv(OBSERVATION_COLUMNS, _observation_lines(run)),
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints_geojson,
-    MATCHES: _matches_npz,
+    MATCHES: lambda run, _: [matches_npz(run.tracks, [view.name for view in run.views])],
 }
 """File name -> the parts of its bytes, of a run and its summary."""
