@@ -162,13 +162,11 @@ def _tables(summary: Summary) -> list[tuple[str, list[list[str]], str]]:
     datum = () if summary.scene is None else summary.scene.datum
     if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()
-    errors = "Reprojection error of the tie points"
-    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
     gcps = GcpEntry.worst(summary.gcps, rows)
     places = ("in summary.json", "in tables/pairs.csv") if summary.out_dir else ("with --json",) * 2
     wanted = (
-        (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
-        (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
+        (table("views", ViewEntry.CAPTION, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
+        (table("pairs", PairEntry.CAPTION, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
         (table("gcps", GCP_CAPTION, gcps, GcpEntry, GcpEntry.TERMINAL), len(summary.gcps), places[0]),
         (table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)), len(datum), ""),
     )

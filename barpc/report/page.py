@@ -108,8 +108,8 @@ class Section:
 
 
 _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
-    "images": ("Images: residuals (RMS) of the tie points in use", ViewEntry, ViewEntry.PAGE),
-    "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
+    "images": (ViewEntry.CAPTION, ViewEntry, ViewEntry.PAGE),
+    "pairs": (PairEntry.CAPTION, PairEntry, PairEntry.PAGE),
     "corrections": ("Corrections: shift at the image centre ± 1 sigma", ViewEntry, ViewEntry.CORRECTIONS),
     "places": ("Ground point at each image centre: ellipse (1 sigma), CE90, stated CE90", ViewEntry, ViewEntry.PLACES),
     "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
