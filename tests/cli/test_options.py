@@ -236,7 +236,7 @@ def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:
 def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> None:
     usual = [flag for flags in listed_in_help("adjust", "--help").values() for flag in flags]
     assert len(set(usual) - {"--help", "--help-all", "--output"}) == 14
-    assert {"--help", "--help-all", "--out-dir", "--gcp", "--dem", "--keep-going"} <= set(usual)
+    assert {"--help", "--help-all", "--out-dir", "--output", "--gcp", "--dem", "--keep-going"} <= set(usual)
     assert "--jitter" not in usual
     whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
     known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}
