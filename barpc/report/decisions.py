@@ -153,4 +153,4 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:
-        yield "Check tie points fit equally well in all parts of every image."
+        yield "Check tie points fit the corrected cameras equally well in all parts of every image."

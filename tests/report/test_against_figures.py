@@ -443,7 +443,7 @@ def _(s, times):
     near(times, s.scene.prior_shared)
 
 
-@says(r"Check tie points fit equally well in all parts of every image\.")
+@says(r"Check tie points fit the corrected cameras equally well in all parts of every image\.")
 def _(s):
     assert s.scene.held_out_places == ()
     errors = [view.held_out_px for view in s.views if view.num_observations]
