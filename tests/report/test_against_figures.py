@@ -516,6 +516,17 @@ def _(s, ties, held):
     assert int(held or 0) == s.scene.num_held_in_height
 
 
+@says(
+    r"The scene may be tilted, by (.*) at its eastern and (.*) at its northern edge \((.*) out\), and bent, by (.*)\. "
+    r"Add GCPs .*"
+)
+def _(s, east, north, out, bent):
+    sigma = {one.part: one.sigma_m for one in s.scene.datum}
+    assert (east, north) == (metres(sigma["tilt east"]), metres(sigma["tilt north"]))
+    bends = [sigma[part] for part in ("twist", "bend east", "bend north")]
+    assert (out, bent) == (metres(s.scene.radius_m), metres(max(bends)))
+
+
 @says(r"(\d+) check points?, not used in the adjustment\. .*")
 def _(s, num):
     assert int(num) == len(s.check_points)
