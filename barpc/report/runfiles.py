@@ -174,8 +174,8 @@ def read_tables(summary: Summary, folder: Path, of_page: bool = True) -> RunFile
     outlines = _parsed(outlines_file, read_text(outlines_file, GEOJSON), _parse_outlines) if of_page else None
     if outlines is not None and len(outlines) != len(names):
         raise InputError(f"{outlines_file}: {len(outlines)} outlines of {len(names)} images")
-    observations = _read_observations(next(ties), names)
-    points, tracks = _read_points(next(ties))
+    observations = _parsed_observations(next(ties), names)
+    points, tracks = _parsed_points(next(ties))
     if outlines is None:
         return RunFiles(summary, observations, points, tracks)
     surface = table_path(folder, SURFACE)
@@ -220,9 +220,9 @@ def _parsed(path: Path, text: Any, parse: Any) -> Any:
         raise InputError(f"{path}: damaged ({plain(error)}); run the adjustment again") from error
 
 
-def _read_observations(path: Path, names: Sequence[str]) -> ObservationTable:
+def _parsed_observations(path: Path, names: Sequence[str]) -> ObservationTable:
     """Return observations.csv, of images in the order of their names."""
-    table = _read_columns(path, OBSERVATION_COLUMNS, OBSERVATION_COLUMNS[4:8], ("view",))
+    table = _parsed_columns(path, OBSERVATION_COLUMNS, OBSERVATION_COLUMNS[4:8], ("view",))
     numbers = np.stack([table[name] for name in OBSERVATION_COLUMNS[2:8]], axis=-1)
     index = {name: i for i, name in enumerate(names)}
 
@@ -233,14 +233,16 @@ def _read_observations(path: Path, names: Sequence[str]) -> ObservationTable:
     return ObservationTable(view, table["track"], numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
-def _read_points(path: Path) -> tuple[Array, IntArray]:
+def _parsed_points(path: Path) -> tuple[Array, IntArray]:
     """Return lon, lat [deg], altitude [m] and mean residual [px] (n, 4) of the tracks (n,) of residuals.csv."""
-    table = _read_columns(path, RESIDUALS, ("mean_residual", "mean_residual_before"))
+    table = _parsed_columns(path, RESIDUALS, ("mean_residual", "mean_residual_before"))
     places = np.stack([table[name] for name in RESIDUALS[:4]], axis=-1)
     return _parsed(path, places, _in_degrees), table["track"]
 
 
-def _read_columns(path: Path, header: Sequence[str], blank: Sequence[str], texts: Sequence[str] = ()) -> dict[str, Any]:
+def _parsed_columns(
+    path: Path, header: Sequence[str], blank: Sequence[str], texts: Sequence[str] = ()
+) -> dict[str, Any]:
     """Return the columns of a table by their names: texts, numbers of tracks, and numbers, NaN for blank ones."""
     from barpc.pointio.tables import read_table  # with what knows of heights: a summary alone needs none
 
