@@ -72,7 +72,7 @@ BANDS = (
 )
 CHANGE = "height minus that of the other images [m]"
 SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
-_SHOWN = BLOCK_SIZE // 2  # cells a side in the report: they are matched again, with the delivered cameras
+_RELIEF_SIDE = BLOCK_SIZE // 2  # cells a side in the report: they are matched again, with the delivered cameras
 _SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
 
 
@@ -303,10 +303,10 @@ def show_in_report(
     """
     try:
         windows = [
-            ((col + right, row + down), tile.part(right, down, _SHOWN), groups[0])
+            ((col + right, row + down), tile.part(right, down, _RELIEF_SIDE), groups[0])
             for (col, row), tile, groups in tiles
-            for right in range(0, tile.size[0], _SHOWN)
-            for down in range(0, tile.size[1], _SHOWN)
+            for right in range(0, tile.size[0], _RELIEF_SIDE)
+            for down in range(0, tile.size[1], _RELIEF_SIDE)
         ]
         with open_raster(made) as file:
             read = ((part, some, file.read([1, 3], window=Window(*at, *part.size))) for at, part, some in windows)

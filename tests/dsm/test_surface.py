@@ -461,7 +461,7 @@ def test_the_report_shows_the_part_of_a_tile_with_most_heights_by_both_kinds_of_
         assert (tile, band) == (replace(cells[1], west=16.0, size=(4, 4)), 3)
         return before, np.full((4, 4), np.nan, np.float32), None
 
-    monkeypatch.setattr(surface_module, "_SHOWN", 4)
+    monkeypatch.setattr(surface_module, "_RELIEF_SIDE", 4)
     monkeypatch.setattr(surface_module, "surface_tile", surface)
     monkeypatch.setattr(
         surface_module, "_delivered", lambda view, run, number: f"{view.name}/{run.summary.views[number].rpc_source}"
