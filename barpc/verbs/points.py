@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +16,13 @@ from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_fr
 from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl
 from barpc.cameras import ImageLike, open_camera
-from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
 from barpc.sensor import SensorModel, geometry
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import one_or_many, place_of
+
+if TYPE_CHECKING:
+    from barpc.rasters.dem import Dem
 
 _SAME_PLACE = 0.01  # deg: places that are one; others that are seen alike lie degrees away
 
@@ -174,7 +177,11 @@ def terrain_of(dem: Files | None = None, geoid: PathLike | None = None, alt: npt
         raise UsageError("--geoid goes with --dem")
     if dem and alt is not None:
         raise UsageError("give either --alt or --dem")
-    return Dem.open(dem, geoid) if dem else None
+    if not dem:
+        return None
+    from barpc.rasters.dem import Dem
+
+    return Dem.open(dem, geoid)
 
 
 def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: Dem | None) -> Array:
@@ -242,6 +249,8 @@ def _run_altitudes(folder: Path, _changed: int) -> dict[str, float]:
 def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None) -> Array:
     """Return ground points (N, 3) of image points (N, 2), on the DEM where there is one, else at altitudes [m]."""
     if dem is not None:
+        from barpc.rasters.dem import localize_on_terrain
+
         found = localize_on_terrain(camera.model, image, dem, camera.alt_range)
         if np.isnan(found).all():
             dem.covering(*camera.model.localize(image, np.full(len(image), camera.altitude))[:, :2].T)
