@@ -194,8 +194,7 @@ class Run:
     def met_worse(self) -> list[ImageRegion]:
         """Rows, columns and cells of images with larger residuals of check tie points than in the rest."""
         found, tracks = self.adjustment, self.tracks
-        # plain least squares assumes no wrong tie point
-        if found is None or not found.held_out.any() or found.options.loss == "linear":
+        if found is None or not found.held_out.any():
             return []
         known = np.isfinite(found.held_out_noise)
         if found.apart is not None and found.apart.clear:
