@@ -148,8 +148,7 @@ def ratios(sizes: list[tuple[int, int]], repeat: int) -> None:
                     found[name].append(timed(run))
         cpu = {name: statistics.median(seconds for seconds, _ in times) for name, times in found.items()}
         ours = found["barpc"][0][1]
-        used = ours.inlier
-        least = float(((ours.residuals[used] / block.tracks.sigma[used, None]) ** 2).sum())
+        least = float(np.nansum((ours.residuals / block.tracks.sigma[:, None]) ** 2))  # of those cut, too, as the peer
         stops, tight = (2.0 * found[name][0][1].cost / least - 1.0 for name in ("stops", "tight"))
         print(
             f"{views:5d} {tracks:7d}  | {cpu['barpc']:6.3f}  "
