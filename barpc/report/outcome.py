@@ -120,7 +120,6 @@ class Run:
     reference: ReferenceControl | None = None
     datums: tuple[HeightDatum, ...] = ()
     detail: tuple[IntArray, ...] = ()
-    earlier: Any = None  # the finished run that images are added to, as the pipeline has it
     unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
     added: Added | None = None
     joint: Adjustment | None = None  # with the cameras of the earlier run free, where `adjustment` holds them
@@ -130,7 +129,7 @@ class Run:
     @property
     def known(self) -> frozenset[str]:
         """Names of the views that are images of an earlier run."""
-        held = getattr(self.adjustment, "earlier", None)
+        held = None if self.adjustment is None else self.adjustment.earlier
         return frozenset(() if held is None else held.names)
 
     @cached_property

@@ -95,7 +95,7 @@ class GroundFrame(Frozen):
 
         def farther(slant: Array) -> Array:
             ground, by_slant, _ = self._ground_range(time, slant)
-            return slant + (target - ground) / by_slant
+            return np.asarray(slant + (target - ground) / by_slant)
 
         slant, _ = newton(farther, self.origin.mean() + target * self.slope)
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
