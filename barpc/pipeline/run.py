@@ -16,11 +16,11 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment, BlockPrior, block_prior
-from barpc.base.blas import one_blas_thread
 from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.geodesy import feature_collection
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
 from barpc.base.options import FitOptions, RunOptions, file_options
+from barpc.base.process import one_blas_thread
 from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.base.sealed import portable

@@ -18,8 +18,7 @@ from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
-from barpc.pipeline import inputs
-from barpc.pipeline import adjusting
+from barpc.pipeline import adjusting, inputs
 from barpc.pipeline import run as stages
 from barpc.pipeline.earlier import of_new
 from barpc.pipeline.inputs import (
