@@ -36,7 +36,8 @@ from barpc.base.errors import ImageError, OutputError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import IMAGE, opened, plain_path, read_head
-from barpc.rasters.raster import Mosaic, earth_crs, has_mask, identify, open_raster, transformed, vrt_of
+from barpc.rasters.mosaic import Mosaic
+from barpc.rasters.raster import earth_crs, has_mask, identify, open_raster, transformed, vrt_of
 from barpc.rasters.vrt import GDAL_TYPES, Source
 from barpc.rpcio.text import (
     COEFFICIENTS,
