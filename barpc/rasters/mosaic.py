@@ -21,11 +21,11 @@ from rasterio.windows import Window
 
 from barpc.base.errors import ImageError
 from barpc.rasters.crs import plain_crs
+from barpc.rasters.raster import BLOCK_SIZE
 from barpc.rasters.vrt import Band, Rect, Source, Vrt
 
 PixelArray = npt.NDArray[Any]
 
-BLOCK_SIZE = 512  # px a side, read and written at a time
 _MOST_OPEN = 64
 _WIDE = ("int32", "uint32", "int64", "uint64", "float64")  # GDAL scales them as float64, others as float32
 

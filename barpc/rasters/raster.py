@@ -38,7 +38,6 @@ from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
 from barpc.base.safe_io import IMAGE, opened, read_head
 from barpc.rasters.composed import header_beside, is_raw, placed_tiles, refuse_foreign_channels, shown_header
 from barpc.rasters.crs import crs_of, refuse_opening_crs
-from barpc.rasters.mosaic import Mosaic
 from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Source, Vrt, read_vrt
 
 DRIVERS: dict[bytes, str] = {
@@ -60,6 +59,7 @@ DRIVERS: dict[bytes, str] = {
 MOSAICS = ("VRT", "TIL")
 """Texts that name rasters, which GDAL is never shown."""
 
+BLOCK_SIZE = 512  # px a side, read and written at a time
 GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 
 GDAL_OPTIONS: dict[str, Any] = {
@@ -187,7 +187,7 @@ def _opened_alone(file: Path, driver: str) -> Iterator[Any]:
             yield dataset
 
 
-def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Mosaic:
+def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Any:
     """Return a VRT, or a list of tiles as one, whose sources are all rasters that are read here."""
     if isinstance(file, Remote):
         raise ImageError(f"{name}: a {driver} is read from disk only; give the images it is made of")
@@ -198,6 +198,8 @@ def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Mosaic:
             drivers[source.file] = identify(source.file)[1]
             if drivers[source.file] in MOSAICS:
                 raise ImageError(f"{name}: a {driver} of a VRT is not read; give the images it is made of")
+    from barpc.rasters.mosaic import Mosaic  # few rasters are VRTs
+
     return Mosaic(name, vrt, lambda source: _open_dataset(source, drivers[source]))
 
 
@@ -217,10 +219,15 @@ def _vrt_of_tiles(file: Path) -> Vrt:
     return replace(whole, size=size, bands=bands, mask=None)
 
 
+def shown_vrt(dataset: Any) -> Vrt | None:
+    """Return the VRT that an opened raster is; None of another."""
+    return getattr(dataset, "vrt", None)
+
+
 def vrt_of(dataset: Any, file: Path) -> Vrt:
     """Return the VRT that shows an opened raster whole; of one that is a VRT its own."""
-    if isinstance(dataset, Mosaic):
-        return dataset.vrt
+    if (own := shown_vrt(dataset)) is not None:
+        return own
     whole = (0, 0, dataset.width, dataset.height)
     rows = zip(dataset.dtypes, dataset.nodatavals, dataset.colorinterp, strict=True)
     bands = tuple(

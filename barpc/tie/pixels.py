@@ -15,8 +15,7 @@ from rasterio.windows import Window
 
 from barpc.base.errors import ImageError
 from barpc.base.geodesy import Array
-from barpc.rasters.mosaic import BLOCK_SIZE
-from barpc.rasters.raster import open_raster
+from barpc.rasters.raster import BLOCK_SIZE, open_raster
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]
