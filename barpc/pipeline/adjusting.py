@@ -14,7 +14,7 @@ from barpc.ba import Adjustment, BlockPrior, adjust_tracks, consistent_observati
 from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
 from barpc.base.errors import BarpcError, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
-from barpc.base.options import AdjustOptions, RunOptions
+from barpc.base.options import AdjustOptions
 from barpc.base.tasks import Progress, Work
 from barpc.pipeline.calibrate import common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, GrowingRun, chosen_pairs, of_new
@@ -41,59 +41,57 @@ from barpc.workspace import Workspace
 logger = logging.getLogger(__name__)
 
 
-def tied_and_adjusted(
-    run: GrowingRun, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work
-) -> GrowingRun:
+def tied_and_adjusted(run: GrowingRun, dem: Dem | None, workspace: Workspace, work: Work) -> GrowingRun:
     """Return the run with tie points and its adjustment; with tie points alone where it stops after matching."""
     with workspace.stage("tie points"):
-        run = with_own_cameras(with_ties(run, options, work, dem), options, work, dem)
-    if options.stop_after == "matching":
+        run = with_own_cameras(with_ties(run, work, dem), work, dem)
+    if run.options.stop_after == "matching":
         _write_asp_matches(run, workspace)
         return replace(run, kind="match")
     if run.earlier is not None:
-        run = _met(run, run.earlier, options)
-    if dem is not None and options.reference:
+        run = _met(run, run.earlier)
+    if dem is not None and run.options.reference:
         with workspace.stage("reference"):
-            run = replace(run, reference=_register_to_reference(run, options, dem, work))
+            run = replace(run, reference=_register_to_reference(run, dem, work))
     with workspace.stage("adjustment"), _passes(work.progress):
-        return _with_adjustment(run, options, dem)
+        return _with_adjustment(run, dem)
 
 
-def with_ties(run: GrowingRun, options: RunOptions, work: Work, terrain: Dem | None = None) -> GrowingRun:
+def with_ties(run: GrowingRun, work: Work, terrain: Dem | None = None) -> GrowingRun:
     """Return the run with tie points: from a file, or matched."""
     views = run.views
-    if options.matches and options.matches_only:
-        return replace(run, tracks=given_tracks(options.matches, views))
+    if run.options.matches and run.options.matches_only:
+        return replace(run, tracks=given_tracks(run.options.matches, views))
     if len(views) < 2:
         return run
-    scope = scope_of(run, options, terrain)
-    if options.matches:
-        scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
+    scope = scope_of(run, terrain)
+    if run.options.matches:
+        scope = replace(scope, given=given_matches(run.options.matches, views, partly=bool(run.left_out)))
     try:
-        ties = find_tracks(views, options.tie, scope, executor=work.executor, progress=work.progress)
+        ties = find_tracks(views, run.options.tie, scope, executor=work.executor, progress=work.progress)
     except DisconnectedError as error:
         groups = [group for group in error.groups if run.earlier is None or {*group} & {*run.earlier.number}]
-        if not options.keep_going or not groups or len(groups[0]) < 2:
+        if not run.options.keep_going or not groups or len(groups[0]) < 2:
             raise
         kept = _only(run, frozenset(groups[0]), error.said)
         logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
-        return with_ties(kept, options, work, terrain)
+        return with_ties(kept, work, terrain)
     detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
     return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
 
 
-def scope_of(run: GrowingRun, options: RunOptions, terrain: Dem | None) -> Scope:
+def scope_of(run: GrowingRun, terrain: Dem | None) -> Scope:
     """Return the pairs and the area in which tie points are looked for."""
     views, old = run.views, _is_old(run)
     scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
-    if options.overlap_list is not None:
-        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
+    if run.options.overlap_list is not None:
+        scope = replace(scope, only=read_pairs(run.options.overlap_list, views, [path for path, _ in run.left_out]))
     elif run.earlier is not None:
-        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
-    return scope if options.aoi is None else replace(scope, area=read_area(options.aoi))
+        scope = replace(scope, only=chosen_pairs(views, old.tolist(), run.options.tie))
+    return scope if run.options.aoi is None else replace(scope, area=read_area(run.options.aoi))
 
 
-def with_own_cameras(run: GrowingRun, options: RunOptions, work: Work, terrain: Dem | None = None) -> GrowingRun:
+def with_own_cameras(run: GrowingRun, work: Work, terrain: Dem | None = None) -> GrowingRun:
     """Return the run; InputError where images fit each other's cameras, or with `keep_going` the run without them."""
     found = exchanged_cameras(run.views, run.tracks)
     if found is None:
@@ -101,11 +99,11 @@ def with_own_cameras(run: GrowingRun, options: RunOptions, work: Work, terrain: 
     names = [view.name for view in run.views]
     sentence = found.sentence(names)
     others = frozenset(name for i, name in enumerate(names) if i not in found.views)
-    if not options.keep_going or len(others) < 2:
+    if not run.options.keep_going or len(others) < 2:
         raise InputError(f"{sentence}: give each image its own RPC (IMAGE,camera=FILE)")
     logger.warning("%s: left out", sentence)
     kept = _only(run, others, {names[view]: sentence for view in found.views})
-    return with_ties(kept, options, work, terrain)
+    return with_ties(kept, work, terrain)
 
 
 def _only(run: GrowingRun, names: frozenset[str], said: Mapping[str, str]) -> GrowingRun:
@@ -123,7 +121,7 @@ def _only(run: GrowingRun, names: frozenset[str], said: Mapping[str, str]) -> Gr
     )
 
 
-def _met(run: GrowingRun, earlier: Earlier, options: RunOptions) -> GrowingRun:
+def _met(run: GrowingRun, earlier: Earlier) -> GrowingRun:
     """Return the run with the tie points of its new images, and those of the earlier ones that have some.
 
     The others stay as the earlier run has them, but for what control is given of them.
@@ -131,7 +129,7 @@ def _met(run: GrowingRun, earlier: Earlier, options: RunOptions) -> GrowingRun:
     old, tracks = _is_old(run), of_new(run.tracks, _is_old(run))
     tied = np.bincount(tracks.view, minlength=len(run.views)) > 0
     leads = {one.lead for one in run.carried}
-    keep = ~old | tied | bool(options.gcp or options.reference) | np.array([v.name in leads for v in run.views])
+    keep = ~old | tied | bool(run.options.gcp or run.options.reference) | np.array([v.name in leads for v in run.views])
     if not (old & keep).any():
         raise TiePointError(
             f"no tie point of the images given is seen in one of {earlier.folder}: look at the images (clouds? "
@@ -153,24 +151,26 @@ def _is_old(run: GrowingRun) -> BoolArray:
     return np.array([view.name in known for view in run.views], dtype=bool)
 
 
-def _register_to_reference(run: GrowingRun, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
+def _register_to_reference(run: GrowingRun, dem: Dem, work: Work) -> ReferenceControl:
     """Register the views, with the cameras as delivered, to the reference."""
-    given = options.adjust.dem_bias_sigma
+    given = run.options.adjust.dem_bias_sigma
     bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
-    accuracy = Accuracy(options.reference_sigma, options.adjust.dem_sigma, bias)
-    return register_views(run.views, reference_names(options), dem, options.tie.band, accuracy, work)
+    accuracy = Accuracy(run.options.reference_sigma, run.options.adjust.dem_sigma, bias)
+    return register_views(run.views, reference_names(run.options), dem, run.options.tie.band, accuracy, work)
 
 
-def _with_adjustment(run: GrowingRun, options: RunOptions, dem: Dem | None) -> GrowingRun:
+def _with_adjustment(run: GrowingRun, dem: Dem | None) -> GrowingRun:
     """Return the run with an adjustment and its inputs."""
-    gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
-    centers = _centers(run.views, options.adjust.center)
+    gcps, checks = (
+        load_gcps(paths, run.views, run.options, dem) for paths in (run.options.gcp, run.options.check_points)
+    )
+    centers = _centers(run.views, run.options.adjust.center)
     if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
         raise TiePointError(
-            f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else constrains "
+            f"{', '.join(run.options.reference)}: the reference {run.reference.refusal}, and nothing else constrains "
             "the images: check its position and the DEM's, or use a finer one"
         )
-    altimetry = load_altimetry(options.altimetry, run.views, options.heights)
+    altimetry = load_altimetry(run.options.altimetry, run.views, run.options.heights)
 
     def solved(options: AdjustOptions, prior: BlockPrior | None) -> Adjustment:
         return adjust_tracks(
@@ -188,9 +188,9 @@ def _with_adjustment(run: GrowingRun, options: RunOptions, dem: Dem | None) -> G
             common=common_errors(run),
         )
 
-    chosen, keep_going = _with_rounding(run, options.adjust), options.keep_going
+    chosen, keep_going = _with_rounding(run, run.options.adjust), run.options.keep_going
     adjustment = solved(chosen, None if run.earlier is None else run.earlier.prior)
-    if run.earlier is not None and not options.update:
+    if run.earlier is not None and not run.options.update:
         run, adjustment = _with_earlier_held(run, run.earlier, adjustment, chosen, solved)
     refuse_strange(run, adjustment)
     ground = [ground_from_ecef(adjustment.points)]  # none without tie points

@@ -129,7 +129,7 @@ def adjust(
                 run.earlier.refuse_changed(run, inputs)
         with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
-                run = tied_and_adjusted(run, options, given, workspace, Work(caching, progress))
+                run = tied_and_adjusted(run, given, workspace, Work(caching, progress))
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
                     run = _fitted(run, options, Work(caching, progress))
@@ -261,7 +261,7 @@ def check(
     Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
-    run = with_own_cameras(with_ties(_with_views("check", images, options, work), options, work), options, work)
+    run = with_own_cameras(with_ties(_with_views("check", images, options, work), work), work)
     if (found := agreeing(run, options.adjust)) is not None:
         run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
@@ -284,7 +284,7 @@ def plan(
         Workspace.require_free(out_dir, options.overwrite, keep, names)
     dem, pairs = side_inputs(options, run.views), list[Pair]()
     if len(run.views) > 1 and not options.matches_only:
-        scope = scope_of(run, options, dem)
+        scope = scope_of(run, dem)
         pairs = possible_pairs(run.views, options.tie, scope)
         pairs = pairs if scope.only else best_pairs(pairs, len(run.views), options.tie.neighbours)
     return planned(run, options, dem, pairs, processes)

@@ -23,7 +23,7 @@ from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import centers_of, solve
+from tests.ba.conftest import as_stated, centers_of, solve
 from tests.constants import chosen
 
 CALM = {"hold_out": False}
@@ -160,6 +160,7 @@ def turned() -> SimulatedBlock:
 
 
 @pytest.mark.nightly
+@as_stated()
 def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties(turned) -> None:
     found = adjust_tracks(turned.views, turned.tracks, AdjustOptions())
     assert found.cameras.unknowns.model == "affine"
@@ -169,6 +170,7 @@ def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("view", [0, pytest.param(1, marks=pytest.mark.nightly)])
+@as_stated()
 def test_a_step_beside_an_image_that_was_turned_is_the_only_one_found_and_is_followed(turned, view) -> None:
     """Beside a model in space what the turn leaves looks like steps, too."""
     tracks = turned.tracks

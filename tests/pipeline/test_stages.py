@@ -297,7 +297,9 @@ def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch,
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
     )  # fmt: skip
-    adjusting._register_to_reference(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), HERE)  # type: ignore[arg-type]
+    adjusting._register_to_reference(
+        SimpleNamespace(views=views(), options=options), SimpleNamespace(known=known), HERE
+    )  # type: ignore[arg-type]
     assert seen["accuracy"] == Accuracy(7.0, 4.0, used)
 
 
@@ -390,7 +392,7 @@ def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
         return loaded
 
     monkeypatch.setattr(stages, "_with_views", load)
-    monkeypatch.setattr(stages, "with_ties", lambda run, options, work: tied if run is loaded else None)
+    monkeypatch.setattr(stages, "with_ties", lambda run, work: tied if run is loaded else None)
     monkeypatch.setattr(stages, "summarize", lambda run: a_record(run, passed=run is tied))
     result = stages.check(given, RunOptions(keep_going=True), progress=told)
     assert [view.name for view in result.views] == ["v2", "v0", "v1"]
