@@ -204,16 +204,15 @@ def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tm
         0,
         "off",
     )
-    assert not told.learn_priors
     assert (whole.fit.method, whole.fit.space) == ("lcurve-joint", "ground")
     assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (
         TieOptions(),
         RunOptions(),
     )
     file = tmp_path / "a.toml"
-    file.write_text("[adjust]\nlearn_priors = true\n")
+    file.write_text("[adjust]\nnoise_floor = 0.03\n")
     mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))
-    assert (mixed.adjust.learn_priors, mixed.adjust.drift, mixed.adjust.jitter) == (True, 1, "off")
+    assert (mixed.adjust.noise_floor, mixed.adjust.drift, mixed.adjust.jitter) == (0.03, 1, "off")
     file.write_text('[adjust]\ncenter = "projective"\n')
     with pytest.raises(InputError, match=r"center stands in a file, where it is not accepted; give the flag --paper"):
         run_options({}, str(file))

@@ -54,7 +54,7 @@ def run(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("words", "most"),
     [
-        (["verify", "{run}"], 58),
+        (["verify", "{run}"], 59),
         (["report", "{run}"], 55),
         (["report", "{run}", "{run}"], 60),
         (["export", "{run}", "{out}", "--to", "s2p"], 73),

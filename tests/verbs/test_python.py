@@ -176,7 +176,7 @@ barpc.adjust("a.tif", pathlib.Path("out"), gcp=["a.csv", pathlib.Path("b.csv")],
 barpc.dsm("run", "out.tif", gsd=2, alt=(0.0, 9.0))
 barpc.fit("a.tif", alt_range=[0, 400], method="ridge")
 barpc.adjust("a.tif", "out", gpc="a.csv")
-barpc.adjust("a.tif", "out", loss="huber")
+barpc.adjust("a.tif", "out", solver="huber")
 barpc.dsm("run", "out.tif", gsd="2")
 barpc.export("run", "out", "s2p", alt_range=(1.0, 2.0))
 barpc.fit("a.tif", matcher="guided")

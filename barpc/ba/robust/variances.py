@@ -170,7 +170,6 @@ class Variances:
 
     given: CameraPrior  # with the standard deviations as they were given
     unknowns: Unknowns  # which unknown is what
-    learns: bool  # whether the standard deviations of constants and drifts may change
     cautious: bool  # rather too wide than too narrow: no control holds the scene
     stated: BoolArray | None = None  # (N,) views whose RPCs state what counts here; None: none does
     # (4 + D, 2) of an earlier block, whose views have no prior of their own here: squared corrections over the
@@ -191,11 +190,15 @@ class Variances:
         widest: tuple[float, ...] | None = None,
     ) -> Variances:
         """Return the priors to be learnt by the options, with control points or without."""
-        learns = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
         most = None if widest is None else np.array([*widest[: unknowns.drift], widest[-1]])
-        return cls(given, unknowns, learns, not control, stated, shown, most)
+        return cls(given, unknowns, not control, stated, shown, most)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the standard deviations of constants and drifts may change."""
+        return self.unknowns.geometric
 
     @property
     def constants(self) -> int:
