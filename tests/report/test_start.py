@@ -55,7 +55,7 @@ def run(tmp_path_factory) -> Path:
     ("words", "most"),
     [
         (["verify", "{run}"], 59),
-        (["report", "{run}"], 55),
+        (["report", "{run}"], 58),
         (["report", "{run}", "{run}"], 60),
         (["export", "{run}", "{out}", "--to", "s2p"], 73),
         (["export", "{run}", "{out}", "--to", "points"], 73),
