@@ -40,7 +40,7 @@ from barpc.base.errors import BarpcError, InputError, OutputError
 from barpc.base.fields import field_values, is_record
 from barpc.base.identity import Stamp
 from barpc.base.manifest import LAST, SUMS
-from barpc.base.memory import give_back, peak_memory
+from barpc.base.process import give_back, peak_memory
 from barpc.base.sealed import (
     CAREFUL,
     NOTES,

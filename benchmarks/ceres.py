@@ -30,8 +30,6 @@ SIZES = (3, 1500), (10, 5000), (30, 10000), (100, 15000), (300, 30000), (1000, 1
 PLAIN = AdjustOptions(
     model="rotation+translation",
     drift=0,
-    loss="linear",
-    estimate_noise=False,
     noise_floor=0.0,
     min_convergence=0.0,
 )

@@ -96,7 +96,7 @@ SIZES = {
     "patches_together": ("barpc.tie.patches.register.CHUNK",),
     "newton_steps": ("barpc.tie.patches.register.NEWTON_STEPS",),
     "kept_after": ("barpc.workspace.KEEP_AFTER",),
-    "rows_together": ("barpc.report.runfiles.ROWS_TOGETHER",),
+    "rows_together": ("barpc.report.tables.ROWS_TOGETHER",),
     "tracks_in_tables": ("barpc.report.outcome.MAX_TRACKS",),
     "observations_intersected": ("barpc.report.outcome._TOGETHER",),
     "matches_measured": ("barpc.report.measures.pairs.MAX_PER_PAIR",),

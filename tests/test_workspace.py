@@ -17,7 +17,7 @@ import pytest
 from barpc import __version__
 from barpc.base.errors import OutputError, TiePointError
 from barpc.base.identity import fingerprint
-from barpc.base.memory import peak_memory
+from barpc.base.process import peak_memory
 from barpc.base.sealed import noted_outputs
 from barpc.workspace import (
     Workspace,

@@ -138,7 +138,7 @@ def solve_block(
         agreed, heights = _with_control(block, given, rounds.run(once=True))
         rounds = Rounds(problem, block, state, heights, block.use)
     outcome = rounds.run()
-    if options.loss != "linear" and _is_suspect(outcome, problem.structure, block.use):
+    if _is_suspect(outcome, problem.structure, block.use):
         projected = problem.project_points(state.params, state.points)
         agree = agreeing(problem.structure, problem.xy, before, projected, block.sigma, block.use)
         again = Rounds(problem, block, state, heights, agree).run()

@@ -29,19 +29,19 @@ def replacing(
     ----------
     path : Path or str, the file to be written; its folder is made where it is missing
     overwrite : bool, replace an existing file, else an OutputError
-    durable : bool, wait until the file is on the disk; not needed for what can be made again
+    durable : bool, wait until the file is on the disk; what can be made again need not, nor has a folder of its own
     room : Path, optional, where the temporary folder is made, on the same disk; None: beside `path`
     """
     path = Path(path)
     refuse_existing(path, overwrite)
     place = (room or path.parent) / f"{_MARK}{uuid.uuid4().hex[:12]}"
-    partial = place / path.name
+    partial = place / path.name if durable else place
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if f"/{STATE}/{PARTIAL}/" in path.as_posix():
             yield path
             return
-        place.mkdir(parents=True)
+        partial.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         if durable:
             _sync(partial)
@@ -55,7 +55,7 @@ def replacing(
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from error
     finally:
         try:
-            place.rmdir()
+            place.rmdir() if durable else place.unlink(missing_ok=True)
         except FileNotFoundError:  # it was not needed
             pass
         except OSError:  # something is left in it

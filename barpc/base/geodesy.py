@@ -93,6 +93,18 @@ def as_points(values: npt.ArrayLike, width: int, what: str, axis: str) -> Array:
     return points
 
 
+def newton(
+    moved: Callable[[Array], Array], x: Array, tolerance: float | Array = NEWTON_TOLERANCE
+) -> tuple[Array, BoolArray]:
+    """Return where steps from `x` to `moved(x)` end, and which of its elements have settled to `tolerance`."""
+    for _ in range(NEWTON_STEPS):
+        before, x = x, moved(x)
+        step = np.abs(x - before)
+        if not (step > tolerance).any():
+            break
+    return x, step <= tolerance
+
+
 def as_ground(ground: npt.ArrayLike) -> Array:
     """Return ground points as float64 (..., 3); see `as_points`."""
     return as_points(ground, 3, "ground points", "lon, lat [deg], altitude [m]")

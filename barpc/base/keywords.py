@@ -31,10 +31,7 @@ class RunKeywords(TypedDict, total=False):
     terms: Literal["auto", "none"]
     sigma_attitude: float | None
     sigma_position: float | None
-    learn_priors: bool
     noise_floor: float
-    loss: Literal["geman_mcclure", "linear"]
-    estimate_noise: bool
     fixed: Sequence[str]
     dem_sigma: float
     dem_bias_sigma: float | None

@@ -131,11 +131,6 @@ class AdjustOptions(Options):
         unit="m",
         above=0,
     )
-    learn_priors: bool = option(
-        True,
-        """Widen the priors of rotation and translation where the corrections contradict them, for all views or
-        single ones, and estimate that of the drift.""",
-    )
     noise_floor: float = option(
         0.02,
         """Tie-point error common to a view, which does not average out: the information of all its observations
@@ -143,12 +138,6 @@ class AdjustOptions(Options):
         unit="px",
         least=0,
     )
-    loss: Literal["geman_mcclure", "linear"] = option(
-        "geman_mcclure",
-        "Robust loss of the first rounds; `linear` skips them.",
-        removed=dict.fromkeys(("huber", "soft_l1", "cauchy"), "`geman_mcclure` is the loss that is kept"),
-    )
-    estimate_noise: bool = option(True, "Scale the observations' sigmas by the scatter of the residuals.")
     fixed: tuple[str, ...] = option((), "A view that keeps its delivered camera.", unit="name")
     dem_sigma: float = option(
         10.0,
@@ -371,7 +360,6 @@ PAPER: Mapping[str, Mapping[str, Any]] = {
         "center": "projective",
         "drift": 0,
         "jitter": OFF,
-        "learn_priors": False,
     },
     "fit": {"method": "lcurve-joint", "space": "ground", "grid": (20, 20, 10)},
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
 
 MOST_PAIRS = 10  # of a plan on the terminal
 _images_argument = click.argument("images", nargs=-1, required=False, metavar="IMAGE...")
-_out_dir = click.option("-o", "--out-dir", "--output", required=True, metavar="DIR", help="Folder for the results.")
+_out_dir = partial(click.option, "-o", "--out-dir", "--output", metavar="DIR")
 
 
 @click.command("adjust", cls=Grouped)
 @_images_argument
-@click.option("-o", "--out-dir", metavar="DIR", help="Folder for the results; needed unless with --dry-run.")
+@_out_dir(help="Folder for the results; needed unless with --dry-run.")
 @paper
 @click.option("--dry-run", is_flag=True, help="Say pairs, time, memory, datum and doubts; write nothing.")
 @with_flags(*RUN, *TIE, *ADJUSTMENT)
@@ -53,7 +54,7 @@ def adjust(dry_run: bool, **flags: Any) -> int:
 
 @click.command("match", cls=Grouped)
 @_images_argument
-@_out_dir
+@_out_dir(required=True, help="Folder for the results.")
 @with_flags(*MATCH, *TIE)
 def match(**flags: Any) -> int:
     r"""Match tie points and stop, for `barpc adjust --matches` and other tools.
@@ -93,7 +94,7 @@ def _run_pipeline(work: Callable[..., Any], flags: dict[str, Any], tell_of: Call
     kept.folder = Path(where[0]) if where and where[0] else None
     with at_work() as progress:
         result = work(images, *where, options, jobs=flags["jobs"], progress=kept.following(progress))
-        return (tell_of or _tell_result)(result)
+    return (tell_of or _tell_result)(result)
 
 
 def _tell_plan(plan: Plan) -> int:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from barpc.base.tasks import Progress
     from barpc.report import Summary
-    from barpc.report.summary import StepEntry
 
 
 EXIT_GATE = 3
@@ -119,7 +118,11 @@ def print_summary(summary: Summary) -> None:
     first, rest = results[:_FIRST], results[_FIRST:]
     head = summary.headline if summary.passed else f"{summary.headline[:-1]} (exit code {EXIT_GATE})."
     written = [f"Written to {summary.out_dir} (tables: -v, or report.html there)"] * bool(summary.out_dir)
-    steps = [line for step in summary.next if step.kind != "review" for line in _step_lines(step, folder)]
+    steps = list[str]()
+    for step in summary.next:
+        if step.kind != "review":
+            commands = (_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)
+            steps += [step.text, *commands]
     if _general("verbose"):
         for title, texts, more in _tables(summary):
             _echo_table(title, texts, width, more)
@@ -132,11 +135,6 @@ def print_summary(summary: Summary) -> None:
         wrong += [f"And {left} more: -v, or report.html."] * bool(left)
     echo(head, bold=True, fg=_COLORS[summary.status])
     _echo_lines([*first, *rest, *wrong, *written, *steps], width)
-
-
-def _step_lines(step: StepEntry, folder: str) -> list[str]:
-    """Return a step and its commands as lines, with the folder of the run."""
-    return [step.text, *(_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)]
 
 
 def _fitting(groups: Sequence[Sequence[str]], room: int, width: int | None) -> Iterator[list[str]]:
@@ -164,13 +162,11 @@ def _tables(summary: Summary) -> list[tuple[str, list[list[str]], str]]:
     datum = () if summary.scene is None else summary.scene.datum
     if len(DatumEntry.columns(datum).split()) <= 3:  # one source holds all: the verdict says so
         datum = ()
-    errors = "Reprojection error of the tie points"
-    offsets = "Epipolar offset: median ± spread (1.4826 MAD) across the epipolar line"
     gcps = GcpEntry.worst(summary.gcps, rows)
     places = ("in summary.json", "in tables/pairs.csv") if summary.out_dir else ("with --json",) * 2
     wanted = (
-        (table("views", errors, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
-        (table("pairs", offsets, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
+        (table("views", ViewEntry.CAPTION, some_views, ViewEntry, ViewEntry.TERMINAL, adjusted), len(views), places[0]),
+        (table("pairs", PairEntry.CAPTION, some_pairs, PairEntry, PairEntry.TERMINAL, adjusted), len(pairs), places[1]),
         (table("gcps", GCP_CAPTION, gcps, GcpEntry, GcpEntry.TERMINAL), len(summary.gcps), places[0]),
         (table("datum", DATUM, datum, DatumEntry, DatumEntry.columns(datum)), len(datum), ""),
     )

@@ -72,6 +72,7 @@ BANDS = (
 )
 CHANGE = "height minus that of the other images [m]"
 SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
+_RELIEF_SIDE = BLOCK_SIZE // 2  # cells a side in the report: they are matched again, with the delivered cameras
 _SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
 
 
@@ -297,12 +298,18 @@ def show_in_report(
     made: Path,
     band: int,
 ) -> None:
-    """Show both reliefs of the tile that has most heights, and two images on the surface, in a run's report; where
-    that fails a line says why.
+    """Show both reliefs of the part of a tile that has most heights, and two images on the surface, in a run's report;
+    where that fails a line says why.
     """
     try:
+        windows = [
+            ((col + right, row + down), tile.part(right, down, _RELIEF_SIDE), groups[0])
+            for (col, row), tile, groups in tiles
+            for right in range(0, tile.size[0], _RELIEF_SIDE)
+            for down in range(0, tile.size[1], _RELIEF_SIDE)
+        ]
         with open_raster(made) as file:
-            read = ((t, groups[0], file.read([1, 3], window=Window(*at, *t.size))) for at, t, groups in tiles)
+            read = ((part, some, file.read([1, 3], window=Window(*at, *part.size))) for at, part, some in windows)
             tile, pairs, after = max(read, key=lambda row: np.isfinite(row[2][0]).sum())
         views = {i: _delivered(block.views[i], run, i) for pair in pairs for i in pair}
         before = surface_tile([(views[i], views[j]) for i, j in pairs], tile, band)

@@ -7,13 +7,15 @@ TYPE_CHECKING = False  # as of `typing`, whose import is most of what `import ba
 if TYPE_CHECKING:
     from barpc.base.options import FitOptions
     from barpc.fit.certificate import RpcFit
-    from barpc.fit.refit import fit_rpc, fit_rpc_points
+    from barpc.fit.given import fit_rpc_points
+    from barpc.fit.refit import fit_rpc
     from barpc.fit.system import Normalization
 
 _MODULES = {
     "FitOptions": "barpc.base.options",
     "RpcFit": "barpc.fit.certificate",
-    **dict.fromkeys(("fit_rpc", "fit_rpc_points"), "barpc.fit.refit"),
+    "fit_rpc": "barpc.fit.refit",
+    "fit_rpc_points": "barpc.fit.given",
     "Normalization": "barpc.fit.system",
 }
 __all__ = ["FitOptions", "Normalization", "RpcFit", "fit_rpc", "fit_rpc_points"]

@@ -1,37 +1,32 @@
-"""Fit an RPC to any sensor model, or to given points, and certify it on points that the fit has not seen."""
+"""Fit an RPC to any sensor model, and certify it on points that the fit has not seen."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from barpc.base.errors import BarpcWarning, FitError
-from barpc.base.geodesy import CHUNK, WGS84_A, Array, ecef_from_ground, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import WGS84_A, Array, ecef_from_ground, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.certificate import RpcFit, coverage, reason, roundtrip
-from barpc.fit.few import BETTER, NOISY, WHOLE, fit_few
-from barpc.fit.methods import FitSolution, normalization, solve
+from barpc.fit.methods import FitSolution, solve
 from barpc.fit.points import (
     NEGLIGIBLE_FIT_ERROR,
     Errors,
     Sample,
-    checked_points,
     column_ranges,
     control_points,
     screened,
     widened,
 )
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO
-from barpc.fit.system import FitProblem
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import nodes_of
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
-from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 
 _ABOUT = 1.1  # times the error
@@ -97,15 +92,15 @@ def _fit_model(
         solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
         errors = sample.errors(solution.rpc)
-        return replace(_certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
+        return replace(certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
-        fit = _best_method(attempt, options, False, exact=True)
+        fit = best_method(attempt, options, False, exact=True)
         if isinstance(model, Splined | Calibrated):
             fit = _plainer(fit, attempt("ridge", model.sensor))
         if not float(fit.max_ckp.max()) <= options.tolerance:
             fit = replace(fit, reason=reason(fit.rpc, sample))
-        return _accepted(fit, options, strict and not isinstance(model, Splined | Calibrated))
+        return accepted(fit, options, strict and not isinstance(model, Splined | Calibrated))
     except FitError as error:
         advice = getattr(model, "advice", "")  # of a model that knows why
         raise FitError("; ".join(filter(None, (str(error), advice)))) from error
@@ -157,150 +152,6 @@ def _points_for_method(
     return ground, image
 
 
-def fit_rpc_points(
-    ground: npt.ArrayLike,
-    image: npt.ArrayLike,
-    *,
-    sigma: npt.ArrayLike | None = None,
-    check: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
-    size: tuple[int, int] | None = None,
-    options: FitOptions | None = None,
-    strict: bool = True,
-) -> RpcFit:
-    """Fit an RPC to given correspondences: GCPs, tables, exported grids.
-
-    Parameters
-    ----------
-    ground : (N, 3), lon, lat [deg], alt [m above the ellipsoid]; all at one altitude give an RPC for that altitude only
-    image : (N, 2), col, row [px]
-    sigma : (N,), optional, relative standard deviations of the image points; else equal
-    check : (ground, image), optional
-        Check points (M, 3) and (M, 2). Without them the certificate holds leave-one-out residuals.
-    size : (width, height), optional, image whose coverage is stated [px]; else the points' own extent
-    options : FitOptions, optional
-        Solver, tolerance. Points that are noisy want a ``tolerance`` of three or four times their noise.
-    strict : bool, as for `fit_rpc`
-
-    Returns
-    -------
-    RpcFit, the RPC and its certificate
-
-    Raises
-    ------
-    FitError
-        Fewer than four points, not finite, out of range, in a plane, a grid of exchanged axes; or the tolerance is not
-        reached. Of fewer than 40 the largest model that they carry is taken (`RpcFit.few`), of fewer than 400 the
-        better one.
-
-    Warns
-    -----
-    BarpcWarning : the points show the ground mirrored
-
-    Examples
-    --------
-    >>> rng, rpc = np.random.default_rng(0), barpc.read_rpc("data_samples/view_00.tif")
-    >>> image = rng.uniform(0, 1000, (400, 2))
-    >>> ground = rpc.localize(image, rng.uniform(0, 400, 400))
-    >>> bool(barpc.fit_rpc_points(ground, image).max_ckp.max() < 1e-3)
-    True
-    """
-    options, given = options or FitOptions(), _looked_at(ground, image)
-    axes, weight = wrong_axes_of_grid(*given), relative_weight(sigma, len(given[0]))
-    held_out = None if check is None else checked_points(*check)
-
-    if len(given[0]) < WHOLE:
-        return _accepted(_few_points(given, weight, held_out, size, options), options, strict)
-
-    def attempt(method: str) -> RpcFit:
-        solution = solve(*given, options, method, weight=weight)
-        return replace(_certified_on_points(solution, held_out, size), axes=axes)
-
-    fit = _best_method(attempt, options, strict and len(given[0]) >= NOISY, exact=False)
-    if len(given[0]) < NOISY and options.method == "auto":
-        small = replace(_few_points(given, weight, held_out, size, options), axes=axes, few="")
-        smaller = float(np.linalg.norm(small.rmse_ckp)) < BETTER * float(np.linalg.norm(fit.rmse_ckp))
-        fit = _accepted(small if smaller else fit, options, strict)
-    return fit
-
-
-def _few_points(
-    given: tuple[Array, Array],
-    weight: Array | None,
-    held_out: tuple[Array, Array] | None,
-    size: tuple[int, int] | None,
-    options: FitOptions,
-) -> RpcFit:
-    """Return the fit of the largest model that some points, too few for an RPC, carry."""
-    (ground, image), norm = given, normalization(*given)
-    place = (ground - norm.ground_offset) / norm.ground_scale
-    found = fit_few(place, (image - norm.image_offset) / norm.image_scale, weight)
-    problem = FitProblem(ground, image, norm, weight=weight, margin=options.pole_margin)
-    solution = FitSolution(found.coeffs, problem, [], np.zeros(2), 1, found.model.name)
-    left_out = found.left_out * norm.image_scale
-    fit = _certified_on_points(solution, held_out, size, [left_out])
-    error = np.sqrt((left_out**2).sum(axis=1).mean())
-    few = (
-        f"{len(ground)} points carry {found.model.name}, which misses points left out by {error:.3g} px (RMS): "
-        f"give {WHOLE} or more for a whole RPC"
-    )
-    return replace(fit, few=few)
-
-
-def _certified_on_points(
-    solution: FitSolution,
-    held_out: tuple[Array, Array] | None,
-    size: tuple[int, int] | None,
-    left_out: Iterable[Array] | None = None,
-) -> RpcFit:
-    """Return a fit to given points with its certificate, on check points or on each point, left out (N, 2) [px].
-
-    Its RPC is limited to the altitudes of the points.
-    """
-    ground, image, errors = solution.problem.ground, solution.problem.image, Errors()
-    if held_out is not None:
-        errors.add(solution.rpc.project(held_out[0]) - held_out[1])
-    if held_out is None:
-        for residual in solution.leave_one_out() if left_out is None else left_out:
-            errors.add(residual)
-    loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
-    fit = _certified(solution, errors, errors.largest, loop, size)
-    rpc = _limited_to_altitudes(fit.rpc, ground[:, 2])
-    return replace(fit, rpc=rpc, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
-
-
-def _limited_to_altitudes(rpc: RPC, alt: Array) -> RPC:
-    """Return the same RPC, stated for no other altitudes than those of points (N,) [m], and a metre at least."""
-    scale = rpc.ground_scale.copy()
-    scale[2] = max(float(f"{0.5 * np.ptp(alt):.12g}"), 1.0)
-    powers = monomials(np.array([[1.0], [1.0], [scale[2] / rpc.ground_scale[2]]]))[:, 0]
-    return replace(rpc, coeffs=rpc.coeffs * powers, ground_scale=scale)
-
-
-def _height_unknown(ground: Array, image: Array, rmse: float) -> float:
-    """Return the uncertainty [px] of the shift by 100 m of altitude, from points with residuals `rmse` [px].
-
-    The slope of col or row by altitude is known by the altitudes that longitude and latitude do not tell (of a surface
-    its relief, less a cubic). Of none of these all is open: 100 m are as much aside under 45 degrees.
-    """
-    (low, high), some = column_ranges(ground), ground[:: max(1, len(ground) // CHUNK)]
-    place = monomials(((some - 0.5 * (low + high)) / np.maximum(0.5 * (high - low), 1e-9)).T)
-    flat = place[[0, 1, 2, 4, 7, 8, 11, 12, 14, 15]].T  # the terms without altitude
-    rest = some[:, 2] - flat @ np.linalg.lstsq(flat, some[:, 2], rcond=None)[0]
-    scatter = float(np.linalg.norm(rest)) * (len(ground) / len(some)) ** 0.5
-    metres = np.ptp(ground[:, :2], axis=0) * metres_per_unit(0.5 * (low + high))[:2]
-    pixels = float(np.linalg.norm(np.ptp(image, axis=0)) / np.linalg.norm(metres))
-    return float(100.0 * min(rmse / max(scatter, 1e-12), pixels))
-
-
-def _looked_at(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return given points, screened; where they show the ground mirrored that is warned of."""
-    ground, image, mirrored = screened(ground, image)
-    if mirrored:
-        message = "points: they show the ground mirrored: the image is, or two of lon, lat or of col, row are exchanged"
-        warnings.warn(message, BarpcWarning, stacklevel=3)
-    return ground, image
-
-
 def innermost(model: object) -> object:
     """Return the camera that a model's corrections stand in front of, or itself."""
     while (inner := getattr(model, "sensor", None)) is not None:
@@ -308,20 +159,7 @@ def innermost(model: object) -> object:
     return model
 
 
-def relative_weight(sigma: npt.ArrayLike | None, count: int) -> Array | None:
-    """Return the weights (count,) of standard deviations (count,), 1 for the smallest; None for none."""
-    if sigma is None:
-        return None
-    value = np.asarray(sigma, dtype=np.float64)
-    if value.shape != (count,) or not (np.isfinite(value).all() and (value > 0).all()):
-        raise FitError(f"sigma: expected {count} positive numbers")
-    weight = value.min() / value
-    if not (weight > np.finfo(float).eps).all():
-        raise FitError(f"sigma: from {value.min():g} to {value.max():g}, too far apart for one fit")
-    return np.asarray(weight)
-
-
-def _certified(
+def certified(
     solution: FitSolution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None, beyond: float = 1.0
 ) -> RpcFit:
     """Return the fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
@@ -350,20 +188,20 @@ def _certified(
     )
 
 
-def _accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
+def accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
     """Return the fit; FitError where `strict` and something is wrong with it."""
     if strict and (wrong := fit.verdict(options.tolerance)):
         raise FitError(wrong)
     return fit
 
 
-def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: bool, exact: bool) -> RpcFit:
+def best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: bool, exact: bool) -> RpcFit:
     """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
     Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
     """
     if options.method != "auto":
-        return _accepted(attempt(str(options.method)), options, strict)
+        return accepted(attempt(str(options.method)), options, strict)
     fits = [attempt("ridge")]
     if exact and not float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR:
         fits.append(attempt("gauss-newton"))
@@ -372,7 +210,7 @@ def _best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: 
         (bool(said), not fit.min_denominator >= MIN_DENOMINATOR_RATIO, float(np.linalg.norm(fit.rmse_ckp)))
         for said, fit in zip(wrong, fits, strict=True)
     ]
-    return _accepted(fits[rank.index(min(rank))], options, strict)
+    return accepted(fits[rank.index(min(rank))], options, strict)
 
 
 # --- axes of a model ------------------------------------------------------------------------------------

@@ -200,6 +200,13 @@ class Earlier:
         return moved_px(before, grown, ecef_from_ground(places), np.array(side))
 
 
+@dataclass(frozen=True, eq=False)
+class GrowingRun(Run):
+    """A run, which may add images to a finished one."""
+
+    earlier: Earlier | None = None
+
+
 def _sha(inputs: Mapping[str, Input], path: str) -> str:
     return inputs[path].sha256 if path in inputs else ""
 
@@ -336,7 +343,9 @@ def of_new(tracks: Tracks, is_old: BoolArray) -> Tracks:
 # --- what the next run needs ------------------------------------------------------------------------------
 
 
-def images_table(run: Run, given: Sequence[Image], inputs: Mapping[str, Input], folder: Path, block: BlockPrior) -> str:
+def images_table(
+    run: GrowingRun, given: Sequence[Image], inputs: Mapping[str, Input], folder: Path, block: BlockPrior
+) -> str:
     """Return the text of `tables/images.json`: the images of a block, those of an earlier run behind it too."""
     assert run.adjustment is not None
     hosts = run.options.allow_remote
@@ -386,10 +395,11 @@ def _contradicted(run: Run, floor: float) -> tuple[str, float, float] | None:
     return (run.adjustment.names[most], float(held[most]), float(free[most])) if worse[most] > floor else None
 
 
-def movers(run: Run, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]) -> CorrectedViews:
+def movers(
+    run: Run, earlier: Earlier, grown: BlockPrior, done: Collection[str], hosts: Sequence[str]
+) -> CorrectedViews:
     """Return the images that move beside those `done`, as `Earlier.corrected` does."""
     assert run.added is not None
-    earlier: Earlier = run.earlier
     wanted = [earlier.images[earlier.number[name]] for name, _ in run.added.beyond if name not in done]
     there = _still_there(wanted, earlier)
     return earlier.corrected(there, grown, hosts) if there else ([], (), ())

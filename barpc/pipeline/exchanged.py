@@ -13,10 +13,11 @@ from itertools import combinations, permutations
 import numpy as np
 
 from barpc.base.errors import listed
+from barpc.base.geodesy import CHUNK
 from barpc.base.statistics import robust_spread
 from barpc.report.outcome import PairTies, pair_ties
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import convergence_angle, epipolar_offset
+from barpc.sensor.geometry import Several, convergence_angle, epipolar_offset
 
 _SCATTER = 0.1  # px across epipolar lines: less does not matter
 _FEWER = 5.0  # times less scatter with the cameras exchanged: 10 to 360 of three public sets, 1 of right cameras
@@ -49,10 +50,10 @@ class Exchange:
 
 def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
     """Return the exchange of cameras that brings the matches of views to their epipolar lines; None without one."""
-    pairs = [ties for ties in pair_ties(tracks) if _converges(views, ties)]
-    measured = [(ties, _scatter(views, tracks, ties, ties.views)) for ties in pairs]
-    measured = [(ties, scatter) for ties, scatter in measured if np.isfinite(scatter)]  # others have too few matches
-    pairs, as_given = [ties for ties, _ in measured], [scatter for _, scatter in measured]
+    pairs = _converging(views, pair_ties(tracks))
+    measured = zip(pairs, _scatters(views, tracks, pairs, [ties.views for ties in pairs]), strict=True)
+    known = [(ties, scatter) for ties, scatter in measured if np.isfinite(scatter)]  # others have too few matches
+    pairs, as_given = [ties for ties, _ in known], [scatter for _, scatter in known]
     worst = sorted((k for k in range(len(pairs)) if as_given[k] > _SCATTER), key=lambda k: -as_given[k])
     suspects = sorted([*dict.fromkeys(view for k in worst for view in pairs[k].views)][:_MOST_TRIED])
     orders = [[*both][::-1] for both in combinations(suspects, 2)]
@@ -69,7 +70,7 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
         after = []
         for k in met:  # the first pair that gains nothing ends most trials
             i, j = pairs[k].views
-            after.append(_scatter(views, tracks, pairs[k], (moved.get(i, i), moved.get(j, j))))
+            after += _scatters(views, tracks, [pairs[k]], [(moved.get(i, i), moved.get(j, j))])
             if not _FEWER * after[-1] < min(max(as_given[k], _SCATTER), _FEWER * _MOST_LEFT):
                 break
         else:
@@ -79,21 +80,37 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
     return best
 
 
-def _converges(views: Sequence[View], ties: PairTies) -> bool:
-    """Return whether the rays of two views meet at an angle that tells epipolar lines."""
-    first, second = (views[view] for view in ties.views)
-    at = first.sensor.localize((np.array(first.size) - 1.0) / 2.0, np.array(first.altitude))
-    return bool(convergence_angle(first.sensor, second.sensor, at) > _LEAST_ANGLE)
+def _converging(views: Sequence[View], pairs: list[PairTies]) -> list[PairTies]:
+    """Return the pairs of views whose rays meet at an angle that tells epipolar lines."""
+    sensors, ends = [view.sensor for view in views], np.array([ties.views for ties in pairs], np.int64).reshape(-1, 2)
+    middle = np.array([(np.array(view.size) - 1.0) / 2.0 for view in views])
+    altitude = np.array([view.altitude for view in views])
+    first, second = (Several(sensors, end) for end in ends.T)
+    angle = convergence_angle(first, second, first.localize(middle[ends[:, 0]], altitude[ends[:, 0]]))
+    return [pairs[k] for k in np.flatnonzero(angle > _LEAST_ANGLE)]
 
 
-def _scatter(views: Sequence[View], tracks: Tracks, ties: PairTies, cameras: tuple[int, int]) -> float:
-    """Return the robust scatter of a pair's matches across epipolar lines through cameras of some views [px].
+def _scatters(
+    views: Sequence[View], tracks: Tracks, pairs: Sequence[PairTies], cameras: Sequence[tuple[int, int]]
+) -> list[float]:
+    """Return the robust scatter of pairs' matches across epipolar lines through cameras of some views [px].
 
     Infinite where too few matches have a line.
     """
-    rows = np.unique(np.linspace(0, len(ties.a) - 1, min(len(ties.a), _MATCHES)).astype(np.int64))
-    first, second = (views[camera] for camera in cameras)
-    seen = tracks.xy[ties.a[rows]], tracks.xy[ties.b[rows]]
-    offset, _ = epipolar_offset(first.sensor, second.sensor, *seen, first.altitude)
-    offset = offset[np.isfinite(offset)]
-    return float(robust_spread(offset - np.median(offset))) if len(offset) >= _MATCHES // 10 else np.inf
+    sensors, found = [view.sensor for view in views], list[float]()
+    for first in range(0, len(pairs), CHUNK // _MATCHES):
+        some = slice(first, first + CHUNK // _MATCHES)
+        rows = [np.unique(np.linspace(0, len(t.a) - 1, min(len(t.a), _MATCHES)).astype(np.int64)) for t in pairs[some]]
+        a, b = (
+            np.concatenate([getattr(ties, of)[row] for ties, row in zip(pairs[some], rows, strict=True)])
+            for of in ("a", "b")
+        )
+        counts = [len(row) for row in rows]
+        left, right = np.repeat(np.array(cameras[some]), counts, axis=0).T
+        height = np.array([view.altitude for view in views])[left]
+        offset, _ = epipolar_offset(Several(sensors, left), Several(sensors, right), tracks.xy[a], tracks.xy[b], height)
+        for one in np.split(offset, np.cumsum(counts)[:-1]):
+            one = one[np.isfinite(one)]
+            many = len(one) >= _MATCHES // 10
+            found.append(float(robust_spread(one - np.median(one))) if many else np.inf)
+    return found

@@ -54,24 +54,15 @@ def side_inputs(options: RunOptions, views: Sequence[View]) -> Dem | None:
     dem = Dem.open(options.dem, options.geoid, options.heights) if options.dem else None
     for paths in (options.gcp, options.check_points):
         points = load_gcps(paths, views, options, dem)
-        for line in () if points is None else (*points.said, *points.left_out):
+        for line in () if points is None else points.said:
             logger.warning("%s", line)
     load_altimetry(options.altimetry, views, options.heights)
     for path in options.reference:
         Sheet.read(path)
     if dem is not None:
-        _require_cover(dem, ", ".join(options.dem), views)
+        outlines = [footprint(view.sensor, view.size, view.altitude) for view in views]
+        dem.covering(*np.concatenate(outlines).T)
     return dem
-
-
-def _require_cover(dem: Dem, path: str, views: Sequence[View]) -> None:
-    """Raise unless the terrain is known somewhere along the outlines of the views."""
-    rings = [footprint(view.sensor, view.size, view.altitude) for view in views]
-    lon, lat = np.concatenate(rings).T
-    if np.isnan(dem(lon, lat)).all():
-        raise InputError(
-            f"{path}: has no height at the images' position ({lon[0]:.4f}, {lat[0]:.4f}); check for another tile"
-        )
 
 
 def with_located(options: RunOptions) -> RunOptions:
@@ -336,11 +327,12 @@ def _with_altitudes(
         given = options.adjust.dem_bias_sigma or (KNOWN_BIAS if dem.known else DEM_BIAS)
         # what all heights of a DEM are wrong by does not average
         sigma[known, 2] = np.hypot(options.adjust.dem_sigma, given * np.sqrt(max(known.sum(), 1)))
-        logger.warning("%s: the DEM's are taken for %d of them", what, known.sum())
+        points = replace(points, said=(*points.said, f"{what}: the DEM's are taken for {known.sum()} of them"))
         unknown &= ~known
     low, high = min(view.alt_range[0] for view in views), max(view.alt_range[1] for view in views)
     ground[unknown, 2], sigma[unknown, 2] = 0.5 * (low + high), (high - low) * np.sqrt(max(unknown.sum(), 1))
-    said = f"{what}: {int(unknown.sum())} constrain the images horizontally only; give their altitudes, or --dem"
+    many = " and" if unknown.sum() == count else f"; {int(unknown.sum())} of them"
+    said = f"{what}{many} constrain the images horizontally only: give their altitudes, or --dem"
     return replace(points, lonlatalt=ground, sigma=sigma), [said] if unknown.any() else []
 
 

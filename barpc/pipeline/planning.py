@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from barpc.base.options import RunOptions
 from barpc.pipeline.inputs import load_altimetry, load_gcps
 from barpc.rasters.dem import Dem
 from barpc.report import Run
+from barpc.scene import GroundPoints
 from barpc.tie.matchers import features
 from barpc.tie.pairing.overlaps import Pair
 
@@ -66,23 +67,23 @@ def planned(run: Run, options: RunOptions, dem: Dem | None, pairs: Sequence[Pair
     slow = _START + _VIEW * len(names)
     if pairs:
         slow += _MEGAPIXEL * float(area.sum()) + _PAIR * len(pairs) + _PAIR_MEGAPIXEL * matched
+    points = [load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points)]
     return Plan(
         tuple(names),
         tuple((names[p.views[0]], names[p.views[1]], p.overlap, p.angle) for p in pairs),
         (slow / _FASTER, slow),
         _PROCESS_MB * processes + _VIEW_MB * len(names),
-        tuple(_datum_lines(run, options, dem)),
-        tuple(_doubt_lines(run)),
+        tuple(_datum_lines(run, options, dem, points[0])),
+        tuple(_doubt_lines(run, points)),
     )
 
 
-def _datum_lines(run: Run, options: RunOptions, dem: Dem | None) -> Iterator[str]:
+def _datum_lines(run: Run, options: RunOptions, dem: Dem | None, gcps: GroundPoints | None) -> Iterator[str]:
     """Yield the constraints on the scene's position, and the datums assumed for heights, in sentences."""
     if not (options.gcp or options.reference or options.add_to):
         holds = "the cameras as delivered" + (" and the DEM" if dem is not None else "")
         yield f"The scene's position is that of {holds}: no ground control."
     found = list[HeightDatum]()
-    gcps = load_gcps(options.gcp, run.views, options, dem)
     for given in (gcps, load_altimetry(options.altimetry, run.views, options.heights)):
         found += [] if given is None else given.datums
     if dem is not None:
@@ -98,8 +99,9 @@ def _datum_lines(run: Run, options: RunOptions, dem: Dem | None) -> Iterator[str
         yield f"Heights without a datum of their own count from {given_datum}, as given."
 
 
-def _doubt_lines(run: Run) -> Iterator[str]:
-    """Yield the doubts on images and cameras, in sentences."""
+def _doubt_lines(run: Run, points: Iterable[GroundPoints | None]) -> Iterator[str]:
+    """Yield the doubts on images, cameras and ground points, in sentences."""
+    yield from (line for given in points if given is not None for line in given.left_out)
     for view, source in zip(run.views, run.sources, strict=True):
         yield from (f"{view.name}: {doubt.sentence}" for doubt in source.doubts)
     for path, reason in run.left_out:

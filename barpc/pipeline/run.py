@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,13 +15,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from barpc.ba import Adjustment, BlockPrior, adjust_tracks, block_prior, consistent_observations, passes_told
-from barpc.ba.constraints.ground import DEM_BIAS, KNOWN_BIAS
-from barpc.base.blas import one_blas_thread
-from barpc.base.errors import BarpcError, BarpcWarning, DisconnectedError, FitError, InputError, TiePointError
-from barpc.base.geodesy import feature_collection, ground_from_ecef
+from barpc.ba import Adjustment, BlockPrior, block_prior
+from barpc.base.errors import BarpcWarning, FitError, InputError
+from barpc.base.geodesy import feature_collection
 from barpc.base.identity import Input, Stamp, ask, guarded, recorded
-from barpc.base.options import AdjustOptions, FitOptions, RunOptions, file_options
+from barpc.base.options import FitOptions, RunOptions, file_options
+from barpc.base.process import one_blas_thread
 from barpc.base.remote import here
 from barpc.base.safe_io import plain_path
 from barpc.base.sealed import portable
@@ -29,46 +28,34 @@ from barpc.base.tasks import Progress, Work
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.acquisitions import one_each
-from barpc.pipeline.calibrate import calibrated, calibrations_of, common_errors, refuse_strange
-from barpc.pipeline.earlier import Earlier, added, chosen_pairs, images_table, join_earlier, movers, of_new
-from barpc.pipeline.exchanged import exchanged_cameras
+from barpc.pipeline.adjusting import agreeing, scope_of, tied_and_adjusted, with_own_cameras, with_ties
+from barpc.pipeline.calibrate import calibrated, calibrations_of
+from barpc.pipeline.earlier import Earlier, GrowingRun, added, images_table, join_earlier, movers
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
 from barpc.pipeline.inputs import (
-    given_matches,
-    given_tracks,
     hash_inputs,
     input_files,
-    load_altimetry,
-    load_gcps,
-    read_pairs,
-    reference_names,
     side_inputs,
     with_located,
 )
 from barpc.pipeline.loading import Image, image_path, load_views
-from barpc.pipeline.outputs import MATCH_FILES, output_names, refuse_shadows, write_tables, write_views
+from barpc.pipeline.outputs import output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures
 from barpc.pipeline.planning import Plan, planned
 from barpc.pipeline.results import RunResult
 from barpc.pipeline.verify_outputs import unverified
-from barpc.pointio.matches import asp_text, write_matches
-from barpc.pointio.names import pair_name, require_pair_names
-from barpc.rasters.dem import Dem
+from barpc.pointio.names import require_pair_names
 from barpc.report import Run, Summary, summarize
-from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.report.page import REPORT_STAGE
 from barpc.report.runfiles import FOLDER, IMAGES, PRIOR_FILE
 from barpc.report.summary import InputEntry, StageEntry
 from barpc.report.tables import outline_features
 from barpc.rpcio import local_image
-from barpc.scene import BoolArray, Reference, Tracks, View
+from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, camera_centers
 from barpc.sensor.rpc import RPC
-from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.pairing.overlaps import Pair, best_pairs, possible_pairs
-from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.workspace import Workspace, timed
 
 logger = logging.getLogger(__name__)
@@ -142,7 +129,7 @@ def adjust(
                 run.earlier.refuse_changed(run, inputs)
         with CachingExecutor(workspace, inputs, executor) as caching:
             with guarded(inputs.values()):
-                run = _tied_and_adjusted(run, options, given, workspace, Work(caching, progress))
+                run = tied_and_adjusted(run, given, workspace, Work(caching, progress))
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
                     run = _fitted(run, options, Work(caching, progress))
@@ -162,7 +149,7 @@ def adjust(
 
 
 def _summed_up(
-    run: Run, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
+    run: GrowingRun, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
 ) -> Summary:
     """Write the block for later runs, summary, tables and report: the same bytes in any folder, at any time."""
     progress = work.progress
@@ -181,22 +168,22 @@ def _summed_up(
 
 
 def _with_block(
-    run: Run, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
-) -> Run:
+    run: GrowingRun, images: Sequence[Image], inputs: Mapping[str, Input], workspace: Workspace, work: Work
+) -> GrowingRun:
     """Write the block and the list of its images, and with `update` the cameras that move; return what that says."""
     assert run.adjustment is not None
-    options = run.options
+    options, earlier = run.options, run.earlier
     with _stage_progress(workspace, "block", work.progress):
         block = block_prior(run.joint or run.adjustment)
-        if run.earlier is not None:
-            run = replace(run, added=added(run, run.earlier, block, options.adjust.noise_floor))
-            block = _as_written(run, block)
+        if earlier is not None:
+            run = replace(run, added=added(run, earlier, block, options.adjust.noise_floor))
+            block = _as_written(run, earlier.prior, block)
         with workspace.output(f"{FOLDER}/{PRIOR_FILE}") as partial:
             block.save(partial)
         text = images_table(run, images, inputs, workspace.folder, block)
         workspace.write_text(f"{FOLDER}/{IMAGES}", text)
-    if run.earlier is not None and options.update and options.stop_after == "all":
-        views, sensors, sources = movers(run, block, {view.name for view in run.views}, options.allow_remote)
+    if earlier is not None and options.update and options.stop_after == "all":
+        views, sensors, sources = movers(run, earlier, block, {view.name for view in run.views}, options.allow_remote)
         used = calibrations_of(options.calibration, views, sources, some=True)
         sensors = calibrated(sensors, [used.get(view.name) for view in views])
         assert run.adjustment is not None
@@ -208,11 +195,11 @@ def _with_block(
     return run
 
 
-def _as_written(run: Run, block: BlockPrior) -> BlockPrior:
+def _as_written(run: Run, prior: BlockPrior, block: BlockPrior) -> BlockPrior:
     """Return a block that has grown out of an earlier one with the unknowns of the cameras that are written."""
     assert run.adjustment is not None
     assert run.added is not None
-    prior, number = run.earlier.prior, {name: i for i, name in enumerate(block.names)}
+    number = {name: i for i, name in enumerate(block.names)}
     moved = {name for name, _ in run.added.beyond} if run.joint is None else set()
     written = block.params.copy()
     for name, before in zip(prior.names, prior.as_written, strict=True):
@@ -230,7 +217,7 @@ def _entries(inputs: Iterable[Input], folder: Path) -> tuple[InputEntry, ...]:
     return tuple(InputEntry(path, one.size, one.sha256) for path, one in sorted(files.items()))
 
 
-def _portable_run(run: Run, folder: Path) -> Run:
+def _portable_run(run: GrowingRun, folder: Path) -> GrowingRun:
     """Return the run with every path relative to its folder, and without `overwrite`."""
 
     def at(path: Any) -> Any:
@@ -254,24 +241,6 @@ def _report_progress(progress: Progress | None, stage: str, done: int) -> None:
 
 
 @contextmanager
-def _passes(progress: Progress | None) -> Iterator[None]:
-    """Report the passes of an adjustment: their total, which residuals decide, is 0 until its end."""
-    last = 0
-
-    def tell(number: int) -> None:
-        nonlocal last
-        last = number
-        if progress is not None:
-            progress("adjustment", number, 0)
-
-    tell(0)
-    with passes_told(tell):
-        yield
-    if progress is not None:
-        progress("adjustment", last, last)
-
-
-@contextmanager
 def _stage_progress(workspace: Workspace, stage: str, progress: Progress | None) -> Iterator[None]:
     """Report the progress of a stage of one task."""
     _report_progress(progress, stage, 0)
@@ -292,8 +261,8 @@ def check(
     Parameters and errors are those of `adjust`, without a folder; the result has no adjustment.
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
-    run = _with_own_cameras(_with_ties(_with_views("check", images, options, work), options, work), options, work)
-    if (found := _agreeing(run, options.adjust)) is not None:
+    run = with_own_cameras(with_ties(_with_views("check", images, options, work), work), work)
+    if (found := agreeing(run, options.adjust)) is not None:
         run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
@@ -315,25 +284,10 @@ def plan(
         Workspace.require_free(out_dir, options.overwrite, keep, names)
     dem, pairs = side_inputs(options, run.views), list[Pair]()
     if len(run.views) > 1 and not options.matches_only:
-        scope = _scope(run, options, dem)
+        scope = scope_of(run, dem)
         pairs = possible_pairs(run.views, options.tie, scope)
         pairs = pairs if scope.only else best_pairs(pairs, len(run.views), options.tie.neighbours)
     return planned(run, options, dem, pairs, processes)
-
-
-def _agreeing(run: Run, options: AdjustOptions) -> BoolArray | None:
-    """Return the observations (K,) of a check without those that an adjustment would cut; None for all of them.
-
-    Where it would cut many of an image these are no wrong matches: the cameras disagree.
-    """
-    if len(run.views) < 2 or not len(run.tracks):
-        return None
-    try:
-        found = consistent_observations(run.views, run.tracks, options)
-    except BarpcError:  # too few
-        return None
-    total, kept = (np.bincount(run.tracks.view, rows, len(run.views)) for rows in (None, found))
-    return found if (kept >= (1.0 - MANY_REJECTED) * total).all() else None
 
 
 def _as_given(views: Iterable[View], images: Sequence[Image], options: RunOptions) -> tuple[View, ...]:
@@ -348,7 +302,7 @@ def _with_views(
     options: RunOptions,
     work: Work,
     workers: list[float] | None = None,
-) -> Run:
+) -> GrowingRun:
     """Return the run with its views; CPU seconds of other processes go to `workers`."""
     for path in input_files(options):
         plain_path(path)
@@ -367,7 +321,9 @@ def _with_views(
     if workers is not None:
         workers.append(loaded.worker_seconds)
     none = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
-    run = Run(kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier)
+    run = GrowingRun(
+        kind, loaded.views, loaded.sources, none, left_out=loaded.left_out, options=options, earlier=earlier
+    )
     of_run = frozenset(earlier.number if earlier else ())
     kept, carried = one_each(run.views, run.sources, options.tie.band, of_run)
     run = replace(
@@ -411,214 +367,7 @@ def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[st
     return names, keep
 
 
-def _tied_and_adjusted(run: Run, options: RunOptions, dem: Dem | None, workspace: Workspace, work: Work) -> Run:
-    with workspace.stage("tie points"):
-        run = _with_own_cameras(_with_ties(run, options, work, dem), options, work, dem)
-    if options.stop_after == "matching":
-        _write_asp_matches(run, workspace)
-        return replace(run, kind="match")
-    if run.earlier is not None:
-        run = _met(run, options)
-    if dem is not None and options.reference:
-        with workspace.stage("reference"):
-            run = replace(run, reference=_register_to_reference(run, options, dem, work))
-    with workspace.stage("adjustment"), _passes(work.progress):
-        return _with_adjustment(run, options, dem)
-
-
-def _met(run: Run, options: RunOptions) -> Run:
-    """Return the run with the tie points of its new images, and those of the earlier ones that have some.
-
-    The others stay as the earlier run has them, but for what control is given of them.
-    """
-    old, tracks = _is_old(run), of_new(run.tracks, _is_old(run))
-    tied = np.bincount(tracks.view, minlength=len(run.views)) > 0
-    leads = {one.lead for one in run.carried}
-    keep = ~old | tied | bool(options.gcp or options.reference) | np.array([v.name in leads for v in run.views])
-    if not (old & keep).any():
-        raise TiePointError(
-            f"no tie point of the images given is seen in one of {run.earlier.folder}: look at the images (clouds? "
-            "dates?), or give matches (--matches)"
-        )
-    place = np.cumsum(keep) - 1
-    kept = [i for i in range(len(keep)) if keep[i]]
-    return replace(
-        run,
-        views=tuple(run.views[i] for i in kept),
-        sources=tuple(run.sources[i] for i in kept),
-        tracks=replace(tracks, view=place[tracks.view]),
-    )
-
-
-def _is_old(run: Run) -> BoolArray:
-    """Return which views (N,) are images of the earlier run; none without one."""
-    known = () if run.earlier is None else run.earlier.number
-    return np.array([view.name in known for view in run.views], dtype=bool)
-
-
-def _register_to_reference(run: Run, options: RunOptions, dem: Dem, work: Work) -> ReferenceControl:
-    """Register the views, with the cameras as delivered, to the reference."""
-    given = options.adjust.dem_bias_sigma
-    bias = (KNOWN_BIAS if dem.known else DEM_BIAS) if given is None else given
-    accuracy = Accuracy(options.reference_sigma, options.adjust.dem_sigma, bias)
-    return register_views(run.views, reference_names(options), dem, options.tie.band, accuracy, work)
-
-
-def _with_adjustment(run: Run, options: RunOptions, dem: Dem | None) -> Run:
-    """Return the run with an adjustment and its inputs."""
-    gcps, checks = (load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points))
-    centers = _centers(run.views, options.adjust.center)
-    if run.reference is not None and run.reference.control is None and not len(run.tracks) and gcps is None:
-        raise TiePointError(
-            f"{', '.join(options.reference)}: the reference {run.reference.refusal}, and nothing else constrains "
-            "the images: check its position and the DEM's, or use a finer one"
-        )
-    altimetry = load_altimetry(options.altimetry, run.views, options.heights)
-
-    def solved(options: AdjustOptions, prior: BlockPrior | None) -> Adjustment:
-        return adjust_tracks(
-            run.views,
-            replace(run.tracks, xy=run.undistorted(run.tracks.view, run.tracks.xy)),
-            options,
-            None if gcps is None else replace(gcps, xy=run.undistorted(gcps.view, gcps.xy)),
-            dem,
-            centers=np.array([center.ecef for center in centers]),
-            prior=prior,
-            known=None if prior is None else np.ones(len(run.tracks), dtype=bool),  # at best some are new
-            reference=_undistorted_reference(run),
-            altimetry=altimetry,
-            keep_largest=keep_going,
-            common=common_errors(run),
-        )
-
-    chosen, keep_going = _with_rounding(run, options.adjust), options.keep_going
-    adjustment = solved(chosen, None if run.earlier is None else run.earlier.prior)
-    if run.earlier is not None and not options.update:
-        run, adjustment = _with_earlier_held(run, adjustment, chosen, solved)
-    refuse_strange(run, adjustment)
-    ground = [ground_from_ecef(adjustment.points)]  # none without tie points
-    control = None if run.reference is None else run.reference.control
-    ground += [one.lonlatalt for one in (gcps, None if control is None else control.points) if one is not None]
-    datums = [] if dem is None else [*dem.datums(np.concatenate(ground))]
-    datums += [one for given in (gcps, altimetry) if given is not None for one in given.datums]
-    return replace(run, centers=centers, gcps=gcps, check_points=checks, adjustment=adjustment, datums=tuple(datums))
-
-
-def _with_earlier_held(
-    run: Run, joint: Adjustment, options: AdjustOptions, solved: Callable[[AdjustOptions, BlockPrior], Adjustment]
-) -> tuple[Run, Adjustment]:
-    """Return the adjustment of new images to the cameras of the earlier run as they are written, and the run with the
-    one that moves them all.
-
-    The uncertainty of the scene's place and shape is that of the latter, as cameras that are held are not exact.
-    """
-    prior: BlockPrior = run.earlier.prior
-    old = {*run.earlier.number}
-    fixed = tuple(dict.fromkeys((*options.fixed, *(view.name for view in run.views if view.name in old))))
-    held = solved(replace(options, fixed=fixed), replace(prior, params=prior.as_written))
-    gauge = replace(joint.gauge, shift=held.gauge.shift)
-    return replace(run, joint=joint), replace(held, gauge=gauge, datum=joint.datum, covariance=joint.covariance)
-
-
-def _undistorted_reference(run: Run) -> Reference | None:
-    control = None if run.reference is None else run.reference.control
-    if control is None or not run.calibrated:
-        return control
-    points = control.points
-    return replace(control, points=replace(points, xy=run.undistorted(points.view, points.xy)))
-
-
-def _with_rounding(run: Run, options: AdjustOptions) -> AdjustOptions:
-    """Return the options with the part of errors that does not average away as large as whole pixels leave it."""
-    if not run.whole_pixels.issuperset(view.name for view in run.views):
-        return options
-    return replace(options, noise_floor=max(options.noise_floor, WHOLE_PIXELS))
-
-
-def _with_ties(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:
-    """Return the run with tie points: from a file, or matched."""
-    views = run.views
-    if options.matches and options.matches_only:
-        return replace(run, tracks=given_tracks(options.matches, views))
-    if len(views) < 2:
-        return run
-    scope = _scope(run, options, terrain)
-    if options.matches:
-        scope = replace(scope, given=given_matches(options.matches, views, partly=bool(run.left_out)))
-    try:
-        ties = find_tracks(views, options.tie, scope, executor=work.executor, progress=work.progress)
-    except DisconnectedError as error:
-        groups = [group for group in error.groups if run.earlier is None or {*group} & {*run.earlier.number}]
-        if not options.keep_going or not groups or len(groups[0]) < 2:
-            raise
-        kept = _only(run, frozenset(groups[0]), error.said)
-        logger.warning("%d of %d images are tied together and kept", len(kept.views), len(views))
-        return _with_ties(kept, options, work, terrain)
-    detail = ties.detail if run.earlier is None else ()  # where the earlier run saw more, they lack on purpose
-    return replace(run, tracks=ties.tracks, matched=ties.pairs, detail=detail)
-
-
-def _scope(run: Run, options: RunOptions, terrain: Dem | None) -> Scope:
-    """Return the pairs and the area in which tie points are looked for."""
-    views, old = run.views, _is_old(run)
-    scope = Scope(terrain=terrain, joined=np.flatnonzero(old).tolist())
-    if options.overlap_list is not None:
-        scope = replace(scope, only=read_pairs(options.overlap_list, views, [path for path, _ in run.left_out]))
-    elif run.earlier is not None:
-        scope = replace(scope, only=chosen_pairs(views, old.tolist(), options.tie))
-    return scope if options.aoi is None else replace(scope, area=read_area(options.aoi))
-
-
-def _with_own_cameras(run: Run, options: RunOptions, work: Work, terrain: Dem | None = None) -> Run:
-    """Return the run; InputError where images fit each other's cameras, or with `keep_going` the run without them."""
-    found = exchanged_cameras(run.views, run.tracks)
-    if found is None:
-        return run
-    names = [view.name for view in run.views]
-    sentence = found.sentence(names)
-    others = frozenset(name for i, name in enumerate(names) if i not in found.views)
-    if not options.keep_going or len(others) < 2:
-        raise InputError(f"{sentence}: give each image its own RPC (IMAGE,camera=FILE)")
-    logger.warning("%s: left out", sentence)
-    kept = _only(run, others, {names[view]: sentence for view in found.views})
-    return _with_ties(kept, options, work, terrain)
-
-
-def _write_asp_matches(run: Run, workspace: Workspace) -> None:
-    names = [view.name for view in run.views]
-    for name in MATCH_FILES:
-        with workspace.output(name) as partial:
-            write_matches(partial, run.tracks, names)
-    for ties in pair_ties(run.tracks):
-        i, j = ties.views
-        text = asp_text(run.tracks.xy[ties.a], run.tracks.xy[ties.b])
-        workspace.write_text(f"asp/{pair_name(names[i], names[j])}.txt", text)
-
-
-def _only(run: Run, names: frozenset[str], said: Mapping[str, str]) -> Run:
-    """Return the loaded run without the views not tied to the main group."""
-    why = "it shares no tie points with the largest group of images"
-    dropped = tuple((view.path, said.get(view.name, why)) for view in run.views if view.name not in names)
-    kept = [i for i, view in enumerate(run.views) if view.name in names]
-    return replace(
-        run,
-        views=tuple(run.views[i] for i in kept),
-        sources=tuple(run.sources[i] for i in kept),
-        left_out=(*run.left_out, *dropped),
-        adjustment=None,
-        reference=None,
-    )
-
-
-def _centers(views: Sequence[View], how: Literal["line", "projective"]) -> tuple[CameraCenter, ...]:
-    found = camera_centers([v.sensor for v in views], [v.size for v in views], [v.alt_range for v in views], how)
-    for view, center in zip(views, found, strict=True):
-        if center.method == "nominal":
-            logger.warning("%s: its camera determines no projection centre; a nominal one is used", view.name)
-    return tuple(found)
-
-
-def _fitted(run: Run, options: RunOptions, work: Work) -> Run:
+def _fitted(run: GrowingRun, options: RunOptions, work: Work) -> GrowingRun:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
     number = run.number
@@ -672,7 +421,7 @@ def fit_group(
     return out
 
 
-def _written(run: Run, options: RunOptions, workspace: Workspace, work: Work) -> Run:
+def _written(run: GrowingRun, options: RunOptions, workspace: Workspace, work: Work) -> GrowingRun:
     """Write the refitted RPCs, and open them again."""
     assert run.adjustment is not None
     every = zip(run.views, run.fits, run.cameras, strict=True)

@@ -245,6 +245,16 @@ class Dem:
         height = self.grid.sample(lon, lat)
         return height if self.geoid is None else height + self.geoid.sample(lon, lat)
 
+    def covering(self, lon: Array, lat: Array) -> Array:
+        """Altitudes as of a call; InputError, which names the files, where none of the places has one."""
+        height = self(lon, lat)
+        if not len(lon) or np.isfinite(height).any():
+            return height
+        geoids = [part.geoid for part in self.parts if np.isfinite(part.grid.sample(lon, lat)).any()]
+        lacking = dict.fromkeys(os.fspath(one.path) for one in geoids or [part.grid for part in self.parts] if one)
+        place = f"({float(lon[0]):.4f}, {float(lat[0]):.4f})"
+        raise InputError(f"{', '.join(lacking)}: has no height at the images' position {place}; check for another tile")
+
     def _counted(self, lon: Array, lat: Array, joined: bool = True) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the altitude (n,) at lon, lat (n,) and the number of the DEM that counts there, -1: none.
 

@@ -1,7 +1,7 @@
 """Reading a VRT: a closed grammar of tags, attributes and text; what is not in it is refused.
 
 GDAL's own reader takes attributes for elements, tags in any case, and half-closed documents. So GDAL is never
-shown a VRT: what this module reads is all there is, and `barpc.rasters.raster` puts the pixels together.
+shown a VRT: what this module reads is all there is, and `barpc.rasters.mosaic` puts the pixels together.
 """
 
 from __future__ import annotations

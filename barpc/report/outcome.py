@@ -120,7 +120,6 @@ class Run:
     reference: ReferenceControl | None = None
     datums: tuple[HeightDatum, ...] = ()
     detail: tuple[IntArray, ...] = ()
-    earlier: Any = None  # the finished run that images are added to, as the pipeline has it
     unwritten: frozenset[str] = frozenset()  # names of its images whose cameras this run leaves as they are
     added: Added | None = None
     joint: Adjustment | None = None  # with the cameras of the earlier run free, where `adjustment` holds them
@@ -130,7 +129,7 @@ class Run:
     @property
     def known(self) -> frozenset[str]:
         """Names of the views that are images of an earlier run."""
-        held = getattr(self.adjustment, "earlier", None)
+        held = None if self.adjustment is None else self.adjustment.earlier
         return frozenset(() if held is None else held.names)
 
     @cached_property
@@ -194,8 +193,7 @@ class Run:
     def met_worse(self) -> list[ImageRegion]:
         """Rows, columns and cells of images with larger residuals of check tie points than in the rest."""
         found, tracks = self.adjustment, self.tracks
-        # plain least squares assumes no wrong tie point
-        if found is None or not found.held_out.any() or found.options.loss == "linear":
+        if found is None or not found.held_out.any():
             return []
         known = np.isfinite(found.held_out_noise)
         if found.apart is not None and found.apart.clear:

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from barpc.base.errors import visible
-from barpc.report import answers
+from barpc.base.errors import listed, visible
+from barpc.report.decisions import decisions
 from barpc.report.maps import doubted, ground_map, largest_miss, residual_panels, template
-from barpc.report.pictures import image_panels, length_bars, pair_strips, profile_charts
+from barpc.report.pictures import PICTURE_KEY, image_panels, length_bars, pair_strips, profile_charts
 from barpc.report.ranking import (
     GOOD_RMSE,
     MIN_PAIR_MATCHES,
@@ -37,10 +37,17 @@ from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, Held
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, counted, largest, metres
+from barpc.report.summary.words import counted, largest, metres
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
+MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
+_ROUNDING = 1e-6  # px
+_FOOTER = (
+    "Residuals are projected minus observed. Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of "
+    "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
+    "observations.csv, pairs.csv, footprints.geojson."
+)
 REPORT_STAGE = "report"  # the stage that makes the page
 
 
@@ -73,7 +80,7 @@ def page_of(files: RunFiles) -> str:
             shown_lines=VERDICT_SENTENCES,
             folded=_FOLDED,
             most=MAX_SHOWN,
-            footer=answers.FOOTER,
+            footer=_FOOTER,
         )
     )
 
@@ -101,8 +108,8 @@ class Section:
 
 
 _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
-    "images": ("Images: residuals (RMS) of the tie points in use", ViewEntry, ViewEntry.PAGE),
-    "pairs": ("Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)", PairEntry, PairEntry.PAGE),
+    "images": (ViewEntry.CAPTION, ViewEntry, ViewEntry.PAGE),
+    "pairs": (PairEntry.CAPTION, PairEntry, PairEntry.PAGE),
     "corrections": ("Corrections: shift at the image centre ± 1 sigma", ViewEntry, ViewEntry.CORRECTIONS),
     "places": ("Ground point at each image centre: ellipse (1 sigma), CE90, stated CE90", ViewEntry, ViewEntry.PLACES),
     "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
@@ -129,33 +136,15 @@ def _tables_of(
     return [table(key, caption, rows, kind, columns, adjusted)] if rows else []
 
 
-_QUESTIONS = {
-    "images": "Which images can I use?",
-    "map": "Where are the images, and which are connected?",
-    "random": "Are the residuals random?",
-    "pairs": "Do the pairs fit for stereo, and can heights be measured?",
-    "surface": "Which ground do they reconstruct?",
-    "moves": "How was each camera corrected?",
-    "gauge": "How uncertain are position and shape of the scene?",
-    "decisions": "What was decided, and why?",
-    "accuracy": "How accurate is it on the ground?",
-    "files": "Do the new RPC files reproduce the corrected cameras?",
-    "run": "With which options, and how much data?",
-}
-"""Key of a section -> its question; the answers are those of `barpc.report.answers`."""
-
-
-def _section(key: str, answer: str, **shown: Any) -> Section:
-    return Section(key, _QUESTIONS[key], answer, **shown)
-
-
 def _images_section(files: RunFiles) -> Section:
     views, number, adjusted = worst_first(files.summary.views), files.number, files.summary.adjusted
     (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    answer = answers.of_images(views, adjusted and _num_in_use(files) > 0)
-    return _section("images", answer, tables=[shown], **_panels(image_panels(files)))
+    agree = "Residuals measure how well the images agree with each other, not their accuracy on the ground. "
+    panels = image_panels(files)
+    answer = agree * (adjusted and _num_in_use(files) > 0) + PICTURE_KEY * bool(panels)
+    return Section("images", "Which images can I use?", answer.strip(), tables=[shown], **_panels(panels))
 
 
 def _num_in_use(files: RunFiles) -> int:
@@ -190,9 +179,17 @@ def _map_section(files: RunFiles) -> Section:
         caption += f" At most {MAX_SHOWN} of {num} footprints are drawn; all are in footprints.geojson."
     lengths = {length: count for length, count in summary.tracks.by_length.items() if count}
     charts = [(ground_map(files), caption)] if any(files.outlines) else []
-    if len(lengths) > answers.MAX_LENGTHS_SAID:
+    groups = len(connected_groups(num, links))
+    tied = "all images" if groups == 1 else f"the images in {groups} separate groups"
+    answer = f"Tie points connect {tied}." if lengths else "There are no tie points in use."
+    answer += f" Connected to one other image only: {listed(lonely)}." * bool(lonely)
+    if len(lengths) > MAX_LENGTHS_SAID:
         charts.append((length_bars(lengths), "Tie points by the number of images that see them."))
-    return _section("map", answers.of_map(lengths, len(connected_groups(num, links)), lonely), charts=charts)
+    elif lengths:
+        (first, most), *rest = lengths.items()
+        said = [f"{counted(most, 'tie point')} in {first} images", *(f"{count} in {images}" for images, count in rest)]
+        answer += f" {', '.join(said)}."
+    return Section("map", "Where are the images, and which are connected?", answer, charts=charts)
 
 
 def _randomness_section(files: RunFiles) -> Section | None:
@@ -206,7 +203,11 @@ def _randomness_section(files: RunFiles) -> Section | None:
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
         parts["folds"].append((f"Before the adjustment. {lengths}", before))
-    return _section("random", answers.of_residuals(marked, key), **parts)
+    random = "Yes: in no image do most cells have a significant mean residual."
+    if marked:
+        random = f"Not in {listed(marked)}: most cells there have a significant mean residual."
+    legend = "Colour: size. Thin lines: single residuals. Bold arrows: significant means of cells."
+    return Section("random", "Are the residuals random?", f"{random} {legend} {key}", **parts)
 
 
 def _surface_section(files: RunFiles) -> Section | None:
@@ -221,22 +222,31 @@ def _surface_section(files: RunFiles) -> Section | None:
         words = words.format(*(one.image for one in files.draped))
         more = "move over it to swipe, click to flicker. Details at the right height do not move."
         charts.append((picture(words, files.draped), f"{words}: {more}"))
-    return _section("surface", answers.of_surface(before, after), charts=charts)
+    answer = (
+        f"In a sample of the surface model {100 * before.share:.0f} % of the cells have a height with the delivered "
+        f"cameras, {100 * after.share:.0f} % with the corrected ones."
+    )
+    if before.nmad_m is not None and after.nmad_m is not None:
+        answer += f" Heights of different pairs differ by {metres(before.nmad_m)} and {metres(after.nmad_m)} (NMAD)."
+    return Section("surface", "Which ground do they reconstruct?", answer, charts=charts)
 
 
 def _pairs_section(files: RunFiles) -> Section | None:
     pairs, number = worst_pairs(files.summary.pairs), files.number
     if not pairs:
         return None
-    worst = max(pairs, key=offset_of)
-    sure = sure_pairs(files.summary.views, pairs)
-    heights = [pair for pair in sure if pair.height_m_per_px and pair.convergence_deg]
-    best = min(heights, key=lambda pair: pair.height_m_per_px or 0.0, default=None)
-    offset = None if set(worst.offset_rms) == {None} else offset_of(worst)
-    answer = answers.of_pairs(worst, offset, GOOD_RMSE, best, MIN_PAIR_MATCHES)
+    heights = any(pair.height_m_per_px and pair.convergence_deg for pair in sure_pairs(files.summary.views, pairs))
+    worst, answer = max(pairs, key=offset_of), "Unknown: no camera of a pair projects the tie points of the other."
+    if set(worst.offset_rms) != {None}:
+        answer = f"Epipolar offsets are at most {offset_of(worst):.3f} px (RMS; {worst.a} - {worst.b})."
+        answer += f" Stereo needs less than {GOOD_RMSE} px."
+    if not heights:
+        enough = f"{MIN_PAIR_MATCHES} matches and a convergence angle that determines heights"
+        answer += f" No pair of images that passed has {enough}."
     (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
-    return _section("pairs", answer, charts=pair_strips(files), tables=[replace(shown, marks=marks)])
+    shown = replace(shown, marks=marks)
+    return Section("pairs", "Do the pairs fit for stereo and heights?", answer, pair_strips(files), tables=[shown])
 
 
 def _corrections_section(files: RunFiles) -> Section | None:
@@ -251,32 +261,39 @@ def _corrections_section(files: RunFiles) -> Section | None:
         return None
     tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
-    return _section("moves", f"By up to {max(moves):.2f} px at the image centre.", tables=tables)
+    return Section(
+        "moves", "How was each camera corrected?", f"By up to {max(moves):.2f} px at the image centre.", tables=tables
+    )
 
 
 def _decisions_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
-    if not (points := answers.decisions(summary)):
+    if not (points := decisions(summary)):
         return None
     tables = _tables_of("decided", summary.views if summary.adjusted else ())
     if scene is not None:
         tables += _tables_of("explained", scene.explanations) + _tables_of("left", scene.left)
         tables += _tables_of("worse", scene.held_out_places or ())
     tables += _tables_of("again", [pair for pair in summary.pairs if pair.beaten])
-    return _section("decisions", "", points=points, charts=profile_charts(files), tables=tables)
+    return Section(
+        "decisions", "What was decided, and why?", "", points=points, charts=profile_charts(files), tables=tables
+    )
 
 
 def _gauge_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
     if scene is None:
         return None
-    points = [f"{mode.words[0].upper()}{mode.words[1:]}." for mode in scene.weakest_modes[:NAMED] if mode.sigma_m]
     columns = DatumEntry.columns(scene.datum)
     tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
     tables += _tables_of("gcps", summary.gcps)
     tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
     tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)
-    return _section("gauge", answers.of_scene(scene, _num_in_use(files) > 0), points=points, tables=tables)
+    answer = "Tie points fix the images relative to each other, not on the Earth. " * (_num_in_use(files) > 0)
+    if scene.num_held_in_height:
+        held = counted(scene.num_held_in_height, "tie point")
+        answer += f"The heights of {held} with too small a convergence angle were constrained."
+    return Section("gauge", "How uncertain are position and shape of the scene?", answer.strip(), tables=tables)
 
 
 def _check_points_section(files: RunFiles) -> Section | None:
@@ -286,7 +303,7 @@ def _check_points_section(files: RunFiles) -> Section | None:
     answer = (
         f"{counted(len(points), 'check point')}, not used in the adjustment. The RMS of residuals is in the verdict."
     )
-    return _section("accuracy", answer, tables=_tables_of("check-points", points))
+    return Section("accuracy", "How accurate is it on the ground?", answer, tables=_tables_of("check-points", points))
 
 
 def _files_section(files: RunFiles) -> Section | None:
@@ -300,13 +317,24 @@ def _files_section(files: RunFiles) -> Section | None:
         caption = "Written files, read again by other programs: largest difference from the corrected cameras [px]"
         tables.append(Table("files", caption, ["file", *(f"{consumer} [px]" for consumer in consumers)], rows))
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
-    return _section("files", answers.of_files(worst), tables=tables) if tables else None
+    if not tables:
+        return None
+    exact = "Not known for every image." if worst is None else "Yes, exactly."
+    if worst is not None and worst > _ROUNDING:
+        exact = f"To {worst:.1e} px over each image and its altitude range."
+    answer = f"{exact} The old images still carry the old RPC."
+    return Section("files", "Do the new RPC files reproduce the corrected cameras?", answer, tables=tables)
 
 
 def _run_section(files: RunFiles) -> Section:
     rows = [[cell_of(key), cell_of(str(value))] for key, value in flat_options(files.summary.options or {}).items()]
     options = Table("options", "Options of the run", ["option", "value"], rows)
-    return _section("run", answers.of_run(files.summary), tables=[options])
+    summary = files.summary
+    counts = len(summary.views), summary.tracks.num_tracks, summary.tracks.num_observations
+    answer = ", ".join(map(counted, counts, ("image", "tie point", "observation"))) + "."
+    if not summary.tables.complete:
+        answer += f" Tables and charts show {summary.tables.num_written_tracks} tie points, sampled evenly."
+    return Section("run", "With which options, and how much data?", answer, tables=[options])
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (

@@ -13,6 +13,7 @@ from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, medians
 
+PICTURE_KEY = "On the pictures tie points in use are blue, their rejected observations red."
 _DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 
 
@@ -28,8 +29,6 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             evenly((seen.xy[rows] + 0.5) * (box / view.size), _DOTS) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
-        used, *rest = (f"{count} {name}" for name, count in view.counts.items())
-        counts = f"tie points: {used} (blue){'; ' * bool(rest)}{', '.join(rest)}{' (red)' * bool(rest)}"
         text = template("drawings.svg.j2").module.thumbnail(
             number=k,
             view=view,
@@ -39,9 +38,9 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             kept=kept.tolist(),
             cut=cut.tolist(),
             parts=boxes,
-            described=f"{counts}; {counted(len(boxes), 'part')} with reservations.",
+            described=f"{PICTURE_KEY} {counted(len(boxes), 'part')} with reservations.",
         )
-        panels.append((text, f"{view.name}: {counts}{f', {STATUS_WORDS[view.status]}' if view.advice else ''}"))
+        panels.append((text, view.name + f": {STATUS_WORDS[view.status]}" * bool(view.advice)))
     return panels
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +16,7 @@ import numpy as np
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plain
 from barpc.base.geodesy import Array
 from barpc.base.manifest import LAST
-from barpc.base.safe_io import GEOJSON, SUMMARY, TABLE, opened_text, parse_json, read_json, read_text
-from barpc.pointio.names import from_cell
+from barpc.base.safe_io import GEOJSON, SUMMARY, parse_json, read_json, read_text
 from barpc.report.records import Number, Record, column, json_form
 from barpc.report.summary import SCHEMA, Summary
 from barpc.report.summary.words import NAMED, Share, Side
@@ -39,7 +36,6 @@ OBSERVATION_COLUMNS = ("view", "track", "col", "row", "col_before", "row_before"
 """Columns of observations.csv, one row an observation: residuals are projected - observed [px]."""
 
 _BASE64 = r"^[A-Za-z0-9+/]{4,400000}={0,2}\Z"
-ROWS_TOGETHER = 1 << 13  # rows of a table that are written, or read, at a time: 20 MB as numbers and texts of Python
 
 
 def table_path(folder: Path, name: str) -> Path:
@@ -178,8 +174,8 @@ def read_tables(summary: Summary, folder: Path, of_page: bool = True) -> RunFile
     outlines = _parsed(outlines_file, read_text(outlines_file, GEOJSON), _parse_outlines) if of_page else None
     if outlines is not None and len(outlines) != len(names):
         raise InputError(f"{outlines_file}: {len(outlines)} outlines of {len(names)} images")
-    observations = _parse_table(next(ties), partial(_parse_observations, names=names))
-    points, tracks = _parse_table(next(ties), _parse_points)
+    observations = _parsed_observations(next(ties), names)
+    points, tracks = _parsed_points(next(ties))
     if outlines is None:
         return RunFiles(summary, observations, points, tracks)
     surface = table_path(folder, SURFACE)
@@ -215,63 +211,52 @@ def _parse_pictures(text: str) -> tuple[tuple[Draped, ...], tuple[PairStrip, ...
     return tuple(map(Draped.read, found["images"])), tuple(map(PairStrip.read, found["pairs"]))
 
 
-def _parse_table(path: Path, parse: Any) -> Any:
-    with opened_text(path, TABLE) as lines:
-        return _parsed(path, lines, parse)
-
-
 def _parsed(path: Path, text: Any, parse: Any) -> Any:
     try:
         return parse(text)
     except (BarpcError, UnicodeDecodeError):
         raise
-    except (ValueError, LookupError, TypeError, AttributeError, StopIteration, csv.Error) as error:
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: damaged ({plain(error)}); run the adjustment again") from error
 
 
-def _table_columns(lines: Iterable[str], header: Sequence[str]) -> Iterator[list[tuple[str, ...]]]:
-    """Yield the columns of a table, a part of its rows at a time; at the end of none."""
-    rows = csv.reader(lines)
-    if tuple(next(rows, ())) != tuple(header):
-        raise ValueError(f"its columns are not {', '.join(header)}")
-    while part := [*islice(rows, ROWS_TOGETHER)]:
-        columns = [*zip(*part, strict=True)]
-        if len(columns) != len(header):
-            raise ValueError(f"rows of {len(columns)} cells")
-        yield columns
-    yield [() for _ in header]
+def _parsed_observations(path: Path, names: Sequence[str]) -> ObservationTable:
+    """Return observations.csv, of images in the order of their names."""
+    table = _parsed_columns(path, OBSERVATION_COLUMNS, OBSERVATION_COLUMNS[4:8], ("view",))
+    numbers = np.stack([table[name] for name in OBSERVATION_COLUMNS[2:8]], axis=-1)
+    index = {name: i for i, name in enumerate(names)}
+
+    def of_images(seen: Any) -> Any:
+        return np.array([index[str(name)] for name in seen.different], dtype=np.int64)[seen.index]
+
+    view, used = _parsed(path, table["view"], of_images), table["used"] == 1.0
+    return ObservationTable(view, table["track"], numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
 
 
-def _floats(columns: Sequence[Sequence[str]], known: int) -> Array:
-    """Return the columns (n, len(columns)) of numbers, of which only those from `known` on may be empty (NaN)."""
-    table = np.array([[float(cell or "nan") for cell in column] for column in columns], dtype=np.float64).T
-    if np.isnan(table[:, :known]).any() or (np.abs(table) > _MAX_TABLE_VALUE).any():
-        raise ValueError("a number is missing or absurdly large")
-    return table
+def _parsed_points(path: Path) -> tuple[Array, IntArray]:
+    """Return lon, lat [deg], altitude [m] and mean residual [px] (n, 4) of the tracks (n,) of residuals.csv."""
+    table = _parsed_columns(path, RESIDUALS, ("mean_residual", "mean_residual_before"))
+    places = np.stack([table[name] for name in RESIDUALS[:4]], axis=-1)
+    return _parsed(path, places, _in_degrees), table["track"]
 
 
-def _parse_observations(lines: Iterable[str], names: Sequence[str]) -> ObservationTable:
-    index, found = {name: i for i, name in enumerate(names)}, []
-    for columns in _table_columns(lines, OBSERVATION_COLUMNS):
-        view = np.array([index[from_cell(name)] for name in columns[0]], dtype=np.int64)
-        used = np.array([cell == "1" for cell in columns[8]], dtype=bool)
-        found.append((view, _track_numbers(columns[1]), _floats(columns[2:8], 2), used))
-    view, track, numbers, used = map(np.concatenate, zip(*found, strict=True))
-    return ObservationTable(view, track, numbers[:, :2], numbers[:, 2:4], numbers[:, 4:], used)
+def _parsed_columns(
+    path: Path, header: Sequence[str], blank: Sequence[str], texts: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the columns of a table by their names: texts, numbers of tracks, and numbers, NaN for blank ones."""
+    from barpc.pointio.tables import read_table  # with what knows of heights: a summary alone needs none
 
+    _, found = read_table(path, {name: (name,) for name in header}, header, texts=texts, blank=blank)
 
-def _parse_points(lines: Iterable[str]) -> tuple[Array, IntArray]:
-    parts = _table_columns(lines, RESIDUALS)
-    found = [(_in_degrees(_floats(columns[:4], 3)), _track_numbers(columns[6])) for columns in parts]
-    points, tracks = map(np.concatenate, zip(*found, strict=True))
-    return points, tracks
+    def numbers(name: str) -> Array:
+        values = np.array(found[name], dtype=np.float64)
+        if (name not in blank and np.isnan(values).any()) or (np.abs(values) > _MAX_TABLE_VALUE).any():
+            raise ValueError(f"{name}: a number is missing or absurdly large")
+        if name == "track" and not ((values >= 0.0) & (values == np.rint(values))).all():
+            raise ValueError("a number of a track is none")
+        return values.astype(np.int64) if name == "track" else values
 
-
-def _track_numbers(cells: Sequence[str]) -> IntArray:
-    """Return the numbers of tracks."""
-    if not all(cell.isdecimal() and len(cell) <= 18 for cell in cells):
-        raise ValueError("a number of a track is none")
-    return np.array(list(map(int, cells)), dtype=np.int64)
+    return {name: column if name in texts else _parsed(path, name, numbers) for name, column in found.items()}
 
 
 def _in_degrees(places: Array) -> Array:

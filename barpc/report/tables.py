@@ -22,12 +22,13 @@ from barpc.pointio.names import cell
 from barpc.report.geopackage import Layer, point_shapes
 from barpc.report.outcome import Run
 from barpc.report.records import value_of
-from barpc.report.runfiles import MATCHES, OBSERVATION_COLUMNS, RESIDUALS, ROWS_TOGETHER
+from barpc.report.runfiles import MATCHES, OBSERVATION_COLUMNS, RESIDUALS
 from barpc.report.summary import Summary
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.sensor.geometry import footprints
 
+ROWS_TOGETHER = 1 << 13  # rows of a table that are written at a time: 20 MB as numbers and texts of Python
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
@@ -64,10 +65,6 @@ def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
         for lon, lat, alt, mean, count, before, track in _rows(*_per_track(run).T)
     )
     return _csv(RESIDUALS, rows)
-
-
-def _observations_csv(run: Run, _: Summary) -> Iterable[bytes]:
-    return _csv(OBSERVATION_COLUMNS, _observation_lines(run))
 
 
 def _observation_lines(run: Run) -> Iterator[str]:
@@ -152,15 +149,11 @@ def gcps_geojson(run: Run) -> bytes:
     return f'{{"type": "FeatureCollection", "features": [\n{text}\n]}}\n'.encode()
 
 
-def _matches_npz(run: Run, _: Summary) -> Iterable[bytes]:
-    return [matches_npz(run.tracks, [view.name for view in run.views])]
-
-
 TABLES: dict[str, Callable[[Run, Summary], Iterable[bytes]]] = {
     "residuals.csv": _residuals_csv,
-    "observations.csv": _observations_csv,
+    "observations.csv": lambda run, _: _csv(OBSERVATION_COLUMNS, _observation_lines(run)),
     "pairs.csv": _pairs_csv,
     "footprints.geojson": _footprints_geojson,
-    MATCHES: _matches_npz,
+    MATCHES: lambda run, _: [matches_npz(run.tracks, [view.name for view in run.views])],
 }
 """File name -> the parts of its bytes, of a run and its summary."""

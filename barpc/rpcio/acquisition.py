@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date
+from heapq import merge
 from pathlib import Path
 
 import numpy as np
@@ -121,7 +122,7 @@ class _Keyed:
     def matches(self, text: _Text) -> Iterator[re.Match[bytes]]:
         """Yield the matches in a text in their order."""
         end = 0
-        for place in sorted(place for word in self.words for place in text.places(word)):
+        for place in merge(*map(text.places, self.words)):
             found = self.pattern.search(text.whole, max(end, place - _BEFORE), place + _LENGTH)
             if found is not None and found.start() <= place:
                 end = found.end()

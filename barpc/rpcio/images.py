@@ -36,7 +36,7 @@ from barpc.base.errors import ImageError, OutputError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import IMAGE, opened, plain_path, read_head
-from barpc.rasters.raster import Mosaic, earth_crs, has_mask, identify, open_raster, transformed, vrt_of
+from barpc.rasters.raster import earth_crs, has_mask, identify, open_raster, shown_vrt, transformed, vrt_of
 from barpc.rasters.vrt import GDAL_TYPES, Source
 from barpc.rpcio.text import (
     COEFFICIENTS,
@@ -153,7 +153,7 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
         The image cannot be read; the copy exists, is the image itself, or cannot be written.
     """
     with copying(image_path, copy_path, overwrite) as (dataset, partial):
-        if not isinstance(dataset, Mosaic) and dataset.driver == "GTiff":
+        if shown_vrt(dataset) is None and dataset.driver == "GTiff":
             with opened(image_path, IMAGE) as file, partial.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
         else:
@@ -215,7 +215,7 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
 def _translate(dataset: Any, partial: Path, target: Path) -> None:
     """Copy an image into a GeoTIFF; a VRT's pixels are GDAL's only when they stand in a file."""
     whole = Window(0, 0, dataset.width, dataset.height)
-    if isinstance(dataset, Mosaic):
+    if shown_vrt(dataset) is not None:
         _copy_window(dataset, partial, target, whole)
     else:
         raster_copy(dataset, str(partial), **TIFF_PROFILE)

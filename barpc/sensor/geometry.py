@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,10 @@ from barpc.base.geodesy import (
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Corrections
 from barpc.sensor.curve import cross
-from barpc.sensor.radar import Radar
 from barpc.sensor.rpc import RpcStack, localize_stack
+
+if TYPE_CHECKING:
+    from barpc.sensor.radar import Radar
 
 CenterMethod = Literal["line", "projective", "nominal", "stated"]
 
@@ -121,7 +123,7 @@ def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
     """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
-    if isinstance(sensor, Radar):
+    if _is_radar(sensor):
         return np.asarray((enu_basis(ground) @ sensor.to_radar(ground)[..., None])[..., 0])
     return sight_enu(sensor, ground)
 
@@ -269,7 +271,7 @@ def camera_centers(
     how: Literal["line", "projective"] = "line",
 ) -> list[CameraCenter]:
     """Estimate the centres of cameras: `camera_center` of each, in one go."""
-    number = [i for i, sensor in enumerate(sensors) if not isinstance(sensor, Radar)]
+    number = [i for i, sensor in enumerate(sensors) if not _is_radar(sensor)]
     ecef = np.full((len(sensors), 3), np.nan)
     if how == "line":
         some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
@@ -281,13 +283,18 @@ def camera_centers(
     found = []
     for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
         low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
-        if isinstance(sensor, Radar):
+        if _is_radar(sensor):
             found.append(_center_stated(sensor, size, alt_range))
         elif low <= altitude[i] <= high:
             found.append(CameraCenter(ecef[i], altitude[i], how))
         else:
             found.append(_center_nominal(sensor, size, alt_range, altitude[i]))
     return found
+
+
+def _is_radar(sensor: SensorModel) -> TypeGuard[Radar]:
+    """Return whether a model knows where its beam comes from; none is loaded to ask."""
+    return hasattr(sensor, "to_radar")
 
 
 def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:

@@ -22,7 +22,6 @@ from numpy.polynomial.polynomial import polyder, polyval
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import (
     EARTH_RATE,
-    NEWTON_STEPS,
     NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
     WGS84_A,
@@ -31,6 +30,7 @@ from barpc.base.geodesy import (
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
+    newton,
     reach,
     wrap_longitude,
 )
@@ -259,27 +259,22 @@ class Pushbroom(Pointwise):
     def _solve(self, ecef: Array) -> Array:
         """Return the image points (2, N) of ECEF points (3, N): Newton on (col, row)."""
         start, stop = self._span
-        time = np.full(ecef.shape[1], (start + stop) / 2)
-        col = np.full(ecef.shape[1], self.look_origin)
-        settled = np.zeros(ecef.shape[1], dtype=bool)
-        for _ in range(NEWTON_STEPS):
+        depth = np.empty(0)
+
+        def moved(found: Array) -> Array:
+            nonlocal depth
+            col, time = found
             tangents, rate, depth = self._seen(ecef, time)
             look, slope = self._look(col)
             miss = look - tangents
             det = rate[1] * slope[0] - rate[0] * slope[1]
-            d_time = (slope[0] * miss[1] - slope[1] * miss[0]) / det
-            d_col = (rate[0] * miss[1] - rate[1] * miss[0]) / det
-            time = np.clip(time + d_time, start, stop)
-            col = col + d_col
-            settled = (
-                (np.abs(d_time) < NEWTON_TOLERANCE * abs(self.line_period))
-                & (np.abs(d_col) < NEWTON_TOLERANCE)
-                & (depth > 0)
-            )
-            if not (~settled & np.isfinite(col) & np.isfinite(time)).any():
-                break
+            time = np.clip(time + (slope[0] * miss[1] - slope[1] * miss[0]) / det, start, stop)
+            return np.stack([col + (rate[0] * miss[1] - rate[1] * miss[0]) / det, time])
+
+        middle = np.repeat([[self.look_origin], [(start + stop) / 2]], ecef.shape[1], axis=1)
+        (col, time), settled = newton(moved, middle, NEWTON_TOLERANCE * np.array([[1.0], [abs(self.line_period)]]))
         out = np.stack([col, (time - self.first_line) / self.line_period])
-        out[:, ~settled] = np.nan
+        out[:, ~(settled.all(axis=0) & (depth > 0) & (time > start) & (time < stop))] = np.nan
         return out
 
     def _derivatives(self, ground: Array) -> tuple[Array, ...]:
@@ -358,19 +353,17 @@ class Frame(Pointwise):
 
     def _farther(self, radius: Array) -> Array:
         """Return how much (N,) farther out than its tangents a place in the focal plane is; NaN if nowhere."""
-        slope, found = polyder(self.distortion), radius
-        settled = NEWTON_TOLERANCE * float(np.abs(self.plane[:, :2]).max())  # focal lengths
-        step = np.zeros_like(radius)
-        for _ in range(NEWTON_STEPS):
+        slope, pixel = polyder(self.distortion), float(np.abs(self.plane[:, :2]).max())  # in focal lengths
+
+        def farther(found: Array) -> Array:
             square = found**2
             left = found * (1.0 - polyval(square, self.distortion)) - radius
             rate = 1.0 - polyval(square, self.distortion) - 2.0 * square * polyval(square, slope)
-            step = left / np.where(rate > 0, rate, np.nan)
-            found = found - step
-            if not (np.abs(step) > settled).any():
-                break
-        found = np.where(np.abs(step) <= settled, found, np.nan)
-        return np.asarray(found / np.where(radius > 0, radius, 1.0))  # in the middle any factor is right
+            return found - left / np.where(rate > 0, rate, np.nan)
+
+        found, settled = newton(farther, radius, NEWTON_TOLERANCE * pixel)
+        # in the middle any factor is right
+        return np.asarray(np.where(settled, found, np.nan) / np.where(radius > 0, radius, 1.0))
 
     def _derivatives(self, ground: Array) -> tuple[Array, ...]:
         image, at, p = self._seen(ecef_from_ground(ground).T)

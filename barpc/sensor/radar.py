@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import NEWTON_STEPS, NEWTON_TOLERANCE, Array, ground_from_ecef, pointwise, up, wrap_longitude
+from barpc.base.geodesy import NEWTON_TOLERANCE, Array, ground_from_ecef, newton, pointwise, up, wrap_longitude
 from barpc.sensor import Pointwise
 from barpc.sensor.curve import Curve, cross
 
@@ -60,14 +60,12 @@ def on_circle(
         away = span * (across * np.sin(angle) - above * np.cos(angle)) + forward
         return away, ground_from_ecef((position + distance * away).T)
 
-    for _ in range(NEWTON_STEPS):
+    def turned(angle: Array) -> Array:
         _, ground = at(angle)
-        turned = span * (across * np.cos(angle) + above * np.sin(angle))
-        moved = (alt - ground[:, 2]) / dot(up(ground), turned)
-        angle = angle + moved / distance
-        if not (np.abs(moved).max(initial=0.0, where=np.isfinite(moved)) > NEWTON_TOLERANCE):
-            break
-    away, ground = at(angle)
+        rise = dot(up(ground), span * (across * np.cos(angle) + above * np.sin(angle)))
+        return angle + (alt - ground[:, 2]) / rise / distance
+
+    away, ground = at(newton(turned, angle, NEWTON_TOLERANCE / distance)[0])
     ground[~(np.abs(ground[:, 2] - alt) <= NEWTON_TOLERANCE)] = np.nan
     ground[:, 2] = alt
     return ground, -away

@@ -24,12 +24,11 @@ from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
     ALTITUDES,
     EARTH_RATE,
-    NEWTON_STEPS,
-    NEWTON_TOLERANCE,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     ground_from_ecef,
+    newton,
 )
 from barpc.base.safe_io import MAX_XML, PRODUCT, opened, parse_xml
 from barpc.sensor.curve import Curve
@@ -234,32 +233,32 @@ class Monostatic(Radar):
         return np.stack(columns, axis=1) / (2 * _DIFFERENCE_STEP)
 
     def _project(self, ground: Array) -> Array:
-        return self._image(self._solve(ecef_from_ground(ground).T)[0])
+        return self._image(self._solve(ecef_from_ground(ground).T))
 
-    def _solve(self, point: Array) -> tuple[Array, Array]:
-        """Return (x, y) (2, N) of points (3, N), by Newton from the scene centre; the last derivative (2, 2, N)."""
+    def _solve(self, point: Array) -> Array:
+        """Return (x, y) (2, N) of points (3, N), by Newton from the scene centre."""
         low, high = self._bounds
-        plane = np.where(np.isfinite(point[:2]), 0.0, np.nan)
-        for _ in range(NEWTON_STEPS):
-            slope = self._by_plane(plane, point)
-            moved = np.clip(plane - _solve_systems(slope, self._miss(plane, point)[0]), low, high)
-            step, plane = np.abs(moved - plane).max(axis=0), moved
-            if not (step.max(initial=0.0, where=np.isfinite(step)) > NEWTON_TOLERANCE):
-                break
+
+        def moved(plane: Array) -> Array:
+            step = _solve_systems(self._by_plane(plane, point), self._miss(plane, point)[0])
+            return np.clip(plane - step, low, high)
+
+        plane, settled = newton(moved, np.where(np.isfinite(point[:2]), 0.0, np.nan))
         _, seen, sight, _ = self._miss(plane, point)
         side = dot(aside(seen.position, seen.velocity, self.look == "right"), sight)
         inside = ((plane > low) & (plane < high)).all(axis=0)
-        plane[:, ~(inside & (side < 0) & (step <= NEWTON_TOLERANCE))] = np.nan
-        return plane, slope
+        plane[:, ~(inside & (side < 0) & settled.all(axis=0))] = np.nan
+        return plane
 
     def _to_radar(self, ground: Array) -> Array:
         point = ecef_from_ground(ground).T
-        _, _, sight, distance = self._miss(self._solve(point)[0], point)
+        _, _, sight, distance = self._miss(self._solve(point), point)
         return (sight * distance).T
 
     def _derivatives(self, ground: Array) -> tuple[Array, Array]:
         point = ecef_from_ground(ground).T
-        plane, slope = self._solve(point)
+        plane = self._solve(point)
+        slope = self._by_plane(plane, point)
         _, seen, sight, distance = self._miss(plane, point)
         toward = dot(seen.velocity, sight)
         by_point = np.stack([sight, (seen.velocity - toward * sight) / distance])  # (2, 3, N)

@@ -133,7 +133,7 @@ class OpenReaders(ExitStack):
         super().__init__()
         self._known: dict[tuple[str, int, tuple[int, int], int], PixelReader] = {}
 
-    def of(self, path: str, band: int, size: tuple[int, int], thin: int) -> PixelReader:
+    def of(self, path: str, band: int, size: tuple[int, int], thin: int = 1) -> PixelReader:
         """Return the reader of an image; arguments as those of `PixelReader`."""
         key = path, band, size, thin
         if key not in self._known:

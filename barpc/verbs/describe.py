@@ -13,7 +13,6 @@ from barpc.base.geodesy import feature_collection, geojson_feature, polygon
 from barpc.base.verb_options import InfoOptions
 from barpc.cameras import ImageLike, open_camera
 from barpc.fit.poles import smallest_denominator
-from barpc.rasters.dem import Dem
 from barpc.scene import Camera
 from barpc.sensor import geometry
 from barpc.sensor.rpc import RPC
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from barpc.base.keywords import InfoKeywords
+    from barpc.rasters.dem import Dem
 
 
 def info(

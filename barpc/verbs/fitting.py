@@ -152,7 +152,7 @@ def _fit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> R
     if choices.alt_range is not None:
         low, high = choices.alt_range
     elif (terrain := terrain_of(choices.dem, choices.geoid)) is not None:
-        low, high = terrain_range(camera.model, camera.extent, (low, high), terrain, choices.dem_margin)
+        low, high = terrain_range(camera.model, camera.extent, (low, high), terrain.covering, choices.dem_margin)
     elif all_ground := getattr(camera.model, "all_ground", None):
         found = fit_rpc(camera.model, camera.extent, all_ground, options=options, strict=False)
         if not found.verdict(options.tolerance):

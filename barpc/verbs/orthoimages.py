@@ -177,7 +177,7 @@ class _Warp:
             levels, words = (level, level), f"all ground at {level:.5g} m"
             heights: dict[str, Any] = {"RPC_HEIGHT": level}
         else:
-            low, high = terrain_range(model, camera.extent, camera.alt_range, terrain, _RELIEF)
+            low, high = terrain_range(model, camera.extent, camera.alt_range, terrain.covering, _RELIEF)
             levels, words = (low, high), f"heights of {terrain.description}"
             heights = {"RPC_DEM": str(_write_terrain(room / "terrain.tif", camera, terrain, levels))}
             at = image_grid(camera.extent, (0.0, 0.0), (_NODES, 1))[0]

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +16,13 @@ from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_fr
 from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl
 from barpc.cameras import ImageLike, open_camera
-from barpc.rasters.dem import Dem, localize_on_terrain
 from barpc.scene import BoolArray, Camera
 from barpc.sensor import SensorModel, geometry
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import one_or_many, place_of
+
+if TYPE_CHECKING:
+    from barpc.rasters.dem import Dem
 
 _SAME_PLACE = 0.01  # deg: places that are one; others that are seen alike lie degrees away
 
@@ -174,7 +177,11 @@ def terrain_of(dem: Files | None = None, geoid: PathLike | None = None, alt: npt
         raise UsageError("--geoid goes with --dem")
     if dem and alt is not None:
         raise UsageError("give either --alt or --dem")
-    return Dem.open(dem, geoid) if dem else None
+    if not dem:
+        return None
+    from barpc.rasters.dem import Dem
+
+    return Dem.open(dem, geoid)
 
 
 def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: Dem | None) -> Array:
@@ -186,7 +193,8 @@ def with_altitudes(ground: npt.ArrayLike, alt: npt.ArrayLike | None, terrain: De
         points = np.concatenate([np.broadcast_to(part, (*lead, part.shape[-1])) for part in (points, level)], axis=-1)
     points = as_ground(points)
     if terrain is not None:
-        points = np.concatenate([points[..., :2], terrain(points[..., 0], points[..., 1])[..., None]], axis=-1)
+        height = terrain.covering(*points[..., :2].reshape(-1, 2).T).reshape(*points.shape[:-1], 1)
+        points = np.concatenate([points[..., :2], height], axis=-1)
     return points
 
 
@@ -241,7 +249,12 @@ def _run_altitudes(folder: Path, _changed: int) -> dict[str, float]:
 def ground_at(camera: Camera, image: Array, alt: Array | float, dem: Dem | None) -> Array:
     """Return ground points (N, 3) of image points (N, 2), on the DEM where there is one, else at altitudes [m]."""
     if dem is not None:
-        return localize_on_terrain(camera.model, image, dem, camera.alt_range)
+        from barpc.rasters.dem import localize_on_terrain
+
+        found = localize_on_terrain(camera.model, image, dem, camera.alt_range)
+        if np.isnan(found).all():
+            dem.covering(*camera.model.localize(image, np.full(len(image), camera.altitude))[:, :2].T)
+        return found
     return camera.model.localize(image, np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image)))
 
 

@@ -19,6 +19,7 @@ JOURNEYS = {
     "images -> files": (
         ("pipeline/run.py", "adjust", "paths"),
         ("pipeline/loading.py", "load_views", "paths -> views with cameras"),
+        ("pipeline/adjusting.py", "tied_and_adjusted", "views -> tracks -> cameras"),
         ("tie/tracks.py", "find_tracks", "views -> tracks"),
         ("ba/adjustment.py", "adjust_tracks", "tracks -> cameras P_BA"),
         ("fit/refit.py", "fit_rpc", "P_BA -> RPC and its certificate"),

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from barpc import simulate
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
+from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.parameters.priors import PointPrior
+from barpc.ba.robust.variances import Variances
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import Minimum, minimise
 from barpc.fit import fit_rpc
+from barpc.scene import Terrain
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.constants import chosen
 
@@ -32,6 +39,28 @@ def solve(block: SimulatedBlock, **options: Any) -> Adjustment:
     hold_out = options.pop("hold_out", True)
     with chosen(AdjustOptions, **{**INDEPENDENT, **options}) as given:
         return adjust_tracks(block.views, block.tracks, given, centers=centers_of(block), hold_out=hold_out)
+
+
+def least_squares(
+    block: SimulatedBlock, options: AdjustOptions, noise: float = 1.0, dem: Terrain | None = None
+) -> tuple[Problem, Minimum]:
+    """All observations by their sigmas times `noise`, once: what moves these moves the solution in proportion."""
+    joined = join(block.views, block.tracks, None, options)
+    problem = make_problem(joined, options, centers_of(block), None)
+    with as_stated():
+        state, heights = first_state(problem, joined, options, dem)
+        for _ in range(2):  # heights are held where points end
+            problem = heights.hold(problem, state.points)
+            minimum = minimise(problem, state, 1.0 / (noise * joined.sigma), options.solver, 1e-12)
+            state = minimum.state
+    return problem, minimum
+
+
+@contextmanager
+def as_stated() -> Iterator[None]:
+    """Priors and DEMs count as they are stated."""
+    with mock.patch.object(Variances, "learns", False), mock.patch.object(PointConstraints, "is_judged", False):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -22,7 +22,6 @@ from barpc.ba.solution import Solution
 from barpc.base.geodesy import enu_basis
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.report.answers import decisions
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
 from benchmarks import worlds_families as families
@@ -294,7 +293,6 @@ def test_control_of_a_world_is_used_where_it_is_right_and_never_bends_the_images
         assert any(
             "Without consistent ground control, the scene's position is uncertain" in line for line in summary.verdict
         )
-        assert any(line.startswith("0 of") and "visible GCPs" in line for line in decisions(summary))
     else:
         assert [word != "used" for word in status] == wrong.tolist()
         assert any(
@@ -362,7 +360,6 @@ def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, mo
     assert any("the images would agree less with each other" in reason for reason in summary.reasons)
     assert any(line.startswith("Without consistent ground control") for line in summary.verdict)
     assert [point.status for point in summary.gcps] == ["rejected"] * 6
-    assert "0 of 6 visible GCPs constrain the block." in decisions(summary)
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_what_a_model_excludes_still_counts(block: Any) -> None:
     xy = tracks.xy.copy()
     xy[far[tracks.point] & (tracks.view == 2) & (rng.random(len(tracks)) < 0.6)] += (3.0, 3.0)  # a cloud of 30 %
     clouded = replace(block, tracks=Tracks(tracks.view, tracks.point, xy, tracks.sigma))
-    spread = adjust_tracks(clouded.views, clouded.tracks, AdjustOptions(terms="none", loss="linear"))
+    spread = adjust_tracks(clouded.views, clouded.tracks, AdjustOptions(terms="none"))
     compromise, ties = delivered(clouded, xy, params=spread.params, noise=9.0)
     of_half, _ = delivered(clouded, xy, params=found.params)
     assert is_closer(of_half, compromise, ties)

@@ -13,7 +13,7 @@ from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.scene import GroundPoints
 from barpc.simulate import simulate_block
-from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.ba.conftest import INDEPENDENT, as_stated, centers_of
 from tests.ba.test_uncertainty import _divided
 
 BLOCK = simulate_block(4, 400, seed=4, num_gcps=6, alt_range=(200.0, 260.0))
@@ -60,19 +60,19 @@ def test_control_points_hold_it_by_their_accuracy():
 
 
 @pytest.mark.slow
+@as_stated()
 def test_a_terrain_holds_heights_and_no_more_than_its_common_error_lets_it():
-    tight, loose = (
-        solved(dem=level, learn_priors=False, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0)
-    )
+    tight, loose = (solved(dem=level, dem_bias_sigma=sigma).datum["heights"] for sigma in (0.5, 20.0))
     assert tight[2] > 0.95
     assert 0.02 < loose[2] < 0.9
     assert tight[:2].max() < tight[2]
 
 
+@as_stated()
 def test_heights_hold_as_much_as_they_take_from_the_variance_of_the_place():
     """Of 300 m each, and hardly any in common: together they know the height about as well as the cameras do."""
-    alone = solved(learn_priors=False)
-    found = solved(dem=level, learn_priors=False, dem_sigma=300.0, dem_bias_sigma=0.1)
+    alone = solved()
+    found = solved(dem=level, dem_sigma=300.0, dem_bias_sigma=0.1)
     taken = 1.0 - (found.gauge.sigma[2] / alone.gauge.sigma[2]) ** 2
     assert 0.3 < taken < 0.9
     assert found.datum["heights"][2] == pytest.approx(taken, abs=0.02)
@@ -118,7 +118,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     ("options", "dem", "says"),
     [
         (
-            {"learn_priors": False},
+            {},
             level,
             "DEM accuracy assumed: 20 m shared by all points, 10 m each; measured: the tie points lie ",
         ),
@@ -134,6 +134,7 @@ def test_the_summary_has_it_in_a_table_without_the_sources_that_tell_nothing():
     ],
 )
 @pytest.mark.filterwarnings("ignore::barpc.BarpcWarning")
+@as_stated()
 def test_what_a_terrain_did_is_said(options, dem, says):
     found = adjust_tracks(
         BLOCK.views,
@@ -154,9 +155,10 @@ def test_what_a_terrain_did_is_said(options, dem, says):
         assert found.datum["heights"][2] > 0.5
 
 
+@as_stated()
 def test_the_scene_lies_above_a_terrain_that_is_too_low():
     low, high = (
-        solved(dem=lambda lon, lat, alt=alt: np.full(len(lon), alt), learn_priors=False, dem_bias_sigma=1e4).terrain
+        solved(dem=lambda lon, lat, alt=alt: np.full(len(lon), alt), dem_bias_sigma=1e4).terrain
         for alt in (130.0, 230.0)
     )
     assert low.offset == pytest.approx(high.offset + 100.0, abs=0.01)

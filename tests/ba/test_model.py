@@ -23,10 +23,10 @@ from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import centers_of, solve
+from tests.ba.conftest import as_stated, centers_of, solve
 from tests.constants import chosen
 
-CALM = {"learn_priors": False, "hold_out": False}
+CALM = {"hold_out": False}
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,9 @@ def turned() -> SimulatedBlock:
 
 
 @pytest.mark.nightly
+@as_stated()
 def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties(turned) -> None:
-    found = adjust_tracks(turned.views, turned.tracks, AdjustOptions(learn_priors=False))
+    found = adjust_tracks(turned.views, turned.tracks, AdjustOptions())
     assert found.cameras.unknowns.model == "affine"
     assert found.findings == ()
     assert (found.inlier | found.held_out).mean() > 0.97
@@ -169,12 +170,13 @@ def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("view", [0, pytest.param(1, marks=pytest.mark.nightly)])
+@as_stated()
 def test_a_step_beside_an_image_that_was_turned_is_the_only_one_found_and_is_followed(turned, view) -> None:
     """Beside a model in space what the turn leaves looks like steps, too."""
     tracks = turned.tracks
     behind = (tracks.view == view) & (tracks.xy[:, 0] > 8000.0)
     moved = replace(tracks, xy=tracks.xy + np.where(behind[:, None], [1.5, 0.0], 0.0))
-    found = adjust_tracks(turned.views, moved, AdjustOptions(learn_priors=False))
+    found = adjust_tracks(turned.views, moved, AdjustOptions())
     assert found.cameras.unknowns.model == "affine"
     (step,) = found.findings
     assert (step.kind, step.view, step.where[0]) == ("step", view, 0)
@@ -182,7 +184,7 @@ def test_a_step_beside_an_image_that_was_turned_is_the_only_one_found_and_is_fol
     # the corrected sensors have it, too
     at = np.array([[7000.0, 9000.0], [9000.0, 9000.0]])
     ground = turned.views[view].sensor.localize(at, np.full(2, 200.0))
-    whole = adjust_tracks(turned.views, tracks, AdjustOptions(learn_priors=False))
+    whole = adjust_tracks(turned.views, tracks, AdjustOptions())
     apart = [np.diff(one.sensors[view].project(ground), axis=0)[0] for one in (found, whole)]
     # what lies along the epipolar lines is told by the third image alone
     np.testing.assert_array_less(np.abs(apart[0] - apart[1] - [1.5, 0.0]), [0.15, 0.3])
@@ -491,9 +493,8 @@ def test_an_agreement_is_taken_that_leaves_a_fifth_less_noise_and_half_of_what_a
     assert starts == [(1, "all"), (1, "agreed")]
 
 
-def test_an_agreement_is_asked_for_where_rounds_are_suspect_and_robust(monkeypatch) -> None:
+def test_an_agreement_is_asked_for_where_rounds_are_suspect(monkeypatch) -> None:
     assert script(monkeypatch, [2.0], [70], suspect=False)[1] == [(1, "all")]
-    assert script(monkeypatch, [2.0], [70], options=AdjustOptions(loss="linear"))[1] == [(1, "all")]
 
 
 @pytest.mark.parametrize(

@@ -405,12 +405,6 @@ def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
     assert not found.moving.any()
 
 
-@pytest.mark.slow
-def test_least_squares_that_were_asked_for_have_no_group() -> None:
-    block, tracks, _ = drifting(3, 600, 0.3, 2.0)
-    assert not adjust_tracks(block.views, tracks, AdjustOptions(loss="linear")).moving.any()
-
-
 @pytest.mark.nightly
 def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() -> None:
     """A pair of which 42 % moves by 2.6 m: a drift of degree 2 leaves 20 m of the scene's shape, and no group."""

@@ -388,10 +388,7 @@ def test_a_joint_prior_of_an_earlier_block_adds_its_information():
     options = AdjustOptions(
         noise_floor=0.0,
         min_convergence=0.01,
-        estimate_noise=False,
-        loss="linear",
         drift=0,
-        learn_priors=False,
     )
     centers = centers_of(made)
     old = made.tracks.select(made.tracks.view < 3)

@@ -15,10 +15,10 @@ from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import triangulate
 from barpc.simulate import simulate_block
-from tests.ba.conftest import INDEPENDENT, centers_of, solve
+from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, solve
 from tests.lanes import rest_slow
 
-L2 = {"loss": "linear", "estimate_noise": False, "hold_out": False}
+EVERY = {"hold_out": False}
 
 
 def truth_sensors(block):
@@ -29,10 +29,11 @@ def truth_sensors(block):
 @pytest.mark.parametrize("solver", ["sparse", "auto"])
 def test_without_noise_the_held_out_points_are_met_to_a_millionth_of_a_pixel(solver):
     exact = simulate_block(6, 500, seed=2, noise=0.0)
-    found = solve(exact, **L2, sigma_attitude=1e4, sigma_position=1e3, solver=solver)
-    assert found.steps <= 12  # the cost is rounding then, and falls no more
+    options = AdjustOptions(**{**INDEPENDENT, "sigma_attitude": 1e4, "sigma_position": 1e3}, drift=0, solver=solver)
+    problem, found = least_squares(exact, options)
     assert exact.held_out_rms([v.sensor for v in exact.views]) > 1.0
-    assert exact.held_out_rms(list(found.sensors)) < 1e-5
+    sensors = problem.cameras.unknowns.corrected(found.state.params, exact.views)
+    assert exact.held_out_rms(list(sensors)) < 1e-5
 
 
 @pytest.mark.slow
@@ -75,8 +76,8 @@ MODELS = ("rotation", "translation", "rotation+translation")
 )
 def test_both_solvers_reach_the_same_minimum(request, size, model):
     block = request.getfixturevalue(size)
-    first, second = (solve(block, **L2, model=model, solver=solver) for solver in ("auto", "sparse"))
-    tight = solve(block, **L2, model=model, solver="sparse", tolerance=1e-14)
+    first, second = (solve(block, **EVERY, model=model, solver=solver) for solver in ("auto", "sparse"))
+    tight = solve(block, **EVERY, model=model, solver="sparse", tolerance=1e-14)
     assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     assert second.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     np.testing.assert_allclose(first.params, tight.params, atol=2e-3 * np.abs(tight.params).max())
@@ -94,8 +95,8 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
     for lon, lat in places:
         there = simulate_block(views, tracks, seed=4, lon=lon, lat=lat)
         costs = [
-            solve(there, **L2, solver="auto").cost_history[-1],
-            solve(there, **L2, solver="sparse", tolerance=1e-14).cost_history[-1],
+            solve(there, **EVERY, solver="auto").cost_history[-1],
+            solve(there, **EVERY, solver="sparse", tolerance=1e-14).cost_history[-1],
         ]
         assert costs[0] == pytest.approx(costs[1], rel=1e-6), (lon, lat)
         freedom = 2 * len(there.tracks) - 3 * tracks
@@ -109,15 +110,15 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
         *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse")),
     ],
 )
-def test_plain_least_squares_takes_two_linearisations_from_metres_away(request, size, solver):
+def test_an_adjustment_takes_few_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
-    found = solve(block, **L2, solver=solver)
+    found = solve(block, **EVERY, solver=solver)
     assert found.steps <= {"auto": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
-    assert found.cost_history[0] > 100 * found.cost_history[-1]
-    tight = solve(block, **L2, solver=solver, tolerance=1e-14)
+    assert block.held_out_rms([v.sensor for v in block.views]) > 100 * block.held_out_rms(list(found.sensors))
+    tight = solve(block, **EVERY, solver=solver, tolerance=1e-14)
     # not of costs, which rounding alone moves by a billionth
     apart = ((found.residuals - tight.residuals) ** 2).sum()
-    assert apart < 1e-10 * (tight.residuals**2).sum()
+    assert apart < 1e-8 * (tight.residuals**2).sum()
 
 
 @pytest.mark.nightly
@@ -177,7 +178,7 @@ def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
 @pytest.mark.slow
 def test_a_drift_is_followed_where_the_model_has_one():
     drifting = simulate_block(4, 300, seed=1, drift=20e-6)
-    plain, found = (solve(drifting, drift=drift, jitter="off", learn_priors=False, **L2) for drift in (0, 1))
+    plain, found = (solve(drifting, drift=drift, jitter="off", **EVERY) for drift in (0, 1))
     assert drifting.held_out_rms(list(plain.sensors)) > 1.0
     assert 0.005 < drifting.held_out_rms(list(found.sensors)) < 0.05
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product, starmap
 
@@ -10,6 +11,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from benchmarks.referee import Case, Errors, cases, judge, make, referee, referee_run, solve
+from tests.ba.conftest import as_stated
 from tests.costs import once
 from tests.lanes import known, rest_slow
 
@@ -28,8 +30,9 @@ def hills(lon, lat):
 
 
 @once
-def verdict(name, seed, **options):
-    return referee(replace(TABLE[name], seed=seed), AdjustOptions(**options), hills)
+def verdict(name, seed, stated=False, **options):
+    with as_stated() if stated else nullcontext():
+        return referee(replace(TABLE[name], seed=seed), AdjustOptions(**options), hills)
 
 
 def verdicts(name, seeds=SEEDS, **options):
@@ -77,7 +80,7 @@ def test_what_a_drifting_attitude_does_is_corrected_by_default(name, across, sha
 @pytest.mark.parametrize("seeds", rest_slow([SEEDS[:1], SEEDS], mark=pytest.mark.nightly))
 def test_without_a_drift_in_the_model_the_same_scene_is_not_met(seeds):
     """With priors as stated; where they learn, that of one image may be wide enough to take up a part of it."""
-    plain = {"drift": 0, "learn_priors": False}
+    plain = {"drift": 0, "stated": True}
     stated, learnt, drifting = (
         median(verdicts("drift 1", seeds, **options), lambda v: v.after.across) for options in (plain, {"drift": 0}, {})
     )
@@ -99,7 +102,7 @@ def test_the_drift_is_learnt_as_large_as_it_is():
 @pytest.mark.slow
 def test_priors_three_times_too_narrow_are_widened_and_the_stated_place_with_them():
     found = verdicts("3 x the prior")
-    told = verdicts("3 x the prior", learn_priors=False)
+    told = verdicts("3 x the prior", stated=True)
     assert median(found, lambda v: v.sigma[2]) > 2 * median(told, lambda v: v.sigma[2])
     assert median(found, lambda v: v.nees) < 0.5 * median(told, lambda v: v.nees)
 

@@ -11,10 +11,10 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, terms
 from barpc.ba.constraints.block import Block, join
-from barpc.ba.evidence.correlated_noise import shared_errors
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, search
+from barpc.ba.select.anomalies import shared_errors
 from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _Taken, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from barpc.ba import adjust_tracks
-from barpc.ba.evidence import correlated_noise
-from barpc.ba.evidence.correlated_noise import shared_errors
+from barpc.ba.select import anomalies
+from barpc.ba.select.anomalies import shared_errors
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
 from tests.distributions import multivariate_normal
@@ -55,8 +55,8 @@ def test_errors_of_cells_are_found_in_the_view_that_has_them(side: int) -> None:
 def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) -> None:
     view, place, off = ties(60)
     off = with_cells(place, view, off, 2, 1.5, 0)
-    monkeypatch.setattr(correlated_noise, "_SIDES", np.array([2]))
-    monkeypatch.setattr(correlated_noise, "_CORRELATED_SHARES", np.array([0.6]))
+    monkeypatch.setattr(anomalies, "_SIDES", np.array([2]))
+    monkeypatch.setattr(anomalies, "_CORRELATED_SHARES", np.array([0.6]))
     found = shared_errors(view, place, SIZE, off)
     for v in range(2):
         mine = view == v

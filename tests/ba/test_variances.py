@@ -20,7 +20,7 @@ from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.statistics import SMALL
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import centers_of, solve
+from tests.ba.conftest import as_stated, centers_of, solve
 from tests.constants import Sized
 from tests.distributions import chi2
 from tests.lanes import rest_slow
@@ -32,7 +32,7 @@ def variances(n: int, model: str = "rotation", drift: int = 0, cautious: bool = 
     constants = 3 * (unknowns.rotates + unknowns.translates)
     sigmas = np.full((n, unknowns.size), 2.0)
     sigmas[:, constants:] = 1.0
-    return Variances(CameraPrior(np.full(sigmas.shape, 0.5), sigmas), unknowns, True, cautious)
+    return Variances(CameraPrior(np.full(sigmas.shape, 0.5), sigmas), unknowns, cautious)
 
 
 def seen(known: np.ndarray) -> np.ndarray:
@@ -71,15 +71,11 @@ def params_of(v: Variances, totals: list[float]) -> np.ndarray:
     return params
 
 
-def test_what_is_learnt_is_what_the_options_leave_open() -> None:
-    for model, options, learns in (
-        ("rotation", {}, True),
-        ("rotation", {"learn_priors": False}, False),
-        ("affine", {}, False),
-    ):
+def test_what_is_learnt_are_the_unknowns_in_space() -> None:
+    for model, learns in (("rotation", True), ("affine", False)):
         given = variances(2, model)
         for control in (False, True):
-            found = Variances.of(given.given, given.unknowns, AdjustOptions(**options), control)
+            found = Variances.of(given.given, given.unknowns, AdjustOptions(), control)
             assert found.learns == learns
             assert found.cautious == (not control)  # control holds the scene, and the priors need not
     assert [variances(1, model, 1).constants for model in ("rotation", "rotation+translation")] == [3, 6]
@@ -495,7 +491,7 @@ def waved(n: int = 3, cautious: bool = False) -> Variances:
     )  # fmt: skip
     sigma = np.full((n, unknowns.size), 2.0)
     sigma[:, unknowns.in_waves] = 0.3
-    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, True, cautious)
+    return Variances(CameraPrior(np.zeros(sigma.shape), sigma), unknowns, cautious)
 
 
 def test_splines_and_steps_are_as_large_as_each_view_shows_and_all_do() -> None:
@@ -558,7 +554,7 @@ def test_a_large_block_learns_once_a_solve(at_minimum, sized: Sized) -> None:
     sigma, params = problem.camera_prior.sigma, minimum.state.params
     known = determined(problem, minimum, sigma)
     squares = (params / sigma) ** 2
-    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, False)
+    v = Variances(problem.camera_prior, problem.cameras.unknowns, False)
     prior, tested = v.learnt(problem, minimum)
     total, freedom = squares[:, :6].sum(), known[:, :6].sum()
     assert tested.ratio == pytest.approx(total / freedom)
@@ -580,7 +576,7 @@ def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimu
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, :6] /= 5.0
     known = determined(problem, minimum, problem.camera_prior.sigma)
-    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False)
+    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, False)
     last = PriorTest(1.0, 2.0, np.full(4, 2.0), np.zeros(4, dtype=bool), ())  # widened before: the drift stands
     prior, tested = v.learnt(problem, minimum, last)
     total, freedom = (minimum.state.params[:, :6] / narrow[:, :6]) ** 2, known[:, :6]
@@ -589,7 +585,8 @@ def test_priors_that_are_too_narrow_are_widened_by_what_all_views_show(at_minimu
     np.testing.assert_allclose(np.sort(tested.scale)[:3], np.sqrt(factor))
     assert tested.scale.max() > 3.0 * np.sqrt(factor) > 5.0
     np.testing.assert_allclose(prior.sigma[:, :6], narrow[:, :6] * tested.scale[:, None])
-    told = replace(v, learns=False).learnt(problem, minimum)
+    with as_stated():
+        told = v.learnt(problem, minimum)
     np.testing.assert_array_equal(told[0].sigma, narrow)
     np.testing.assert_array_equal(told[1].scale, 1.0)
     assert told[1].ratio == pytest.approx(tested.ratio) == pytest.approx(total.sum() / freedom.sum())
@@ -601,7 +598,7 @@ def test_constants_of_a_large_block_once_widened_stay(at_minimum, sized: Sized) 
     sized(unknowns_tried=0)
     given = CameraPrior(problem.camera_prior.mean, problem.camera_prior.sigma.copy())
     given.sigma[:, :6] /= 30.0
-    v = Variances(given, problem.cameras.unknowns, True, False)
+    v = Variances(given, problem.cameras.unknowns, False)
     tested, priors, scales = None, [given], []
     for _ in range(12):
         now = replace(problem, camera_prior=priors[-1])
@@ -619,7 +616,7 @@ def test_a_small_block_learns_until_its_priors_stand(at_minimum) -> None:
     problem, minimum = at_minimum
     narrow = problem.camera_prior.sigma.copy()
     narrow[:, 6:] = 0.05
-    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, True, False)
+    v = Variances(CameraPrior(problem.camera_prior.mean, narrow), problem.cameras.unknowns, False)
     prior, tested = v.learnt(problem, minimum)
 
     def solved(sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -645,7 +642,7 @@ def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minim
         raise np.linalg.LinAlgError("not positive definite")
 
     monkeypatch.setattr(Variances, "_known", fails)
-    v = Variances(problem.camera_prior, problem.cameras.unknowns, True, False)
+    v = Variances(problem.camera_prior, problem.cameras.unknowns, False)
     prior, tested = v.learnt(problem, minimum)
     assert prior is problem.camera_prior
     assert np.isnan(tested.ratio)
@@ -683,7 +680,6 @@ def test_views_that_state_an_accuracy_share_what_they_are_off_by(model: str, unk
     np.testing.assert_allclose(shared(v, known), [expected, 1.0, expected, expected])
     assert learnt(v, params, known)[1].shared == pytest.approx(expected)
     np.testing.assert_array_equal(shared(v, 0.49 / freedom * known), 1.0)  # nothing is determined
-    np.testing.assert_array_equal(shared(replace(v, learns=False), known), 1.0)
     np.testing.assert_array_equal(shared(replace(v, stated=None), known), 1.0)
 
 

@@ -312,7 +312,7 @@ DIRECT = {
     "rasters/raster.py": "images, checked there",
     "base/identity.py": "any input, to hash it: below sidefile, which asks it; regular files only",
     "pointio/tables.py": "no file: lines that were read",
-    "base/blas.py": "what libraries the process has loaded, as Linux tells",
+    "base/process.py": "what libraries the process has loaded, as Linux tells",
     "base/sealed.py": "outputs, to hash them, and the state",
     "workspace.py": "barpc's own source, the state",
     "pipeline/executor.py": "arrays that the caller has put down for its workers",

@@ -80,6 +80,8 @@ COMMANDS: dict[str, list[str]] = {
     "convert": ["convert", "{file}"],
     "ortho --dem": ["ortho", IMAGES[0], "--dem", "{file}"],
     "project --dem": ["project", IMAGES[0], "5.4", "43.3", "--dem", "{file}"],
+    "localize --dem": ["localize", IMAGES[0], "500", "500", "--dem", "{file}"],
+    "fit --dem": ["fit", IMAGES[0], "--dem", "{file}"],
     "project --points": ["project", IMAGES[0], "--points", "{file}"],
     "dsm": ["dsm", "{file}"],
     "verify": ["verify", "{file}"],

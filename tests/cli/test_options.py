@@ -204,16 +204,15 @@ def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tm
         0,
         "off",
     )
-    assert not told.learn_priors
     assert (whole.fit.method, whole.fit.space) == ("lcurve-joint", "ground")
     assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (
         TieOptions(),
         RunOptions(),
     )
     file = tmp_path / "a.toml"
-    file.write_text("[adjust]\nlearn_priors = true\n")
+    file.write_text("[adjust]\nnoise_floor = 0.03\n")
     mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))
-    assert (mixed.adjust.learn_priors, mixed.adjust.drift, mixed.adjust.jitter) == (True, 1, "off")
+    assert (mixed.adjust.noise_floor, mixed.adjust.drift, mixed.adjust.jitter) == (0.03, 1, "off")
     file.write_text('[adjust]\ncenter = "projective"\n')
     with pytest.raises(InputError, match=r"center stands in a file, where it is not accepted; give the flag --paper"):
         run_options({}, str(file))
@@ -236,7 +235,7 @@ def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:
 def test_the_help_of_a_run_has_the_usual_flags_and_says_where_the_rest_is() -> None:
     usual = [flag for flags in listed_in_help("adjust", "--help").values() for flag in flags]
     assert len(set(usual) - {"--help", "--help-all", "--output"}) == 14
-    assert {"--help", "--help-all", "--out-dir", "--gcp", "--dem", "--keep-going"} <= set(usual)
+    assert {"--help", "--help-all", "--out-dir", "--output", "--gcp", "--dem", "--keep-going"} <= set(usual)
     assert "--jitter" not in usual
     whole = [flag for flags in listed_in_help("adjust", "--help-all").values() for flag in flags]
     known = {flag for one in adjust.params for flag in one.opts if flag.startswith("--")}

@@ -6,6 +6,7 @@ import gc
 import io
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import threading
 import time
 import warnings
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from types import SimpleNamespace
 
 import click
@@ -22,6 +24,7 @@ from barpc.base.errors import InputError
 from barpc.cli.terminal import MINUTE, Lines, progress_told
 from barpc.verbs.workers import THREADS, executor_for
 from tests.lanes import rest_slow
+from tests.reliability.conftest import pristine  # noqa: F401
 
 
 class Told:
@@ -65,6 +68,21 @@ def test_of_what_nothing_is_done_no_end_is_told() -> None:
     told.now += 60.0
     told.lines.look()
     assert told.said == ["match: 0 of 40"]
+
+
+@pytest.mark.slow
+@pytest.mark.landing(6)
+def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:  # noqa: F811
+    screen, side = pytest.importorskip("pty").openpty()
+    with subprocess.Popen([sys.executable, "-m", "barpc", "check", *pristine[:2]], stdout=side, stderr=side):
+        os.close(side)
+        shown = b""
+        with suppress(OSError):  # the end of a terminal
+            while part := os.read(screen, 4096):
+                shown += part
+    os.close(screen)
+    lines = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode()).splitlines()
+    assert any(line.startswith(("The cameras of both", "2 images need")) for line in lines), lines[-5:]
 
 
 def test_tenths_are_told_only_where_they_are_asked_for() -> None:

@@ -147,7 +147,7 @@ def test_a_dem_without_a_height_there_is_an_error(image, dem, tmp_path, capsys):
     with rasterio.open(dem, "r+") as out:
         out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
     assert run("info", image, "--dem", dem) == 1
-    assert "no height in the middle" in capsys.readouterr().err
+    assert "dem.tif: has no height at the images' position" in capsys.readouterr().err
 
 
 def test_exchanged_coordinates_are_recognised(image, tmp_path, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +14,6 @@ from barpc.cli import fit as fitting
 from barpc.cli.adjust import _tell_result
 from barpc.cli.fit import _certificate
 from barpc.export import targets
-from barpc.report import compare
 from barpc.rpcio import write_rpc
 from tests.cli.test_main import run
 from tests.report.made import a_summary
@@ -119,29 +117,6 @@ def test_a_miss_writes_nothing_unless_told_to(source: str, tmp_path: Path, capsy
     assert out.is_file()
 
 
-def test_altitudes_come_from_a_dem_and_its_margin_unless_they_are_given(
-    source: str, fitted: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from barpc.rasters.dem import Dem
-
-    asked = list[Any]()
-
-    def terrain_range(model: Any, size: Any, alts: Any, dem: Any, margin: float) -> tuple[float, float]:
-        asked.append((size, dem, margin))
-        return 100.0 - margin, 100.0 + margin
-
-    monkeypatch.setattr(Dem, "open", lambda dem, geoid: (dem, geoid))
-    monkeypatch.setattr("barpc.verbs.fitting.terrain_range", terrain_range)
-    assert run("fit", source, "--dem", "d.tif", "--geoid", "g.gtx", "--dem-margin", "50") == 0
-    assert run("fit", source, "--dem", "d.tif", "--dem", "e.tif") == 0
-    assert asked == [((600, 500), (("d.tif",), "g.gtx"), 50.0), ((600, 500), (("d.tif", "e.tif"), None), 500.0)]
-    assert [row[1] for row in fitted] == [(50.0, 150.0), (-400.0, 600.0)]
-    assert run("fit", source, "--dem", "d.tif", "--alt-range", "0", "300") == 0
-    assert len(asked) == 2
-    assert fitted[-1][1] == (0.0, 300.0)
-    assert run("fit", source, "--dem", "d.tif", "--dem-margin", "-1") == 2
-
-
 @pytest.mark.parametrize(("wide", "count"), [("", 1), ("too far", 2)])
 def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
     wide: str, count: int, source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -173,20 +148,7 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
 # --- check, report, adjust --------------------------------------------------------------------------------
 
 
-def test_two_runs_are_compared_and_one_is_reported_again(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    found = {"a": "x", "b": "y", "views": [], "pairs": [], "lines": ["All alike."]}
-    monkeypatch.setattr(compare, "compare_runs", lambda one, two: {**found, "a": one, "b": two})
-    monkeypatch.setattr("barpc.pipeline.remake.remake_report", lambda one: f"{one}/report.html")
-    assert run("report", "one") == 0
-    assert capsys.readouterr().out == "one/report.html\n"
-    assert run("report", "one", "two") == 0
-    said = capsys.readouterr().out
-    assert said.startswith("A: one\nB: two\n")
-    assert said.endswith("All alike.\n")
-    assert run("report", "one", "two", "--json") == 0
-    assert json.loads(capsys.readouterr().out) == {**found, "a": "one", "b": "two"}
+def test_the_summary_of_one_run_is_not_printed_again(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("report", "one", "--json") == 2
     assert "--json goes with two runs" in capsys.readouterr().err
 
@@ -214,34 +176,6 @@ def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
     assert _tell_result(result) == 3
     headline = "" if quiet else "All well. "
     assert capsys.readouterr() == (out, f"barpc: needs review (exit code 3): {headline}One.\n")
-
-
-def test_match_stops_after_matching_and_check_asks_another_entry(monkeypatch: pytest.MonkeyPatch) -> None:
-    from barpc import pipeline
-
-    asked = list[tuple[str, Any, str, dict[str, Any]]]()
-
-    def entry(name: str) -> Any:
-        def work(images: Sequence[str], *, options: Any, executor: Any, progress: Any, **where: str) -> Any:
-            assert executor is None
-            assert callable(progress)
-            asked.append((name, list(images), options.stop_after, where))
-            return SimpleNamespace(summary={}, record=a_summary([]), passed=True, root="")
-
-        return work
-
-    for name in ("adjust", "check"):
-        monkeypatch.setattr(pipeline, name, entry(name))
-    assert run("adjust", "a.tif", "b.tif", "-o", "out") == 0
-    assert run("match", "a.tif", "-o", "out") == 0
-    assert run("check", "a.tif") == 0
-    usual = asked[0][2]
-    assert usual != "matching"
-    assert asked == [
-        ("adjust", ["a.tif", "b.tif"], usual, {"out_dir": "out"}),
-        ("adjust", ["a.tif"], "matching", {"out_dir": "out"}),
-        ("check", ["a.tif"], usual, {}),
-    ]
 
 
 # --- export -----------------------------------------------------------------------------------------------

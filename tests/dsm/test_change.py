@@ -39,7 +39,7 @@ def one_block(seed):
     """Error of the height difference of two dates at some points, its sigma, and that of independent dates."""
     # (an image's tie points are never believed beyond 0.02 px together: 0.3 px of 60 are 0.04)
     block = simulate_block(4, 60, seed=seed, per_site=4, size=(6000, 6000), noise=0.3)
-    found = adjust_tracks(block.views, block.tracks, AdjustOptions(drift=0, learn_priors=False))
+    found = adjust_tracks(block.views, block.tracks, AdjustOptions(drift=0))
     views = [replace(view, sensor=sensor) for view, sensor in zip(block.views, found.sensors, strict=True)]
     errors = CameraErrors.of(block_prior(found), views)
     corrections = zip(block.views, block.truth.corrections, strict=True)

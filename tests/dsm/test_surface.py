@@ -444,23 +444,24 @@ def test_images_that_are_not_matched_are_refused_by_name(given, error, said, run
         run_of_shots[0]([shot("a", **given), shot("b")])
 
 
-def test_the_report_shows_the_tile_with_most_heights_by_both_kinds_of_cameras(tmp_path, monkeypatch, caplog):
+def test_the_report_shows_the_part_of_a_tile_with_most_heights_by_both_kinds_of_cameras(tmp_path, monkeypatch, caplog):
     views = [SimpleNamespace(name=name) for name in "abc"]
     run = SimpleNamespace(views=[SimpleNamespace(rpc_source=f"came with {name}") for name in "abc"], outputs=())
-    bands = np.full((5, 4, 8), np.nan, np.float32)
-    bands[0, 1:, 4:], bands[2, 1:, 4:] = 7.0, [0.25, 0.5, 0.5, 1.0]
+    bands = np.full((5, 4, 12), np.nan, np.float32)
+    bands[0, 1:, 8:], bands[2, 1:, 8:] = 7.0, [0.25, 0.5, 0.5, 1.0]
     place = {"crs": "EPSG:32631", "transform": rasterio.Affine(2, 0, 0, 0, -2, 0)}
-    with rasterio.open(tmp_path / "dsm.tif", "w", "GTiff", 8, 4, 5, dtype="float32", **place) as file:
+    with rasterio.open(tmp_path / "dsm.tif", "w", "GTiff", 12, 4, 5, dtype="float32", **place) as file:
         file.write(bands)
-    cells = [SimpleNamespace(size=(4, 4), step=2.0, number=n) for n in range(2)]
+    cells = [Tile("", west, 0.0, 2.0, size, (0.0, 9.0)) for west, size in ((0.0, (4, 4)), (8.0, (8, 4)))]
     tiles = [((0, 0), cells[0], [[(0, 1)]]), ((4, 0), cells[1], [[(2, 0), (2, 1)], [(0, 1)]])]
     remade, before = [], np.full((4, 4), 3.0, np.float32)
 
     def surface(pairs, tile, band):
         assert pairs == [("c/came with c", "a/came with a"), ("c/came with c", "b/came with b")]
-        assert (tile, band) == (cells[1], 3)
+        assert (tile, band) == (replace(cells[1], west=16.0, size=(4, 4)), 3)
         return before, np.full((4, 4), np.nan, np.float32), None
 
+    monkeypatch.setattr(surface_module, "_RELIEF_SIDE", 4)
     monkeypatch.setattr(surface_module, "surface_tile", surface)
     monkeypatch.setattr(
         surface_module, "_delivered", lambda view, run, number: f"{view.name}/{run.summary.views[number].rpc_source}"

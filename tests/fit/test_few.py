@@ -11,7 +11,7 @@ from click.testing import CliRunner
 import barpc
 from barpc.base.errors import FitError
 from barpc.cli import cli
-from barpc.fit.few import MODELS, WHOLE, fit_few
+from barpc.fit.given import MODELS, WHOLE, fit_few
 
 RPC = barpc.read_rpc(Path(__file__).resolve().parents[2] / "data_samples/view_00.tif")
 
@@ -95,7 +95,7 @@ def test_weights_count(monkeypatch):
 def test_each_model_is_found_again_by_exact_points_of_its_own(model):
     rng = np.random.default_rng(4)
     place = rng.uniform(-1.0, 1.0, (30, 3))
-    from barpc.fit.few import _coefficients, _projected
+    from barpc.fit.given import _coefficients, _projected
 
     coeffs = np.zeros((4, 20))
     coeffs[1::2, 0] = 1.0

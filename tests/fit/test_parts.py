@@ -211,7 +211,7 @@ def test_of_several_fits_the_best_is_taken(ridge, newton, how, taken) -> None:
         return fits[method]
 
     with pytest.raises(FitError, match=taken) if " px" in taken else nullcontext():
-        assert fit_module._best_method(attempt, FitOptions(**given), strict, exact).method == taken
+        assert fit_module.best_method(attempt, FitOptions(**given), strict, exact).method == taken
     assert tried == list(fits)
 
 

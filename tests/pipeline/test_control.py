@@ -481,12 +481,12 @@ def test_an_altitude_of_zero_is_none_and_holds_an_image_sideways_alone(tmp_path,
     for name in ("lonlatalt", "sigma"):
         np.testing.assert_array_equal(getattr(found, name)[~some], getattr(POINTS, name)[~some])
     assert found.left_out == (
-        f"{path}: {count} of 6 points have no altitude, or a default (0, or one for all): {count} constrain the images "
-        "horizontally only; give their altitudes, or --dem",
+        f"{path}: {count} of 6 points have no altitude, or a default (0, or one for all) and constrain the images "
+        "horizontally only: give their altitudes, or --dem",
     )
 
 
-def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path, caplog) -> None:
+def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path) -> None:
     path = tmp_path / "p.gcp"
     path.write_text(asp(at_zero(POINTS, np.arange(6) != 1)))
     options = RunOptions()
@@ -496,13 +496,13 @@ def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path, capl
     np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(options.adjust.dem_sigma, 5.0 * 5**0.5))
     assert found.sigma[1, 2] == 0.3
     assert found.left_out == ()
-    assert "5 of 6 points have no altitude, or a default (0, or one for all): the DEM's are taken" in caplog.text
+    assert "5 of 6 points have no altitude, or a default (0, or one for all): the DEM's are" in " ".join(found.said)
     east = float(np.median(POINTS.lonlatalt[:, 0]))
     found = load_gcps([str(path)], VIEWS, options, Plane(east))  # type: ignore[arg-type]
     assert found is not None
     beyond = (POINTS.lonlatalt[:, 0] >= east) & (np.arange(6) != 1)
     np.testing.assert_array_equal(found.lonlatalt[:, 2] == 321.0, ~beyond & (np.arange(6) != 1))
-    assert f"{beyond.sum()} constrain the images horizontally only" in found.left_out[0]
+    assert f"; {beyond.sum()} of them constrain the images horizontally only" in found.left_out[0]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -528,8 +528,8 @@ def test_points_without_a_column_of_altitudes_are_as_those_of_zero(tmp_path) -> 
     assert found is not None
     assert found.said == (f"{path}: CSV; no altitudes",)
     assert found.left_out[0].endswith(
-        "6 constrain the images horizontally only; give their altitudes, or --dem; left out"
-    ) or (found.left_out[0].endswith("6 constrain the images horizontally only; give their altitudes, or --dem"))
+        "and constrain the images horizontally only: give their altitudes, or --dem; left out"
+    ) or (found.left_out[0].endswith("and constrain the images horizontally only: give their altitudes, or --dem"))
     found = load_gcps([str(path)], VIEWS, RunOptions(), Plane())  # type: ignore[arg-type]
     assert found is not None
     assert found.lonlatalt[:, 2].tolist() == [321.0] * 6

@@ -18,7 +18,7 @@ from barpc.base.errors import BarpcWarning, FitError, InputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
-from barpc.pipeline import inputs
+from barpc.pipeline import adjusting, inputs
 from barpc.pipeline import run as stages
 from barpc.pipeline.earlier import of_new
 from barpc.pipeline.inputs import (
@@ -238,20 +238,15 @@ def test_of_each_track_with_something_new_all_observations_are_kept(seed) -> Non
 # --- what is read before any work -------------------------------------------------------------------------
 
 
-def test_ground_points_that_are_left_out_are_said_and_references_are_looked_at(tmp_path, caplog, monkeypatch) -> None:
-    """Of GCPs and of check points, in the order given; a reference that is none stops the run here."""
-    for name in ("g.csv", "c.csv"):
-        (tmp_path / name).write_text("nothing\n")
-    given = RunOptions(gcp=(str(tmp_path / "g.csv"),), check_points=(str(tmp_path / "c.csv"),), keep_going=True)
-    assert side_inputs(given, views()) is None
-    lines = [record.getMessage() for record in caplog.records]
-    assert [Path(line.split(",")[0]).name for line in lines] == ["g.csv", "c.csv"]
+def test_references_are_looked_at(monkeypatch) -> None:
+    """One that is none stops the run here."""
     read = []
     monkeypatch.setattr(inputs, "Sheet", SimpleNamespace(read=read.append))
-    monkeypatch.setattr(inputs, "_require_cover", lambda *given: None)
-    monkeypatch.setattr(inputs, "Dem", SimpleNamespace(open=lambda *given: given))
+    monkeypatch.setattr(
+        inputs, "Dem", SimpleNamespace(open=lambda *given: SimpleNamespace(given=given, covering=np.hypot))
+    )
     with_all = RunOptions(dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"))
-    assert side_inputs(with_all, views()) == (("d.tif",), "g.gtx", "egm96")
+    assert side_inputs(with_all, views()).given == (("d.tif",), "g.gtx", "egm96")
     assert read == ["r.tif", "s.tif"]
 
 
@@ -275,7 +270,7 @@ def test_the_page_is_named_where_it_can_be_drawn(tmp_path, monkeypatch, drawn) -
 def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> None:
     sources = tuple(SimpleNamespace(path=Path(f"{n}.RPB")) for n in range(3))
     run = Run("adjust", views(), sources, NONE, left_out=(("/x/bad.tif", "bad"),))  # type: ignore[arg-type]
-    kept = stages._only(run, frozenset(["v0", "v2"]), {})
+    kept = adjusting._only(run, frozenset(["v0", "v2"]), {})
     assert [view.name for view in kept.views] == ["v0", "v2"]
     assert kept.sources == (sources[0], sources[2])
     assert kept.left_out == (
@@ -283,7 +278,7 @@ def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> N
         ("/x/v1.tif", "it shares no tie points with the largest group of images"),
     )
     assert (kept.adjustment, kept.reference) == (None, None)
-    known = stages._only(run, frozenset(["v0", "v2"]), {"v1": "shows the picture mirrored"})
+    known = adjusting._only(run, frozenset(["v0", "v2"]), {"v1": "shows the picture mirrored"})
     assert known.left_out[1] == ("/x/v1.tif", "shows the picture mirrored")
 
 
@@ -292,12 +287,14 @@ def test_a_run_without_some_of_its_views_keeps_what_belongs_to_the_others() -> N
 )
 def test_heights_of_a_reference_are_as_sure_as_what_they_count_from(monkeypatch, stated, known, used) -> None:
     seen = {}
-    monkeypatch.setattr(stages, "register_views", lambda *given: seen.update(accuracy=given[4]))
+    monkeypatch.setattr(adjusting, "register_views", lambda *given: seen.update(accuracy=given[4]))
     options = RunOptions(
         dem="d.tif", reference=("r.tif",), reference_sigma=7.0,
         adjust=AdjustOptions(dem_bias_sigma=stated, dem_sigma=4.0),
     )  # fmt: skip
-    stages._register_to_reference(SimpleNamespace(views=views()), options, SimpleNamespace(known=known), HERE)  # type: ignore[arg-type]
+    adjusting._register_to_reference(
+        SimpleNamespace(views=views(), options=options), SimpleNamespace(known=known), HERE
+    )  # type: ignore[arg-type]
     assert seen["accuracy"] == Accuracy(7.0, 4.0, used)
 
 
@@ -361,7 +358,7 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
 
 def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
     view = simulate_block(2, 4, seed=1, num_checks=0).views[0]
-    assert stages._centers([view], "line")[0].method != "nominal"
+    assert adjusting._centers([view], "line")[0].method != "nominal"
     assert "nominal" not in caplog.text
 
 
@@ -390,7 +387,7 @@ def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
         return loaded
 
     monkeypatch.setattr(stages, "_with_views", load)
-    monkeypatch.setattr(stages, "_with_ties", lambda run, options, work: tied if run is loaded else None)
+    monkeypatch.setattr(stages, "with_ties", lambda run, work: tied if run is loaded else None)
     monkeypatch.setattr(stages, "summarize", lambda run: a_record(run, passed=run is tied))
     result = stages.check(given, RunOptions(keep_going=True), progress=told)
     assert [view.name for view in result.views] == ["v2", "v0", "v1"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from barpc.base.blas import _switches, one_blas_thread
+from barpc.base.process import _switches, one_blas_thread
 from barpc.verbs.workers import THREADS
 
 ROOT = Path(__file__).resolve().parents[2]

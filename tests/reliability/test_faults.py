@@ -305,10 +305,10 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "zero workers": (given("-j", 0), 2, ("0",)),
     "a number that is none": (given("--drift", "far"), 2, ("far",)),
     "a choice that is none": (given("--images", "jpeg"), 2, ("jpeg",)),
-    "an unknown loss": (
-        given("--options", "o.toml", o__toml=b"[adjust]\nloss = 'magic'\n"),
+    "an unknown solver": (
+        given("--options", "o.toml", o__toml=b"[adjust]\nsolver = 'magic'\n"),
         1,
-        ("magic", "geman_mcclure, linear"),
+        ("magic", "auto, sparse"),
     ),
     "an unknown model": (given("--model", "magic"), 2, ("magic", "rotation")),
     "an unknown matcher": (

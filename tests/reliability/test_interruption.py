@@ -283,7 +283,7 @@ def test_an_error_of_the_machine_is_one_line(crops, out, monkeypatch, error):
     def fail(*_args, **_kwargs):
         raise error
 
-    monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
+    monkeypatch.setattr("barpc.pipeline.adjusting.adjust_tracks", fail)
     said = barpc("adjust", *crops, "-o", out, "--overwrite")
     assert said.code == 1
     assert len(said.err.strip().splitlines()) == 1
@@ -297,7 +297,7 @@ def test_debug_shows_the_traceback_of_a_bug(crops, out, monkeypatch):
     def fail(*_args, **_kwargs):
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("barpc.pipeline.run.adjust_tracks", fail)
+    monkeypatch.setattr("barpc.pipeline.adjusting.adjust_tracks", fail)
     said = barpc("--debug", "adjust", *crops, "-o", out, "--overwrite")
     assert said.code == 1
     assert "Traceback" in said.err

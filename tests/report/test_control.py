@@ -9,7 +9,7 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run, verdict
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.page import report_html
 
 
@@ -47,7 +47,7 @@ def test_a_wrong_position_in_one_image_is_found_there_and_said(block_run):
     run = replace(run, tracks=run.tracks.select(run.keep))  # no wrong matches: nothing has to be cut
     wrong, xy = 7, gcps.xy.copy()
     xy[wrong, 1] += 12.0 * gcps.xy_sigma[wrong]
-    adjustment, summary = summary_of(run, replace(gcps, xy=xy), loss="linear")
+    adjustment, summary = summary_of(run, replace(gcps, xy=xy))
     assert adjustment.gcp_inlier.all()
     assert int(np.argmax(adjustment.gcp_w)) == wrong
     plain = np.abs(adjustment.gcp_w)[wrong]

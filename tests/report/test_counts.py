@@ -12,7 +12,7 @@ import pytest
 
 from barpc.ba.constraints.ground import TerrainTest
 from barpc.report import page, verdict
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.summary import TracksEntry
 from barpc.report.verdict import block_verdict
 from barpc.tie.reference import ReferenceControl, ViewMatch
@@ -101,5 +101,5 @@ def test_the_answers_of_the_page(views, pairs, tracks):
     made = [section for make in page.SECTIONS if (section := make(files)) is not None]
     assert len(made) >= 4
     for section in made:
-        spoken([section.answer, *section.points, *(words for _, words in section.charts)])
+        spoken([section.key, section.answer, *section.points, *(words for _, words in section.charts)])
     spoken(["decisions:", *decisions(summary)])  # of nothing none

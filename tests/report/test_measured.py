@@ -14,7 +14,7 @@ from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.report import outcome as runs
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.measures.block import measure_scene
 from barpc.report.measures.ground_points import measure_check_points, measure_control, measure_gcps, measure_reference
 from barpc.report.measures.pairs import MAX_PER_PAIR

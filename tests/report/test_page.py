@@ -82,7 +82,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
         "Which images can I use?",
         "Where are the images, and which are connected?",
         "Are the residuals random?",
-        "Do the pairs fit for stereo, and can heights be measured?",
+        "Do the pairs fit for stereo and heights?",
         "How was each camera corrected?",
         "How uncertain are position and shape of the scene?",
         "What was decided, and why?",
@@ -129,8 +129,9 @@ def test_fifty_images_make_less_than_3_mb_in_seconds(tmp_path):
     run = run_of_block(50, 20_000, outliers=0.05)
     start = time.process_time()
     summary = summarize(run)
+    (tmp_path / "tables").mkdir()
     for name, content in TABLES.items():
-        (tmp_path / name).write_bytes(b"".join(content(run, summary)))
+        (tmp_path / "tables" / name).write_bytes(b"".join(content(run, summary)))
     html = page.report_html(summary, tmp_path)
     assert time.process_time() - start < 25.0  # CPU s; some 3 on a machine of its own
     assert len(html.encode()) < 3e6

@@ -13,7 +13,7 @@ from jsonschema import Draft202012Validator
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.report import Run, verdict
-from barpc.report.answers import decisions
+from barpc.report.decisions import decisions
 from barpc.report.measures.views import moved_in_space
 from barpc.report.outcome import pair_ties, triangulate_tracks
 from barpc.report.records import Number, column, json_form, table

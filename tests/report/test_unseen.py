@@ -13,7 +13,7 @@ from barpc.ba.unseen import unseen_steps
 from barpc.base.geodesy import ground_from_ecef
 from barpc.report import Run, summarize
 from barpc.report.measures.block import explanations
-from barpc.report.unseen import unseen_parts
+from barpc.report.quality_checks import unseen_parts
 from barpc.simulate import simulate_block
 
 FROM = 350  # row

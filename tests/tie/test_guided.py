@@ -43,7 +43,7 @@ def pair() -> tuple[Keypoints, Keypoints, EpipolarSegments]:
     slope = rng.uniform(-0.05, 0.05, 500)
     slope[::50] = np.nan
     before, after = rng.uniform(-16, -8, 500), rng.uniform(8, 16, 500)
-    return a, b, EpipolarSegments(np.array([1.0, 0.0]), *predicted.T, slope, before, after, LINEAR)
+    return a, b, EpipolarSegments(np.array([1.0, 0.0]), *predicted.T, slope, before, after, lambda: LINEAR)
 
 
 def brute(a: Keypoints, b: Keypoints, where: EpipolarSegments) -> dict[tuple[int, int], tuple[float, float]]:
@@ -245,7 +245,9 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     rng = np.random.default_rng(0)
     turned = rng.uniform(0, 2000, (4000, 2))
     place = rng.uniform(-100, 2100, (1500, 2))
-    where = EpipolarSegments(np.array([1.0, 0.0]), *place.T, *(np.full(1500, x) for x in (slope, *reach)), np.eye(2))
+    where = EpipolarSegments(
+        np.array([1.0, 0.0]), *place.T, *(np.full(1500, x) for x in (slope, *reach)), lambda: np.eye(2)
+    )
     first, second = (
         _Described.of(replace(keypoints(rng, xy, np.ones((len(xy), 128), np.uint8)), angle=angle), np.eye(2))
         for xy, angle in ((place, rng.uniform(0, 7, 1500)), (turned, rng.uniform(0, 7, 4000)))

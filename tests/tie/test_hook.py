@@ -150,7 +150,7 @@ def everywhere(xy: np.ndarray) -> EpipolarSegments:
     """Predictions of a place in B that is that of A, ten pixels along the rows either way."""
     x, y = xy.T
     zero, ten = np.zeros(len(xy)), np.full(len(xy), 10.0)
-    return EpipolarSegments(np.array([1.0, 0.0]), x, y, zero, -ten, ten, np.eye(2))
+    return EpipolarSegments(np.array([1.0, 0.0]), x, y, zero, -ten, ten, lambda: np.eye(2))
 
 
 def test_a_matcher_of_ones_own_sees_the_images_as_their_files_are(monkeypatch) -> None:

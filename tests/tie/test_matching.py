@@ -103,7 +103,9 @@ def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_t
     assert asked[1] == "of the first"
 
 
-FLAT = Prediction(lambda xy: EpipolarSegments(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, np.eye(2)), 3.0, list)
+FLAT = Prediction(
+    lambda xy: EpipolarSegments(np.array([1.0, 0.0]), *(np.zeros(len(xy)),) * 5, lambda: np.eye(2)), 3.0, list
+)
 
 
 @pytest.mark.parametrize(

@@ -206,16 +206,18 @@ def test_patches_are_registered_tile_by_tile(monkeypatch, sized: Sized) -> None:
 
     def ordered(function: Any, tasks: Any, name: str) -> list[PatchRegistration]:
         seen.extend(tasks)
-        return [PatchRegistration.none(task[3]) for task in tasks]
+        return [PatchRegistration.none(np.concatenate([part[2] for part in parts])) for parts, _ in tasks]
 
     monkeypatch.setattr("barpc.tie.patches.register._sparse", lambda *_: False)
     sized(patches_together=1)
     found = links.register(1, 256, SimpleNamespace(ordered=ordered))
     assert len(found.xy) == 160
-    for _, band, origin, start, linear, structural in seen:
+    assert [band for _, band in seen] == [1]  # small parts of a view in one task
+    for _, origin, start, linear, structural in seen[0][0]:
         assert (np.ptp(np.floor(origin / 256), axis=0) == 0).all()
-        assert (band, structural) == (1, False)
+        assert not structural
         assert len(origin) == len(start) == len(linear)
-    assert sum(len(task[2]) for task in seen) == 160
-    assert len(seen) > 20
-    np.testing.assert_array_equal(np.sort(found.xy, axis=0), np.sort(np.concatenate([t[3] for t in seen]), axis=0))
+    starts = [part[2] for part in seen[0][0]]
+    assert sum(map(len, starts)) == 160
+    assert len(starts) > 20
+    np.testing.assert_array_equal(np.sort(found.xy, axis=0), np.sort(np.concatenate(starts), axis=0))

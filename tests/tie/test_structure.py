@@ -284,7 +284,9 @@ def test_how_long_bands_are_is_measured_in_the_middles_of_the_windows(half, step
     def where(at: np.ndarray) -> EpipolarSegments:
         length = np.where(at[:, 0] < 2000.0, half, np.nan)
         nothing = np.zeros(len(at))
-        return EpipolarSegments(np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, np.eye(2))
+        return EpipolarSegments(
+            np.array([1.0, 0.0]), nothing, nothing, nothing, -0.5 * length, 1.5 * length, lambda: np.eye(2)
+        )
 
     view: View = SimpleNamespace(path="", size=(4000, 2000))  # type: ignore[assignment]
     for windows, found in (([(0, 0, 2000, 2000), (3000, 0, 900, 900)], step), ([(3000, 0, 900, 900)], 2), ([], 1)):
@@ -320,7 +322,9 @@ def test_a_segment_is_looked_at_as_far_as_it_lies_in_the_image(start, axis, most
     search._files = (("a", (1, 1)), ("b", (1000, 800)))
     (x, y), half = axis, np.full(1, most)
     along, across = start[0] * x + start[1] * y, start[1] * x - start[0] * y
-    where = EpipolarSegments(np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, np.eye(2))
+    where = EpipolarSegments(
+        np.array(axis), np.array([along]), np.array([across]), np.zeros(1), -half, half, lambda: np.eye(2)
+    )
     found = search._part_in_b(where, np.zeros(1), np.array([0]), 10.0)
     assert found == pytest.approx(expected)
 
@@ -401,7 +405,7 @@ def test_a_place_beyond_the_band_and_its_sides_is_not_found_however_alike(
     axis = np.array([0.6, 0.8])
     along, across = (at + moved) @ axis + beyond, (at + moved) @ [-0.8, 0.6] + aside
     half = np.full(3, 25.0)
-    where = EpipolarSegments(axis, along, across, np.zeros(3), -half, half, np.eye(2))
+    where = EpipolarSegments(axis, along, across, np.zeros(3), -half, half, lambda: np.eye(2))
     monkeypatch.setattr(structural, "linear_map", lambda *_: np.eye(2))
     search = _GridSearch.__new__(_GridSearch)
     search._views, search._files, search._band, search._whole = (), files, 1, False  # type: ignore[assignment]

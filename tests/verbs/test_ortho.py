@@ -12,7 +12,7 @@ import pytest
 import rasterio
 
 import barpc
-from barpc.base.errors import FitError, InputError, OutputError, Remark
+from barpc.base.errors import InputError, OutputError, Remark
 from barpc.rasters.dem import Dem
 from barpc.rpcio import write_rpc_copy
 from tests.cli.test_images import run
@@ -145,7 +145,7 @@ def test_where_the_dem_has_a_void_there_are_no_pixels_and_beyond_it_no_map(ramp,
         assert np.isnan(file.nodata)
     assert np.isnan(shown[:, : col - 40]).all()
     assert np.isfinite(shown[SIDE // 2, col + 40 : col + 80]).all()
-    with pytest.raises(FitError, match="the DEM has no altitude under the image"):
+    with pytest.raises(InputError, match=r"far\.tif: has no height at the images' position"):
         barpc.ortho(ramp, tmp_path / "none", dem=write_hills(tmp_path / "far.tif", start=7.0))
     assert not (tmp_path / "none").exists()
 

@@ -27,7 +27,6 @@ from barpc.cli import COMMANDS, cli
 from barpc.simulate import simulate_block
 from barpc.verbs.images import every
 from barpc.verbs.options import FLAG_NAMES, run_options
-from barpc.verbs.points import with_altitudes
 from barpc.verbs.python import in_keywords
 from tests.docs.test_pages import script
 from tests.rpcio.conftest import make_rpc
@@ -36,15 +35,6 @@ SAMPLES = Path(__file__).parents[2] / "data_samples"
 VIEWS = sorted(SAMPLES.glob("view_*.tif"))
 GROUND = [5.4, 43.3, 120.0]
 PUBLIC = [name for name in barpc.__all__ if name != "__version__"]
-
-
-def test_a_terrain_gives_points_their_altitudes():
-    def plane(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-        return 10.0 * lon + lat
-
-    found = with_altitudes([[5.0, 44.0], [6.0, 43.0]], None, plane)
-    assert found.tolist() == [[5.0, 44.0, 94.0], [6.0, 43.0, 103.0]]
-    assert with_altitudes([[5.0, 44.0, 1.0]], None, plane).tolist() == [[5.0, 44.0, 94.0]]
 
 
 # --- a function a verb ------------------------------------------------------------------------------------
@@ -186,7 +176,7 @@ barpc.adjust("a.tif", pathlib.Path("out"), gcp=["a.csv", pathlib.Path("b.csv")],
 barpc.dsm("run", "out.tif", gsd=2, alt=(0.0, 9.0))
 barpc.fit("a.tif", alt_range=[0, 400], method="ridge")
 barpc.adjust("a.tif", "out", gpc="a.csv")
-barpc.adjust("a.tif", "out", loss="huber")
+barpc.adjust("a.tif", "out", solver="huber")
 barpc.dsm("run", "out.tif", gsd="2")
 barpc.export("run", "out", "s2p", alt_range=(1.0, 2.0))
 barpc.fit("a.tif", matcher="guided")

@@ -227,8 +227,7 @@ class PointConstraints:
     @property
     def is_judged(self) -> bool:
         """Whether the weight of the DEM is estimated from the tie points."""
-        given = self.dem is None or self.reference is not None
-        return not given and self.options.learn_priors
+        return self.dem is not None and self.reference is None
 
     def hold(self, problem: Problem, points: Array) -> Problem:
         """Return the problem with the priors on points, computed at `points` (P, 3), ECEF [m]."""

@@ -85,7 +85,6 @@ class Rounds:
         residual, projected = problem.prepare(state.params, state.points)
         self.problem, self.block = heights.hold(problem, state.points), block
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
-        self.robust = options.loss != "linear"
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
         faint = downweighting(block, heights)[block.point]
@@ -113,14 +112,14 @@ class Rounds:
         self.projected = projected  # projection of the state; None if it was not computed
         self.passes, self.noise = 0, 1.0 if known is None else known.noise
         self.misfit: Array | float = 0.0
-        if known is not None and self.goes_on and self.robust:
+        if known is not None and self.goes_on:
             self.misfit = known.smooth.misfit()
         self.scatter: Array | None = None  # residuals without smooth parts; None: not computed yet
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
         """Repeat passes until inliers, weights and priors are constant; with `once` one pass only."""
-        if self.robust and not self.is_known:
+        if not self.is_known:
             self._search()
         while True:
             outcome = self._cut_and_solve(once)
@@ -178,7 +177,7 @@ class Rounds:
         """
         was_in_use = self.use
         many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
-        if self.robust and self.passes and many_cut:
+        if self.passes and many_cut:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = retriangulate_rejected(
                 self.problem, self.state, self.residual, self.use, weight, self.projected
@@ -198,7 +197,7 @@ class Rounds:
         # an error common to all views affects the accuracy of the scene, but no residual: its prior must converge
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
-        if once or self.passes >= TRIED or (settled and (same or not self.robust)):
+        if once or self.passes >= TRIED or (settled and same):
             redundancy = 0.5 * self.observations.mean_freedom(self.use)
             smooth = self.smooth.test_neighbours(smooth, self.residual, self.use, redundancy)
             if found.covariance(self.problem.free).is_large:
@@ -211,7 +210,7 @@ class Rounds:
                 inlier=self.use,
                 noise=self.noise,
                 passes=self.passes,
-                told=self.observations.told_by(self.use / (self.observations.sigma * self._weighting_noise)),
+                told=self.observations.told_by(self.use / (self.observations.sigma * self.noise)),
                 prior=tested,
                 smooth=smooth,
                 by_point=self._by_points().by_point.copy(),  # the next projection overwrites it
@@ -219,29 +218,23 @@ class Rounds:
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
 
-    @property
-    def _weighting_noise(self) -> float:
-        """The noise by which observations are weighted."""
-        return self.noise if self.options.estimate_noise else 1.0
-
     def _weights_stand(self) -> bool:
         """Return whether the new noise and misfit leave the weights of the observations unchanged."""
-        next_weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)[self.use]
+        next_weight = self.observations.weight(self.use, self.noise, self.misfit)[self.use]
         return bool((np.abs(self.weight[self.use] / next_weight - 1.0) < STANDS).all())
 
     def _cut(self) -> None:
         """Reject observations by their residuals without the smooth part."""
-        if self.robust:
-            scatter = self._scatter() if self.scatter is None else self.scatter
-            s = self.observations.squared(scatter, self.use.astype(np.float64))
-            near = self.observations.is_near(s, CRITICAL * self.noise)
-            self.use = self.observations.tied(self.everything & near)
+        scatter = self._scatter() if self.scatter is None else self.scatter
+        s = self.observations.squared(scatter, self.use.astype(np.float64))
+        near = self.observations.is_near(s, CRITICAL * self.noise)
+        self.use = self.observations.tied(self.everything & near)
 
     def _solve(self) -> Minimum:
         """Minimise the squared residuals of the observations in use; to full convergence from the second pass on."""
         again = self.passes > 1 or self.goes_on
-        tolerance = TOLERANCE if again or not self.robust else STANDS
-        self.weight = weight = self.observations.weight(self.use, self._weighting_noise, self.misfit)
+        tolerance = TOLERANCE if again else STANDS
+        self.weight = weight = self.observations.weight(self.use, self.noise, self.misfit)
         if self.earlier is not None and self.again is not None:
             given = replace(self.problem, joint_prior=self.earlier)
             known = weight * self.observations.tied(self.use & self.again)
@@ -258,13 +251,9 @@ class Rounds:
         """Estimate the noise and the misfit of the observations in use; return the test of their smooth part."""
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
-        if self.robust:
-            fitted = 2 * NUM_TERMS * len(fit)
-            self.scatter = self._scatter(fit)
-            self.noise = self.observations.noise(self.scatter, self.use, self.problem, fitted)
-            self.misfit = tested.misfit()
-        else:
-            self.noise = self.observations.noise(self.residual, self.use, self.problem)
+        self.scatter = self._scatter(fit)
+        self.noise = self.observations.noise(self.scatter, self.use, self.problem, 2 * NUM_TERMS * len(fit))
+        self.misfit = tested.misfit()
         return tested
 
     def _by_points(self) -> Projected:

@@ -173,7 +173,6 @@ class Variances:
 
     given: CameraPrior  # with the standard deviations as they were given
     unknowns: Unknowns  # meaning of each unknown
-    learns: bool  # whether the standard deviations of constants and drifts are estimated
     cautious: bool  # whether estimates are upper confidence limits, as there is no control
     stated: BoolArray | None = None  # (N,) views whose RPCs state an accuracy that is in use; None: none does
     # (4 + D, 2) sums of an earlier block: squared corrections over the given variances, and degrees of freedom. The
@@ -194,11 +193,15 @@ class Variances:
         widest: tuple[float, ...] | None = None,
     ) -> Variances:
         """Return the variances of a block, to be estimated as the options state."""
-        learns = unknowns.geometric and options.learn_priors
         own = options.sigma_attitude is None and options.sigma_position is None and len(views) > 0
         stated = np.array([states_accuracy(view) for view in views]) if own else None
         most = None if widest is None else np.array([*widest[: unknowns.drift], widest[-1]])
-        return cls(given, unknowns, learns, not control, stated, shown, most)
+        return cls(given, unknowns, not control, stated, shown, most)
+
+    @property
+    def learns(self) -> bool:
+        """Whether the standard deviations of constants and drifts may change."""
+        return self.unknowns.geometric
 
     @property
     def constants(self) -> int:

@@ -131,7 +131,7 @@ def find_foreign_camera(
     """
     num, beyond_prior = len(block.views), None
     unknowns = num if first is None else first.problem.free.size  # at least
-    asked_for_less = options.first_model != GEOMETRIC or options.drift == 0 or options.loss == "linear"
+    asked_for_less = options.first_model != GEOMETRIC or options.drift == 0
     if num < 3 or unknowns > LARGEST or asked_for_less:
         return None, None
     lost = np.ones(num) if first is None else lost_shares(first, block)

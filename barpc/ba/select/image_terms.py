@@ -88,7 +88,8 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     if not steps or found.problem.joint_prior is not None:
         return found
     problem, waves = found.problem, found.problem.cameras.unknowns.waves
-    assert waves is not None
+    if waves is None:  # steps may be named that are not followed
+        return found
     first = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start
     covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
     for at in steps:

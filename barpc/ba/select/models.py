@@ -242,10 +242,9 @@ def _without_moving_ground(
 
     `Solution.findings` has groups and terms.
     """
-    # without a robust loss no observation is wrong; a model with too few unknowns has residuals in all images
     noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
-    too_small = options.is_plain and bool(found.outcome.smooth.found(noise).all())
-    if options.loss == "linear" or too_small:
+    # a model with too few unknowns has residuals in all images
+    if options.is_plain and bool(found.outcome.smooth.found(noise).all()):
         return found, parts, Selection()
     groups: list[Finding] = []
     while True:

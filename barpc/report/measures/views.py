@@ -12,7 +12,6 @@ from scipy.special import erf
 from barpc.ba import Adjustment
 from barpc.ba.parameters.priors import USABLE_ACCURACY
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
-from barpc.fit import RpcFit
 from barpc.report.outcome import Run
 from barpc.report.summary.views import (
     COVERAGE_CELLS,
@@ -74,7 +73,7 @@ def measure_views(run: Run) -> tuple[ViewEntry, ...]:
             rmse_before=first[i],
             rmse_after=last[i],
             camera_center=CenterEntry(*_CENTER(run.centers[i])) if run.centers else None,
-            fit=_fit_entry(run.fits[i]) if run.fits else None,
+            fit=FitEntry(*_FIT(run.fits[i])) if run.fits else None,
             outputs=dict(run.written[i]) if run.written else {},
             date=view.date or None,
             stated_ce90_m=stated_ce90(view),
@@ -103,10 +102,6 @@ def _gap_corners(run: Run, i: int) -> tuple[tuple[float, float, float, float], .
         (lon, lat, col, row) for (lon, lat), (col, row) in zip(ground.tolist(), corners.tolist(), strict=True)
     )
     return found if np.isfinite(ground).all() else None
-
-
-def _fit_entry(fit: RpcFit) -> FitEntry:
-    return FitEntry(*_FIT(fit))
 
 
 def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ class GcpEntry(KnownPoint):
     TERMINAL: ClassVar = "GCP status residual_enu_m residual_px w"
 
     sigma_m: tuple[float, float, float] = column(
-        "Stated standard deviation, east, north, up", "m", "sigma east, north, up", ".2g"
+        "Stated standard deviation, east, north, up", "m", "sigma east, north, up", ".3g"
     )
     residual_enu_m: Vector = column("Position predicted without it, minus given", "m", ("east", "north", "up"), "+.3f")
     used: bool = column("Whether it constrains the block", default=True)

@@ -34,6 +34,7 @@ class PairEntry(Record):
         "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
         "kept": Column("after, used [px]", lambda pair: _offset_cell(pair.epipolar_kept), ".3f", adjusted=True),
     }
+    CAPTION: ClassVar = "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)"
     PAGE: ClassVar = (
         "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after kept"
     )

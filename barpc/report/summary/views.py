@@ -109,6 +109,7 @@ class ViewEntry(Record):
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
         "largest": Column("RPC misfit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
+    CAPTION: ClassVar = "Images: residuals (RMS) of the tie points in use"
     PAGE: ClassVar = (
         "name verdict wrong num_observations num_check lost tie_coverage rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
@@ -122,7 +123,7 @@ class ViewEntry(Record):
         "correction.ellipse.ce90_m stated_ce90_m"
     )
     DECISIONS: ClassVar = (
-        "name prior_scale num_observations num_check num_rejected num_moving systematic_px systematic_p "
+        "name prior_scale num_rejected num_moving systematic_px systematic_p "
         "neighbour_correlated_px correction.jitter_px correction.detector_px correction.step_px correction.sinusoid_px"
     )
     FOOTPRINT: ClassVar = "name path status num_observations rmse_before rmse_after gsd_m"
@@ -135,12 +136,6 @@ class ViewEntry(Record):
     def lost(self) -> float:
         """Share of its tie points that were rejected."""
         return self.num_rejected / max(self.num_rejected + self.num_observations, 1)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Its tie points by their names in all sentences and tables: in use, then others of which it has some."""
-        found = {"check": self.num_check, "rejected": self.num_rejected, "excluded": self.num_moving}
-        return {"used": self.num_observations, **{name: count for name, count in found.items() if count}}
 
     @property
     def reservation(self) -> str:

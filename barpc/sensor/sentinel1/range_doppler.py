@@ -23,13 +23,13 @@ from barpc.base.errors import InputError, RpcFormatError
 from barpc.base.frozen import Frozen
 from barpc.base.geodesy import (
     EVERYWHERE,
-    NEWTON_STEPS,
     NEWTON_TOLERANCE,
     SPEED_OF_LIGHT,
     Array,
     ecef_from_ground,
     ecef_from_ground_jacobian,
     enu_basis,
+    newton,
     pointwise,
     up,
 )
@@ -92,13 +92,12 @@ class GroundFrame(Frozen):
     def times(self, image: Array) -> Array:
         """Return the times (2, N) [s] of image points (2, N) [px]: Newton on the polynomial."""
         time, target = image[1] * self.interval, image[0] * self.spacing
-        slant = self.origin.mean() + target * self.slope
-        for _ in range(NEWTON_STEPS):
+
+        def farther(slant: Array) -> Array:
             ground, by_slant, _ = self._ground_range(time, slant)
-            step = (target - ground) / by_slant
-            slant = slant + step
-            if not (np.abs(step).max(initial=0.0, where=np.isfinite(step)) > NEWTON_TOLERANCE):
-                break
+            return np.asarray(slant + (target - ground) / by_slant)
+
+        slant, _ = newton(farther, self.origin.mean() + target * self.slope)
         return np.stack([time, slant * (2.0 / SPEED_OF_LIGHT)])
 
     def _ground_range(self, time: Array, slant: Array) -> tuple[Array, Array, Array]:
@@ -309,23 +308,22 @@ class RangeDoppler(Radar):
     def _geometry(self, ecef: Array) -> _ZeroDopplerPoints:
         point = ecef.T
         low, high = self.orbit.span
-        time = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
-        settled = NEWTON_TOLERANCE * self.frame.interval
-        for _ in range(NEWTON_STEPS):
+
+        def later(time: Array) -> Array:
             position, velocity, acceleration = self.orbit.states(time)
             sight = position - point
             rate = -dot(acceleration, sight) - dot(velocity, velocity)
-            moved = np.clip(time + dot(velocity, sight) / rate, low, high)
-            step, time = np.abs(moved - time), moved
-            if not (step.max(initial=0.0, where=np.isfinite(step)) > settled):
-                break
+            return np.clip(time + dot(velocity, sight) / rate, low, high)
+
+        middle = np.where(np.isfinite(point[0]), (low + high) / 2, np.nan)
+        time, settled = newton(later, middle, NEWTON_TOLERANCE * self.frame.interval)
         position, velocity, acceleration = self.orbit.states(time)
         sight = position - point
         distance = np.sqrt(dot(sight, sight))
         sight /= distance
         rate = -distance * dot(acceleration, sight) - dot(velocity, velocity)
         side = dot(aside(position, velocity, self.look == "right"), sight)
-        time[~((time > low) & (time < high) & (side < 0) & (step <= settled))] = np.nan
+        time[~((time > low) & (time < high) & (side < 0) & settled)] = np.nan
         times = np.stack([time, distance * (2.0 / SPEED_OF_LIGHT)])
         return _ZeroDopplerPoints(times, sight, distance, velocity, -velocity / rate)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import cv2
@@ -37,6 +38,7 @@ _PART = 0.1
 `MANY`: with 250 tracks in place of 3664 three real pairs meet check points alike, to 0.139, 0.154, 0.129 px."""
 _MIN_KEYPOINT_RATIO = 4.0
 """Keypoints that images are to hold for each of these, or nothing is gained; the triplet has 2.1 to 2.5."""
+_TILES_KEPT = 32  # in a process's memory, of about a megabyte
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,12 +257,19 @@ class KeypointFiles:
         chosen = set(self.boxes if wanted is None else wanted)
         for box, name, count in zip(self.boxes, self.names, self.counts, strict=True):
             if count and box in chosen:
-                kept = _unpacked(self.store.need(name), box).select(np.arange(count))
-                order = np.lexsort((kept.angle, kept.xy[:, 0], kept.xy[:, 1]))
-                parts.append(kept.select(order))
+                kept, order = _kept_tile(self.store, name, box, count)
+                parts.append(kept)
                 numbers.append(first + order)
             first += count
         return join_keypoints(parts), np.concatenate(numbers)
+
+
+@lru_cache(maxsize=_TILES_KEPT)
+def _kept_tile(store: Store, name: str, box: Box, count: int) -> tuple[Keypoints, IntArray]:
+    """Return the first keypoints of a tile, by row and column, and their numbers: pair after pair asks for them."""
+    kept = _unpacked(store.need(name), box).select(np.arange(count))
+    order = np.lexsort((kept.angle, kept.xy[:, 0], kept.xy[:, 1]))
+    return kept.select(order), order
 
 
 def keep_tile(store: Store, name: str, task: tuple[str, tuple[int, int], Box, Survey, KeypointDensity]) -> int:

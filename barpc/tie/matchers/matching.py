@@ -216,9 +216,9 @@ def _attempt(
 def _overlap_keypoints(
     views: Ends, keypoints: Points, search: float | None
 ) -> tuple[tuple[Keypoints, Keypoints], tuple[IntArray, IntArray]]:
-    """Return the keypoints of the tiles that both views may see, or all in memory, and their numbers."""
+    """Return the keypoints, and their numbers, of the tiles that both views may see; of one tile, or in memory, all."""
     boxes = [points.boxes for points in keypoints]
-    seen = shared_tiles(views, [_BOTH], boxes, search) if any(boxes) else boxes
+    seen = shared_tiles(views, [_BOTH], boxes, search) if max(map(len, boxes)) > 1 else boxes
     first, second = (points.load(some) for points, some in zip(keypoints, seen, strict=True))
     return (first[0], second[0]), (first[1], second[1])
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +31,12 @@ class EpipolarSegments:
     slope: Array  # (N,) d(across)/d(along)
     before: Array  # (N,) where to look along the axis [px]: from the lowest altitude (negative: backwards)
     after: Array  # to the highest
-    linear: Array  # (2, 2) d(image B)/d(image A) at constant altitude, in the middle of the points
+    derivative: Callable[[], Array]  # gives `linear`: few ask
+
+    @property
+    def linear(self) -> Array:
+        """d(image B)/d(image A) (2, 2) at constant altitude, in the middle of the points."""
+        return self.derivative()
 
     def turn(self, xy: Array) -> Array:
         """Return the coordinates along and across (..., 2) of points (..., 2) of image B [px]."""
@@ -80,7 +87,9 @@ def epipolar_segments(first: View, second: View, xy: Array, axis: Array | None =
         slope = np.where(np.abs(u1 - u0) > 1e-3, ((w1 - w0) / (u1 - u0)).clip(-1.0, 1.0), 0.0)
     slope[~usable] = np.nan
     along, across, reach = 0.5 * (u0 + u1), 0.5 * (w0 + w1), 0.5 * np.abs(u1 - u0)
-    return EpipolarSegments(axis, along, across, slope, -reach, reach, linear_map(first, second, middle))
+    return EpipolarSegments(
+        axis, along, across, slope, -reach, reach, cache(partial(linear_map, first, second, middle))
+    )
 
 
 def linear_map(first: View, second: View, xy: Array) -> Array:

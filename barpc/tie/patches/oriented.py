@@ -63,7 +63,7 @@ def found_about(sampling: Sampling, at: Array, xy: Array, half: int = HALF) -> t
 
 
 def register_oriented(
-    files: ImageFiles, band: int, reference: Array, start: Array, linear: Array
+    files: ImageFiles, band: int, reference: Array, start: Array, linear: Array, readers: OpenReaders | None = None
 ) -> tuple[Array, BoolArray, Array]:
     """Register patches of A at `reference` about `start` (n, 2) [px] of B: places, success, correlations.
 
@@ -72,7 +72,8 @@ def register_oriented(
     """
     place, ok, score = start.copy(), np.zeros(len(start), dtype=bool), np.zeros(len(start))
     step = resolution(np.median(linear, axis=0))
-    with OpenReaders() as readers:
+    with OpenReaders() as own:
+        readers = readers or own
         for rows in grouped(*np.floor(reference[:, ::-1] / (step * SPAN)).T):
             at, turn = reference[rows], np.median(linear[rows], axis=0)
             near, found, _ = found_about(Sampling(files, band, step, turn, readers), at, start[rows], TEMPLATE_REACH)

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from barpc.base.fields import field_values
+from barpc.base.frozen import join_fields
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
@@ -24,7 +25,7 @@ from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
 from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches import oriented
-from barpc.tie.pixels import SPAN, FloatImage, PixelReader, grow, levelled
+from barpc.tie.pixels import SPAN, FloatImage, OpenReaders, PixelReader, grow, levelled
 
 MIN_CORRELATION = 0.8
 """Of two registered patches, or the match is left out."""
@@ -55,6 +56,10 @@ class PatchRegistration:
         zero = np.zeros(len(start))
         return PatchRegistration(start.copy(), zero, zero + np.inf, zero > 0)
 
+    def select(self, rows: IntArray) -> PatchRegistration:
+        """Return the registration of some rows."""
+        return PatchRegistration(*(column[rows] for column in field_values(self).values()))
+
     def put(self, rows: IntArray, found: PatchRegistration) -> None:
         """Add the registration of some rows."""
         for name, column in field_values(found).items():
@@ -62,7 +67,13 @@ class PatchRegistration:
 
 
 def register_places(
-    files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, patch: int
+    files: oriented.ImageFiles,
+    band: int,
+    reference: Array,
+    start: Array,
+    linear: Array,
+    patch: int,
+    readers: OpenReaders | None = None,
 ) -> PatchRegistration:
     """Register patches of two image files, each a path and its size, by `register_patches`, tile by tile.
 
@@ -73,7 +84,8 @@ def register_places(
     sparse, every = _sparse(reference, margin), PatchRegistration.none(start)
     read, groups = (_mosaics, [np.arange(len(start))]) if sparse else (_window_pixels, _by_tile(reference, SPAN))
     (path, size), (other, beyond) = files
-    with PixelReader(path, band, size) as first, PixelReader(other, band, beyond) as second:
+    with OpenReaders() as own:
+        first, second = (readers or own).of(path, band, size), (readers or own).of(other, band, beyond)
         for rows in groups:
             a, valid_a, shift_a = read(first, size, reference[rows], margin)
             if not valid_a.any():  # nothing to look for
@@ -154,15 +166,25 @@ def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
     return [np.concatenate(part) for part in parts]
 
 
-def register_part(
-    files: oriented.ImageFiles, band: int, reference: Array, start: Array, linear: Array, structural: bool
-) -> PatchRegistration:
-    """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike."""
-    if structural:
-        xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear)
-        return PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok)
-    found = register_places(files, band, reference, start, linear, PATCH)
-    return replace(found, ok=found.ok & (found.correlation >= MIN_CORRELATION))
+_Part = tuple[oriented.ImageFiles, Array, Array, Array, bool]
+"""Patches of one image to be found in another: both files, reference, start, linear, whether structure is compared."""
+
+
+def register_parts(parts: Sequence[_Part], band: int) -> PatchRegistration:
+    """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike.
+
+    Every file is opened once for all parts.
+    """
+    found = list[PatchRegistration]()
+    with OpenReaders() as readers:
+        for files, reference, start, linear, structural in parts:
+            if structural:
+                xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear, readers)
+                found.append(PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok))
+            else:
+                one = register_places(files, band, reference, start, linear, PATCH, readers)
+                found.append(replace(one, ok=one.ok & (one.correlation >= MIN_CORRELATION)))
+    return PatchRegistration(**join_fields(found))
 
 
 def register_patches(
@@ -352,9 +374,19 @@ def refine(
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
     found = links.register(options.band, options.tile, work)
-    good, across = links.verified(found, found.ok)
-    sigma = links.scaled(found, good, across)
+    each = grouped(tracks.view[links.reference[found.ok]])
+    each = [np.flatnonzero(found.ok)[group] for group in each]
+    told = work.ordered(verify_links, [(links.part(rows), found.select(rows)) for rows in each], "refine")
+    good, sigma = np.zeros(len(links), dtype=bool), found.sigma.copy()
+    for rows, (verified, scaled) in zip(each, told, strict=True):
+        good[rows], sigma[rows] = verified, scaled
     return _shared_variance(tracks, of_track, other[good], found.xy[good], sigma[good])
+
+
+def verify_links(links: _Registrations, found: PatchRegistration) -> tuple[BoolArray, Array]:
+    """Return which registered links of a view are verified, and the sigmas [px] of these."""
+    good, across = links.verified(found, found.ok)
+    return good, links.scaled(found, good, across)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,10 +397,18 @@ class _Registrations:
     tracks: Tracks
     reference: IntArray
     other: IntArray
-    structural: frozenset[tuple[int, int]] = frozenset()
+    structural: Collection[tuple[int, int]] = ()
 
     def __len__(self) -> int:
         return len(self.other)
+
+    def part(self, links: IntArray) -> _Registrations:
+        """Return some links, with no other views and tracks than theirs."""
+        rows, where = np.unique([self.reference[links], self.other[links]], return_inverse=True)
+        views, view = np.unique(self.tracks.view[rows], return_inverse=True)
+        point = np.unique(self.tracks.point[rows], return_inverse=True)[1]
+        tracks = Tracks(view, point, self.tracks.xy[rows], self.tracks.sigma[rows])
+        return _Registrations([self.views[v] for v in views], tracks, *where.reshape(2, -1))
 
     @cached_property
     def origin(self) -> Array:
@@ -393,17 +433,22 @@ class _Registrations:
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
         parts = [part for group in self.groups() for part in _task_parts(origin[group], group, tile)]
-        tasks = []
+        tasks, rows, before = list[list[_Part]](), list[list[IntArray]](), -1
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))
             places = origin[part], start[part], linear[part]
-            ends = sorted(int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other))
-            tasks.append((images, band, *places, tuple(ends) in self.structural))
-        done: list[PatchRegistration] = work.ordered(register_part, tasks, "refine")
+            ends = [int(self.tracks.view[row[part[0]]]) for row in (self.reference, self.other)]
+            if ends[0] != before or sum(map(len, rows[-1])) + len(part) > SPAN:  # small ones of a view share a task
+                tasks.append([])
+                rows.append([])
+            before = ends[0]
+            tasks[-1].append((images, *places, tuple(sorted(ends)) in self.structural))
+            rows[-1].append(part)
+        done: list[PatchRegistration] = work.ordered(register_parts, [(task, band) for task in tasks], "refine")
         found = PatchRegistration.none(start)
-        for part, one in zip(parts, done, strict=True):
-            found.put(part, one)
+        for some, one in zip(rows, done, strict=True):
+            found.put(np.concatenate(some), one)
         return found
 
     def verified(self, found: PatchRegistration, good: BoolArray) -> tuple[BoolArray, Array]:

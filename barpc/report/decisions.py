@@ -1,14 +1,12 @@
-"""Sentences of report.html: the answer to each of its questions, and the decisions of a run."""
+"""The decisions of a run in sentences: matchers, camera model, priors, rejection."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from barpc.base.errors import listed
 from barpc.base.statistics import LARGEST
 from barpc.report.records import flat_options
-from barpc.report.runfiles import ReliefWindow
 from barpc.report.summary import Summary
 from barpc.report.summary.block import JustificationEntry, SceneEntry
 from barpc.report.summary.pairs import PairEntry
@@ -19,116 +17,17 @@ _UNEXPLAINED = "systematic", "held_out", "wrong_matches", "beside", "contradicte
 """Causes of a reservation whose residuals nothing explains."""
 _SIGNIFICANT = 1e-4  # probability of the F test below which systematic residuals are no noise
 _WIDENED = 1.005  # factor that reads as more than 1.0
-_ROUNDING = 1e-6  # px
-MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
-FOOTER = (
-    "Residuals are projected minus observed. Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of "
-    "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
-    "observations.csv, pairs.csv, footprints.geojson."
-)
-
-
-def of_images(views: Sequence[ViewEntry], agree: bool) -> str:
-    """Return how many images passed; `agree`: with tie points of adjusted cameras."""
-    passed = f"{sum(not view.advice for view in views)} of {counted(len(views), 'image')} passed."
-    measure = " Residuals measure how well the images agree with each other, not their accuracy on the ground."
-    return passed + measure * agree
-
-
-def of_map(by_length: Mapping[int, int] | Mapping[str, int], groups: int, lonely: Sequence[str]) -> str:
-    """Return how tie points connect the images; `by_length`: number of images -> tie points seen in that many."""
-    tied = "Tie points connect all images."
-    if not by_length:
-        tied = "There are no tie points in use."
-    elif groups > 1:
-        tied = f"Tie points connect the images in {groups} separate groups."
-    if lonely:
-        tied += f" Connected to one other image only: {listed(lonely)}."
-    if not by_length or len(by_length) > MAX_LENGTHS_SAID:
-        return tied
-    (first, most), *rest = by_length.items()
-    lengths = [f"{counted(most, 'tie point')} in {first} images", *(f"{num} in {length}" for length, num in rest)]
-    return f"{tied} {', '.join(lengths)}."
-
-
-def of_residuals(marked: Sequence[str], key: str) -> str:
-    """Return the images most of whose cells have a significant mean residual, and the key of their maps."""
-    random = "Yes: in no image do most cells have a significant mean residual."
-    if marked:
-        random = f"Not in {listed(marked)}: most cells there have a significant mean residual."
-    return f"{random} Colour: size. Thin lines: single residuals. Bold arrows: significant means of cells. {key}"
-
-
-def of_surface(before: ReliefWindow, after: ReliefWindow) -> str:
-    """Return how much of a sample of the surface has heights, and how well these agree."""
-    text = (
-        f"In a sample of the surface model {100 * before.share:.0f} % of the cells have a height with the delivered "
-        f"cameras, {100 * after.share:.0f} % with the corrected ones."
-    )
-    if before.nmad_m is None or after.nmad_m is None:
-        return text
-    return f"{text} Heights of different pairs differ by {metres(before.nmad_m)} and {metres(after.nmad_m)} (NMAD)."
-
-
-def of_pairs(worst: PairEntry, offset: float | None, wanted: float, best: PairEntry | None, enough: int) -> str:
-    """Return the largest epipolar offset (RMS) [px], the limit of stereo, and the best pair for heights."""
-    fit = "Unknown: no camera of a pair projects the tie points of the other."
-    if offset is not None:
-        fit = f"Epipolar offsets are at most {offset:.3f} px (RMS; {worst.a} - {worst.b})."
-        fit += f" Stereo needs less than {wanted} px."
-    if best is None:
-        return (
-            f"{fit} No pair of images that passed has {enough} matches and a convergence angle that determines heights."
-        )
-    return (
-        f"{fit} The best pair for heights is {best.a} - {best.b}: one pixel of parallax is "
-        f"{metres(known(best.height_m_per_px))} of height."
-    )
-
-
-def of_scene(scene: SceneEntry, tied: bool) -> str:
-    """Return an introduction to the uncertainty of the scene; `tied`: with tie points."""
-    text = "Tie points fix the images relative to each other, not on the Earth. " * tied
-    text += "The remaining uncertainty (1 sigma), the largest first."
-    if scene.num_held_in_height:
-        held = counted(scene.num_held_in_height, "tie point")
-        text += f" The heights of {held} with too small a convergence angle were constrained."
-    return text
-
-
-def of_files(worst: float | None) -> str:
-    """Return the largest error of the fitted RPCs [px]; None where it is not known for every image."""
-    exact = "Yes, exactly."
-    if worst is None:
-        exact = "Not known for every image."
-    elif worst > _ROUNDING:
-        exact = f"To {worst:.1e} px over each image and its altitude range."
-    return f"{exact} Use these files in other tools: the old images still carry the old RPC."
-
-
-def of_run(summary: Summary) -> str:
-    """Return the numbers of images, tie points and observations."""
-    counts = len(summary.views), summary.tracks.num_tracks, summary.tracks.num_observations
-    text = ", ".join(map(counted, counts, ("image", "tie point", "observation"))) + "."
-    if summary.tables.complete:
-        return text
-    return f"{text} Tables and charts show {summary.tables.num_written_tracks} tie points, sampled evenly."
-
-
-# --- decisions ----------------------------------------------------------------------------------------------
 
 
 def decisions(summary: Summary) -> list[str]:
-    """Return the decisions of the run: matchers, camera model, priors, rejection."""
+    """Return the decisions of a run, in the order in which they are made."""
     options, scene, views = flat_options(summary.options or {}), summary.scene, summary.views
     found = [*_matched(summary.pairs, options.get("tie.matcher"))]
     if scene is not None:
         if scene.model:
-            found.append(f"Each camera is corrected by {scene.model}.")
+            found.append(f"Each camera is corrected by {scene.model.replace('+', ' and ')}.")
         found += [*_added(scene, views), *_drift(scene, options.get("adjust.drift"))]
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
-        if seen := [gcp for gcp in summary.gcps if gcp.images]:
-            found.append(f"{sum(gcp.used for gcp in seen)} of {len(seen)} visible GCPs constrain the block.")
     if (test := summary.control_test) is not None:
         found.append(
             f"{test.num_beyond} of {counted(test.num, 'residual')} of control points in the images are significant "
@@ -251,10 +150,7 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         counts = f"{used} used, {scene.num_held_out} check (independent of the adjustment), {cut} rejected as outliers"
         counts += f", {moving} excluded, as they move together" * bool(moving)
         yield f"Observations of tie points: {counts}."
-    if cut:
-        most = max(views, key=lambda view: (view.lost, view.name))
-        yield f"Most were rejected in {most.name}: {two_digits(100 * most.lost)} % of those used or rejected."
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:
-        yield "Check tie points fit equally well in all parts of every image."
+        yield "Check tie points fit the corrected cameras equally well in all parts of every image."
