@@ -15,20 +15,19 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.ba.terms import detectors
-from barpc.ba.terms.detectors import _Columns, find_edges
+from barpc.ba.terms.detectors import Columns, find_edges
 from barpc.base.geodesy import ecef_from_ground
 from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import Sized
 
 
-def columns(cols: list[np.ndarray], sigma: float = 1.0, together: bool = False) -> tuple[_Columns, np.ndarray]:
+def columns(cols: list[np.ndarray], sigma: float = 1.0, together: bool = False) -> tuple[Columns, np.ndarray]:
     """Views whose observations stand at these columns, all in use; the columns of all, one after the other."""
     bounds, col = np.cumsum([0, *map(len, cols)]), np.concatenate(cols)
-    problem: Any = SimpleNamespace(structure=SimpleNamespace(bounds=bounds), xy=np.stack([col, 0 * col]))
     n = list(range(len(cols)))
     use = np.ones(len(col), dtype=bool)
-    return _Columns(problem, use, np.full(len(col), sigma), [n] if together else [[v] for v in n]), col
+    return Columns(bounds, col, use, np.full(len(col), sigma), [n] if together else [[v] for v in n]), col
 
 
 def squares(residual: np.ndarray, weight: np.ndarray) -> float:
@@ -43,8 +42,7 @@ def test_a_change_explains_as_much_as_two_means_explain_more_than_one(low, high)
     col = rng.uniform(0, 9000, 240)
     sigma, use = rng.uniform(0.5, 2, 240), rng.random(240) < 0.9
     residual = rng.normal(0, 1, (2, 240)) + np.where(col > 4000, [[1.0], [-0.5]], 0.0)
-    problem: Any = SimpleNamespace(structure=SimpleNamespace(bounds=np.array([0, 240])), xy=np.stack([col, col]))
-    gain, at = _Columns(problem, use, sigma, [[0]]).split(0, low, high, residual)
+    gain, at = Columns(np.array([0, 240]), col, use, sigma, [[0]]).split(0, low, high, residual)
     inside = use & (col > low) & (col < high)
     best = (0.0, 0.0)
     for place in np.sort(col[inside]):
@@ -92,7 +90,7 @@ def test_means_of_detectors_are_weighted_and_nothing_where_there_is_no_edge() ->
     assert not found[:, 10:].any()
 
 
-def grown(made: _Columns, residual: np.ndarray, sigma: float = 1.0) -> tuple[list[list[float]], float]:
+def grown(made: Columns, residual: np.ndarray, sigma: float = 1.0) -> tuple[list[list[float]], float]:
     """Edges where points do not share what is wrong."""
     return detectors._grown(made, residual, lambda given: given, np.full(residual.shape[1], 1.0 / sigma))
 

@@ -180,8 +180,7 @@ class Ended:
     ("kinds", "whole", "axis", "kept"),
     [
         ({0: "step", 1: "step"}, 1, 1, "tried"),  # one image stands still: it is seen against that
-        ({0: "step", 1: "step"}, 1, 0, "found"),  # of columns: detectors may be of all
-        ({0: "step", 1: "step"}, 3, 0, "tried"),
+        ({0: "step", 1: "step"}, 1, 0, "tried"),  # of columns, too: a line of detectors is a term
         ({0: "step", 1: "step", 2: "decay"}, 1, 1, "found"),  # of all images: what is of images as a whole competes
         ({0: "step", 1: "step", 2: "decay"}, 3, 1, "tried"),
         ({0: "sinusoid", 1: "sinusoid"}, 1, 1, "found"),

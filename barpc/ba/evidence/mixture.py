@@ -40,6 +40,7 @@ class Group:
     sigma: Array  # (m,) prior standard deviations of these
     cell: IntArray  # (K,) ground cell of the track of each observation
     share: Array  # (K,) prior probability that its track moves
+    start: MixtureFit | None = None  # fit of a sample of the tracks to start from; None: from gross errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ def fit_mixture(
 
     `sigma` (e,) [px] are the prior standard deviations of the latter. `warm` is a fit to start from; its terms are the
     first of `extra`, and the noise anneals only from the misfit of the new ones. With a moving `group` it anneals from
-    gross errors. `noisiest` is the upper limit of the noise.
+    gross errors, or goes on from the start of the group. `noisiest` is the upper limit of the noise.
     """
     return Mixture(linear, extra, sigma, warm, group, noisiest).run()
 
@@ -290,7 +291,12 @@ class Mixture:
         if group is not None:
             self.noise, self.eps = GROSS, np.full(linear.views, WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1])
             self.beside.append(np.concatenate([self.extra, group.by_move / linear.sigma], axis=1))
-            self.moved = _MovedObservations(linear.residual, group.share, self.noise)
+            if group.start is not None:
+                self.noise, self.eps = group.start.noise, group.start.eps
+                self.x[: linear.precision.size] = group.start.step.ravel()
+                self.x[len(self.x) - len(group.sigma) :] = group.start.move
+            scatter = self.noise if group.start is None else group.start.scatter
+            self.moved = _MovedObservations(linear.residual, group.share, scatter)
         self.squared = [(beside**2).sum(axis=0) for beside in self.beside]
         self.part = np.flatnonzero(linear.taking_part)
         self.count = np.bincount(linear.view[self.part], minlength=linear.views)
@@ -325,11 +331,13 @@ class Mixture:
 
     def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> MixtureFit:
         """Iterate to convergence, or `most` times, from where the last run ended; `cooled` as `COOLED`."""
-        linear, last, fitted, ends = self.linear, -np.inf, 0.0, False
+        linear, last, fitted, ends, overshot = self.linear, -np.inf, 0.0, False, False
         self.cooled = cooled
         for left in range(most, 0, -1):
             expected = self._expected()
-            is_new = self._has_changed(expected) or ends or left == 1
+            # a curvature of other weights may overshoot, and the iteration then ends in a cycle
+            overshot |= expected.log < last - LIKELIHOOD_TOLERANCE
+            is_new = self._has_changed(expected) or ends or overshot or left == 1
             if is_new:
                 kinds = zip(expected.kinds, self.beside, strict=True)
                 self.curvature = [self._curvature(kind.weight, beside) for kind, beside in kinds]

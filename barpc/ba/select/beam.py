@@ -288,7 +288,7 @@ class TermSearch:
         made = self._added([], self._most_promising(list(proposed(seen, out, periods))))
         made = self._refined(self._added(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
-        if moves and not self._explains_all(made):
+        if moves and not (self._explains_all(made) and self._stands_still(made[0])):
             made = self._sorted([row[:2] for row in (*made, *self._moving())])
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
@@ -318,6 +318,13 @@ class TermSearch:
             return False
         one, found, _ = made[0]
         return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
+
+    def _stands_still(self, candidate: _Candidate) -> bool:
+        """Return whether no region of the ground moves beside a candidate, by a score test."""
+        one, found, _ = candidate
+        extra = np.concatenate([self.seen.extra, one.columns], axis=1)
+        sigma = np.append(self.seen.sigma, one.sigma)
+        return not MovingObjects.shows(replace(self.seen, base=found, extra=extra, sigma=sigma))
 
     def _moving(self) -> list[_Candidate]:
         """Return moving groups, searched for once, and displaced parts of images with the same observations."""
@@ -378,7 +385,8 @@ class TermSearch:
             for shape in one.shapes(self.seen, self._fit):
                 again = shape.refined(self.seen, found, others)
                 if not _unchanged(again, one):
-                    fitted = self._fit(again, base=found)
+                    # a fit of as many unknowns is a start
+                    fitted = self._fit(again, base=found if len(again.sigma) == len(one.sigma) else None)
                     better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
             more = better.evidence - found.evidence
             one, found = made, better
@@ -394,7 +402,8 @@ class TermSearch:
 
 def _unchanged(one: Term, before: Term) -> bool:
     """Return whether a term has the place of `before`, and nearly the same prior."""
-    return one.where == before.where and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
+    same = one.where == before.where and len(one.sigma) == len(before.sigma)
+    return same and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
 
 
 def _rivals(tried: list[_Candidate]) -> list[int]:

@@ -62,7 +62,7 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     in_all = len({one.view for one in terms}) == len(parts.inner.views)
     # one image may be the datum of the others: sinusoids then appear in all but one
     in_most = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
-    if not (in_all or in_most) and not any(one.where is not None and one.where[0] == 0 for one in terms):
+    if not (in_all or in_most):
         return tried
     smooth = with_splines(found, parts, options)
     left = [

@@ -8,6 +8,7 @@ from barpc.ba.evidence.periods import Period
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.terms.common_edge import CommonEdge
 from barpc.ba.terms.decay import Decay
+from barpc.ba.terms.detector_line import DetectorLine
 from barpc.ba.terms.low_frequency import LowFrequency
 from barpc.ba.terms.moving_objects import MovingObjects
 from barpc.ba.terms.sinusoid import Sinusoid
@@ -18,7 +19,8 @@ from barpc.ba.terms.transient import Transient
 __all__ = ["TERMS", "CommonEdge", "LinesLost", "LowFrequency", "MovingObjects", "Sinusoid", "Transient", "proposed"]
 
 TERMS: dict[str, type[Term]] = {
-    term.NAME: term for term in (Step, LinesLost, Decay, Transient, CommonEdge, LowFrequency, Sinusoid, MovingObjects)
+    term.NAME: term
+    for term in (Step, LinesLost, DetectorLine, Decay, Transient, CommonEdge, LowFrequency, Sinusoid, MovingObjects)
 }
 """Name -> class of the term, in the order of proposals."""
 

@@ -8,7 +8,7 @@ is repeated with the gains of all images summed, and the set that explains more 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +17,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
 from barpc.base.statistics import BACKFITTING, FEW, ITERATIONS
-from barpc.scene import BoolArray
+from barpc.scene import BoolArray, IntArray
 
 _MIN_LOG_RATIO = 40.0  # least doubled log-likelihood ratio: among 10,000 columns reached by noise once in 100,000 views
 _A_VIEW = 4.0  # added to it for every further view of a focal plane
@@ -26,11 +26,22 @@ _AS_LARGE = 0.5  # of the largest gain, at least: a step of another view has a q
 Edges = list[list[float]]  # columns of the steps of each group of views, ascending
 
 
-class _Columns:
-    """Observations in use, sorted by column, of groups of views that share their detectors."""
+class Columns:
+    """Observations in use, sorted by column, of groups of views that share their detectors.
 
-    def __init__(self, problem: Problem, use: BoolArray, sigma: Array, groups: list[list[int]]) -> None:
-        bounds, col = problem.structure.bounds, problem.xy[0]
+    Parameters
+    ----------
+    bounds : (N + 1,)
+        First observation of each view, and the end.
+    col, use, sigma : (K,)
+        Columns of all observations [px], the mask of those in use, and their standard deviations [px].
+    groups : list of list of int
+        Views of each group.
+    """
+
+    def __init__(
+        self, bounds: Sequence[int] | IntArray, col: Array, use: BoolArray, sigma: Array, groups: list[list[int]]
+    ) -> None:
         inside = [a + np.flatnonzero(use[a:b]) for a, b in pairwise(bounds)]
         self.order = [rows[np.argsort(col[rows], kind="stable")] for rows in inside]
         self.col = [col[rows] for rows in self.order]
@@ -75,9 +86,10 @@ def find_edges(problem: Problem, state: State, residual: Array, use: BoolArray, 
     weight, widths = use / sigma, problem.cameras.unknowns.half[0]
     project = problem.projected_off_points(problem.project_points(state.params, state.points), weight)
     residual, views = project(_without_steps(problem, state, residual)), list(range(len(widths)))
-    edges, cost = _grown(_Columns(problem, use, sigma, [[v] for v in views]), residual, project, weight)
+    given = problem.structure.bounds, problem.xy[0], use, sigma
+    edges, cost = _grown(Columns(*given, [[v] for v in views]), residual, project, weight)
     if any(edges) and len(views) > 1 and (widths == widths[0]).all():
-        common, in_common = _grown(_Columns(problem, use, sigma, [views]), residual, project, weight)
+        common, in_common = _grown(Columns(*given, [views]), residual, project, weight)
         edges = common * len(views) if in_common < cost else edges
     out = np.full((len(edges), max(map(len, edges))), np.inf)
     for v, of_view in enumerate(edges):
@@ -96,7 +108,7 @@ def _without_steps(problem: Problem, state: State, residual: Array) -> Array:
     return residual - steps
 
 
-def _grown(columns: _Columns, residual: Array, project: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
+def _grown(columns: Columns, residual: Array, project: Callable[[Array], Array], weight: Array) -> tuple[Edges, float]:
     """Return the edges of each group, found one after the other and refined; and the cost of residuals and edges."""
     edges: Edges = [[] for _ in columns.groups]
     explained = np.zeros_like(residual)
@@ -124,7 +136,7 @@ def _grown(columns: _Columns, residual: Array, project: Callable[[Array], Array]
     return [_edge_positions(columns, g, of_group, explained + left) for g, of_group in enumerate(edges)], cost
 
 
-def _edge_positions(columns: _Columns, g: int, edges: list[float], residual: Array) -> list[float]:
+def _edge_positions(columns: Columns, g: int, edges: list[float], residual: Array) -> list[float]:
     """Return the significant edges of a group, each at its best column between its neighbours."""
     found: list[float] = []
     for at in range(len(edges)):

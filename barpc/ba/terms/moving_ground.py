@@ -136,9 +136,9 @@ def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Arra
     found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _cell_shares(found.moving, cell, rows)[cell]
     member = moving(linear, extra, replace(start, share=shares), found)
-    if np.mean(member[rows] > 0.5) > 0.5:  # the larger group stands still
-        member = 1.0 - member
-    return replace(group, share=member.clip(LEVEL, 1.0 - LEVEL))
+    larger = bool(np.mean(member[rows] > 0.5) > 0.5)  # the larger group stands still
+    share = (1.0 - member if larger else member).clip(LEVEL, 1.0 - LEVEL)
+    return replace(group, share=share, start=None if larger else found)
 
 
 def price_of_group(linear: Linear, cell: IntArray) -> float:
