@@ -236,7 +236,7 @@ def test_a_dem_is_asked_in_the_middle_of_the_image(
     assert seen == pytest.approx([999.5, 949.5], abs=1e-2)
     hole = a_slope(tmp_path / "hole.tif", np.s_[70:90, 30:50])
     assert run("info", pair[1], "--dem", str(hole)) == 1
-    assert f"barpc: {pair[1]}: the DEM has no height in the middle of it" in capsys.readouterr().err
+    assert f"barpc: {hole}: has no height at the images' position" in capsys.readouterr().err
 
 
 def test_outlines_name_their_images(pair: list[str], capsys: pytest.CaptureFixture[str]) -> None:
