@@ -107,7 +107,12 @@ class Term:
         return float(self.columns[:, :, rows].any(axis=(0, 1)).sum() / max(rows.sum(), 1))
 
     def differs(self, other: Term) -> bool:
-        """Return whether another term is another hypothesis; overlapping intervals of one axis of a view are not."""
+        """Return whether another term is another hypothesis.
+
+        Overlapping intervals of one axis of a view are not, nor a term and one that consists of such parts.
+        """
+        if self.view == other.view and (self._is_part_of(other) or other._is_part_of(self)):
+            return False
         if (self.NAME, self.view) != (other.NAME, other.view):
             return True
         if self.where is None or other.where is None:
@@ -115,6 +120,11 @@ class Term:
         axis, start, stop = self.where[:3]
         axis2, start2, stop2 = other.where[:3]
         return axis != axis2 or stop <= start2 or stop2 <= start
+
+    def _is_part_of(self, other: Term) -> bool:
+        """Return whether another term consists of terms of this kind, along the same axis."""
+        kinds = {(one.NAME, one.where[0]) for one in other.parts if one.where is not None}
+        return self.where is not None and (self.NAME, self.where[0]) in kinds
 
     def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
         """Yield its records, with its unknowns (e,) from the fit with all terms; `fields` are further fields."""

@@ -25,8 +25,8 @@ MODES = {
 }
 """Motion of the scene (`barpc.ba.constraints.gauge.MOTIONS`) -> its sentence."""
 EXPLANATIONS = (
-    *("step", "lines_lost", "decay", "transient", "common_edge", "low_frequency", "sinusoid", "moving_objects"),
-    "foreign_camera",
+    *("step", "lines_lost", "detector_line", "decay", "transient", "common_edge", "low_frequency"),
+    *("sinusoid", "moving_objects", "foreign_camera"),
 )
 """Kinds of explanations of residuals: the terms `barpc.ba.terms.TERMS`, and a camera that contradicts the others."""
 
