@@ -64,7 +64,7 @@ _NEVER: dict[str, Any] = {
     "veto of check tracks": ("select.models.is_admitted select.image_terms.is_admitted", lambda *_: True),
     "terms in the images": ("select.models.with_terms", lambda found, *_: found),
     "splines and detectors": ("select.models.with_splines select.image_terms.with_splines", lambda found, *_: found),
-    "detectors": ("select.image_terms.find_edges", lambda problem, *_: np.zeros((problem.structure.num_views, 0))),
+    "line of detectors": ("terms.detector_line.change_points", lambda *_: []),
     "affine in the image": ("select.models._with_image_affine", lambda *_: None),
     "correlated noise": ("select.beam.correlated_log_ratio select.anomalies.correlated_log_ratio", lambda *_: 0.0),
     "rivals side by side": ("select.beam._rivals", lambda _: []),

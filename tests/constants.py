@@ -78,7 +78,6 @@ SIZES = {
     "products_kept": ("barpc.ba.solving.problem.KEPT",),
     "steps": ("barpc.ba.solving.solve.ITERATIONS",),
     "front_views": ("barpc.ba.solving.structure.LEAF",),
-    "edge_rounds": ("barpc.ba.terms.detectors.ITERATIONS",),
     "cells_read": ("barpc.rasters.dem._MAX_CELLS",),
     "points_together": ("barpc.sensor.rpc.CHUNK",),
     "unknowns_searched": ("barpc.ba.select.search.LARGEST",),

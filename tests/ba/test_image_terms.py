@@ -237,8 +237,12 @@ def test_splines_that_spoil_the_check_tracks_in_one_round_are_not_solved_to_the_
     for times, tried in ((1.4, True), (1.6, False)):
         bad = replace(one.found, after=replace(one.found.after, noise=times * one.found.after.noise))
         monkeypatch.setattr(Solution, "has_waves", True)
-        monkeypatch.setattr(image_terms, "_solve_with", lambda *_, bad=bad, **__: bad)
-        monkeypatch.setattr(image_terms, "_with_edges", lambda found, *_: ended.append(found) or found)
+
+        def solve(*_: Any, once: bool = False, bad: Any = bad, **__: Any) -> Any:
+            ended.extend([] if once else [bad])
+            return bad
+
+        monkeypatch.setattr(image_terms, "_solve_with", solve)
         assert with_splines(one.found, replace(one.parts), one.options) is one.found
         assert bool(ended) is tried
         ended.clear()

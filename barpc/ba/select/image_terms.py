@@ -1,4 +1,4 @@
-"""Models with additional parameters in the images: selected terms, B-splines over the rows (jitter), detector steps."""
+"""Models with additional parameters in the images: selected terms, B-splines over the rows (jitter), given edges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
 from barpc.ba.solution import MUCH_BETTER, Solution, finished
 from barpc.ba.terms import TERMS, LinesLost, Sinusoid
-from barpc.ba.terms.detectors import find_edges
 from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
@@ -26,7 +25,7 @@ from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _DENSER = 1.5  # factor on the number of splines of each further try: 7, 10, 15, 22, 33
 _WHOLE = 0.1  # lines: tolerance of a whole number; lost lines gave 2.95 of 3, 5.07 of 5; two in ten slips meet it
-_TWICE = 2  # searches for detector steps; successive numbers of splines that may be no better
+_TWICE = 2  # successive numbers of splines that may be no better
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +119,7 @@ def _ends_with_its_image(one: Finding, block: Block) -> bool:
 
 
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with splines over the rows and detector steps, if options or correlated residuals request them.
+    """Solve the block with splines over the rows, if correlated residuals request them, and detector steps of options.
 
     Terms and moving ground have them as a rival, and where they win the solution is asked again: it is cached.
     """
@@ -144,13 +143,10 @@ def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solu
         if misses == _TWICE or not (best.has_waves or (asked and best is found)):
             break
         layout = _Layout(AdditionalParameters(count, _given_edges(block, options)))
-        if options.detectors:
-            tried = _solve_with(found, parts, options, layout)
-        else:
-            tried = _solve_with(found, parts, options, layout, once=True)
-            # cameras that contradict each other: further rounds do not make good what the first spoils
-            if given or asked or not tried.after.error > MUCH_NOISE * best.after.error:
-                tried = _with_edges(tried, parts, options)
+        tried = _solve_with(found, parts, options, layout, once=not options.detectors)
+        # cameras that contradict each other: further rounds do not make good what the first spoils
+        if not options.detectors and (given or asked or not tried.after.error > MUCH_NOISE * best.after.error):
+            tried = _solve_with(tried, parts, options, layout)
         better = given or (asked and best is found) or is_admitted(tried.after, best.after, parts.outer)
         best, misses = (tried, 0) if better else (best, misses + (best is not found))
     if best is found or not (given or asked or _explains(best, found, block)):
@@ -193,24 +189,6 @@ def _layout_of(terms: list[Finding], views: int) -> _Layout:
             periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
     params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
     return _Layout(AdditionalParameters(0, np.zeros((views, 0)), places, periods), params)
-
-
-def _with_edges(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve a block, of which one round was solved with splines, with the detector steps of its residuals.
-
-    Correcting large steps reveals smaller ones, so the search is repeated.
-    """
-    waves, block = found.problem.cameras.unknowns.waves, parts.inner
-    assert waves is not None
-    for _ in range(_TWICE if found.has_waves else 0):
-        outcome = found.outcome
-        sigma = block.sigma * outcome.noise
-        edges = find_edges(outcome.problem, found.final, outcome.residual, outcome.inlier, sigma)
-        if edges.shape[1] <= waves.edges.shape[1]:
-            break
-        waves = AdditionalParameters(waves.count, edges)
-        found = _solve_with(found, parts, options, _Layout(waves))
-    return found if waves.edges.size else _solve_with(found, parts, options, _Layout(waves))
 
 
 def _given_edges(block: Block, options: AdjustOptions) -> Array:

@@ -11,11 +11,10 @@ import numpy as np
 from barpc.ba.evidence.mixture import MixtureFit, off_from_right
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA
-from barpc.ba.terms.detectors import Columns
 from barpc.ba.terms.step import Step, open_ended
 from barpc.ba.terms.term import Finding, Residuals, Term
 from barpc.base.geodesy import Array
-from barpc.base.statistics import SURE
+from barpc.base.statistics import FEW, SURE
 
 
 class DetectorLine(Term):
@@ -73,22 +72,33 @@ def change_points(residuals: Residuals, view: int, found: MixtureFit, others: Ar
     """
     linear, price = residuals.linear, Step.at(residuals, view, (0, 0.0, 1.0, 0.0, 0.0)).price + SURE
     off, _ = off_from_right(linear, linear.left(found.step) + others / linear.sigma, found.right)
-    use, noise = linear.taking_part & (found.right > 0.5), np.full(len(linear.view), found.noise)
-    columns = Columns(linear.bounds, residuals.place[0], use, noise, [[view]])
-
-    def divided(low: float, high: float) -> list[float]:
-        gain, col = columns.split(0, low, high, off)
-        return [*divided(low, col), col, *divided(col, high)] if gain > 2.0 * price else []
-
-    edges, rows = divided(-np.inf, np.inf), np.flatnonzero(use & (linear.view == view))
+    rows = np.flatnonzero((linear.view == view) & linear.taking_part & (found.right > 0.5))
+    rows = rows[np.argsort(residuals.place[0, rows], kind="stable")]
     col, values = residuals.place[0, rows], off[:, rows].T / found.noise
-    smooth = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS)
+    edges = _divided(np.vstack([np.zeros(2), np.cumsum(values, axis=0)]), 0, len(rows), price)
+    smooth, at = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS), np.arange(len(rows))
     while edges:
-        design = np.column_stack([col[:, None] >= edges, smooth])
+        design = np.column_stack([at[:, None] >= edges, smooth])
         inverse = np.linalg.pinv(design.T @ design)
         jumps = (inverse @ design.T @ values)[: len(edges)]
         gain = 0.5 * (jumps**2).sum(axis=1) / inverse.diagonal()[: len(edges)]
         if gain.min() > price:
             break
         del edges[int(gain.argmin())]
-    return edges
+    return [0.5 * float(col[n - 1] + col[n]) for n in edges]
+
+
+def _divided(sums: Array, first: int, stop: int, price: float) -> list[int]:
+    """Return the indices between `first` and `stop` at which a mean changes, ascending, by binary segmentation.
+
+    `sums` (n + 1, 2) are cumulative sums of values of unit variance. A part is divided where the log-likelihood gain is
+    largest, with at least `FEW` values on each side, if it exceeds `price` [nats].
+    """
+    count, whole = np.arange(FEW, stop - first - FEW + 1), stop - first
+    if not len(count):
+        return []
+    left, right = sums[first + count] - sums[first], sums[stop] - sums[first + count]
+    change = left / count[:, None] - right / (whole - count)[:, None]
+    gain = 0.5 * (change**2).sum(axis=1) * count * (whole - count) / whole
+    at = first + int(count[gain.argmax()])
+    return [*_divided(sums, first, at, price), at, *_divided(sums, at, stop, price)] if gain.max() > price else []
