@@ -46,6 +46,7 @@ from barpc.report.summary.words import NAMED, counted, enu, median, metres, two_
 
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
 _SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
+_DETECTORS = 3  # displaced parts of the columns of an image from which they have one sentence
 _SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
 _SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
 _IMAGE_CHECKED = "The image was checked"
@@ -336,8 +337,7 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
             f"More than {100 * MANY_REJECTED:.0f} % of the tie points of {listed(many)} were rejected; neighbours err "
             f"in random directions, {why}."
         )
-    found = [one.sentence for one in explanations(run.adjustment) if one.name != FOREIGN_CAMERA]
-    yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in found)
+    yield from (f"{sentence[0].upper()}{sentence[1:]}." for sentence in _explanation_sentences(run.adjustment))
     yield from _pointing_lines(run, run.adjustment, views)
     yield from _unmet_places(run, run.adjustment, views, matter=False)
     yield from _unseen_lines(run.adjustment)
@@ -352,6 +352,24 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     yield from dem_lines(run.adjustment)
     if run.check_points is not None and run.after is not None:
         yield _residual_sentence(check_residuals(run.after, run.check_points).rms(), len(run.check_points.names))
+
+
+def _explanation_sentences(found: Adjustment) -> Iterator[str]:
+    """Yield the sentences of explanations of the residuals; one for three or more displaced detectors of an image."""
+    rows = [one for one in explanations(found) if one.name != FOREIGN_CAMERA]
+    detectors = [one for one in rows if (one.name, one.axis) == ("step", AXES[0]) and not one.candidates]
+    for one in rows:
+        alike = [each for each in detectors if each.image == one.image]
+        if len(alike) < _DETECTORS or all(one is not each for each in alike):
+            yield one.sentence
+        elif one is alike[0]:
+            edges = sorted(each.first for each in alike if each.first)
+            size = max(each.size_px or 0.0 for each in alike)
+            places = listed([f"{edge:.0f}" for edge in edges])
+            yield (
+                f"{len(alike)} parts of the columns of {one.image} are displaced by up to {size:.2f} px, as by "
+                f"detectors with edges at {places}"
+            )
 
 
 def _unseen_lines(found: Adjustment) -> Iterator[str]:

@@ -532,6 +532,14 @@ def _(s, num):
     assert int(num) == len(s.check_points)
 
 
+@says(rf"(\d+) parts of the columns of (.+) are displaced by up to {NUM} px, as by detectors with edges at (.+)\.")
+def _(s, count, image, size, edges) -> None:
+    parts = [one for one in s.scene.explanations if (one.name, one.axis, one.image) == ("step", "columns", image)]
+    assert int(count) == len(parts) > 2
+    near(size, max(one.size_px for one in parts))
+    assert edges == listed([f"{edge:.0f}" for edge in sorted(one.first for one in parts if one.first)])
+
+
 @says(rf"(?:Not known for every image|Yes, exactly|To {NUM} px .*)\. The old images .*")
 def _(s, worst):
     errors = [max(view.fit.max_px) for view in s.views if view.fit]

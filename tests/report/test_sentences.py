@@ -18,6 +18,7 @@ from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
 from barpc.report.outcome import Added, Run
 from barpc.report.quality_checks import control_reasons, held_lines
+from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import enu, metres
 from barpc.report.verdict import block_verdict, view_status
@@ -773,3 +774,24 @@ def test_what_control_holds_is_said_with_how_far_it_agrees(agrees, used, scale, 
     tested = SimpleNamespace(agrees=agrees, used=np.arange(4) < used, agreed=SimpleNamespace(scale=scale), checked=True)
     points = SimpleNamespace(names="PQRS", point=np.array([0, 1, 2, 2]), view=np.array([0, 1, 1, 0]))
     assert next(held_lines(tested, points, views(), "it is known to a metre")) == words
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_many_displaced_detectors_of_an_image_are_one_sentence(monkeypatch, count):
+    """Of one image alone; rows, other images and parts that another image may have keep a sentence of their own."""
+    parts = [part(f"columns {n}", 100.0 * n, 0.1 * n) for n in range(1, count + 1)]
+    others = part("rows", 5.0, axis="rows"), part("of b", 7.0, image="b"), part("or c", 9.0, candidates=("c",))
+    monkeypatch.setattr(verdicts, "explanations", lambda _: (others[0], *parts, *others[1:]))
+    said = list(verdicts._explanation_sentences(None))  # type: ignore[arg-type]
+    edges = ", ".join(f"{100 * n}" for n in range(1, count + 1))
+    whole = (
+        f"{count} parts of the columns of a are displaced by up to {0.1 * count:.2f} px, as by detectors with edges at"
+    )
+    own = [one.sentence for one in parts] if count < 3 else [f"{whole} {edges}"]
+    assert said == ["rows", *own, "of b", "or c"]
+
+
+def part(sentence: str, first: float, size: float = 1.0, axis: str = "columns", **fields: Any) -> ExplanationEntry:
+    """A displaced part of image a."""
+    given = {"image": "a", "axis": axis, "first": first, "size_px": size, **fields}
+    return ExplanationEntry("step", sentence, given.pop("image"), 9.0, 9.0, **given)

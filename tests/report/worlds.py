@@ -93,6 +93,15 @@ def displaced(rows: Callable[[Tracks], np.ndarray], by: tuple[float, float], **o
     return run_of(replace(block, tracks=replace(block.tracks, xy=xy)))
 
 
+def of_detectors() -> Run:
+    """A block of which one image has four detectors, each displaced by itself."""
+    block, sizes = world(points=1500), np.array([[0.0, 0.0], [0.9, -0.6], [-0.5, 0.8], [0.6, 0.5]])
+    xy = block.tracks.xy.copy()
+    own = block.tracks.view == 1
+    xy[own] += sizes[np.searchsorted(SIZE[0] * np.array([0.25, 0.5, 0.75]), xy[own, 0])]
+    return run_of(replace(block, tracks=replace(block.tracks, xy=xy)))
+
+
 def swinging() -> Run:
     block = world(points=1500)
     xy = block.tracks.xy.copy()
@@ -236,6 +245,7 @@ WORLDS: dict[str, Callable[[], Run]] = {
     "jitter": swinging,
     "displaced rows": lambda: displaced(lambda t: (t.view == 1) & (t.xy[:, 1] > 2800), (0.0, 1.5)),
     "displaced columns": lambda: displaced(lambda t: (t.view == 1) & (t.xy[:, 0] > 2800), (0.0, 1.5)),
+    "displaced detectors": of_detectors,
     "wrong matches": lambda: run_of(world(points=600, outliers=0.35)),
     "a foreign camera": foreign,
     "moving objects": floating,

@@ -387,10 +387,11 @@ class TermSearch:
                 if not _unchanged(again, one):
                     # a fit of as many unknowns is a start
                     fitted = self._fit(again, base=found if len(again.sigma) == len(one.sigma) else None)
-                    better, made = (fitted, again) if fitted.evidence > better.evidence else (better, made)
-            more = better.evidence - found.evidence
+                    more = fitted.evidence - again.price > better.evidence - made.price
+                    better, made = (fitted, again) if more else (better, made)
+            gain = better.evidence - made.price - (found.evidence - one.price)
             one, found = made, better
-            if more < LIKELIHOOD_TOLERANCE:
+            if gain < LIKELIHOOD_TOLERANCE:
                 break
         return one, found
 

@@ -14,7 +14,7 @@ from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA
 from barpc.ba.terms.step import Step, open_ended
 from barpc.ba.terms.term import Finding, Residuals, Term
 from barpc.base.geodesy import Array
-from barpc.base.statistics import FEW, SURE
+from barpc.base.statistics import FEW, OUTLIER, SURE, robust_spread
 
 
 class DetectorLine(Term):
@@ -36,7 +36,8 @@ class DetectorLine(Term):
         if interval.axis:
             return []
         base = residuals.base
-        edges = change_points(residuals, interval.view, base, np.einsum("cek,e->ck", residuals.extra, base.extra))
+        others = np.einsum("cek,e->ck", residuals.extra, base.extra)
+        edges = change_points(residuals, interval.view, base, others)
         return [cls.at(residuals, interval.view, edges)] if len(edges) > 1 else []
 
     @classmethod
@@ -54,7 +55,8 @@ class DetectorLine(Term):
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
         """Return the line with edges by the cameras of the fit, and a prior as wide as its displacements."""
-        edges = change_points(residuals, self.view, found, others)
+        own = np.einsum("cek,e->ck", self.columns, found.extra[-len(self.sigma) :])
+        edges = change_points(residuals, self.view, found, others, own)
         return self.at(residuals, self.view, edges, self.prior_width(found)) if len(edges) > 1 else self
 
     def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
@@ -63,20 +65,35 @@ class DetectorLine(Term):
             yield from part.findings(residuals, own, **fields)
 
 
-def change_points(residuals: Residuals, view: int, found: MixtureFit, others: Array) -> list[float]:
+def change_points(
+    residuals: Residuals, view: int, found: MixtureFit, others: Array, own: Array | None = None
+) -> list[float]:
     """Return the columns [px], ascending, at which the mean residual of a view changes significantly.
 
     Residuals are those of a fit `found` with displacements `others` (2, K) [px], against ground points intersected from
-    inliers. Candidates are found by binary segmentation. The least significant one beside the others and a trend, which
-    the cameras follow, is removed until all are significant.
+    inliers. The displacements `own` (2, K) [px] of a line in the fit are added to them. Without these rejected
+    observations count, too, up to `OUTLIER` times the spread of all: those of displaced detectors may be rejected.
+
+    Candidates are found by binary segmentation. The least significant one beside the others and a trend, which the
+    cameras follow, is removed until all are significant.
     """
     linear, price = residuals.linear, Step.at(residuals, view, (0, 0.0, 1.0, 0.0, 0.0)).price + SURE
-    off, _ = off_from_right(linear, linear.left(found.step) + others / linear.sigma, found.right)
-    rows = np.flatnonzero((linear.view == view) & linear.taking_part & (found.right > 0.5))
-    rows = rows[np.argsort(residuals.place[0, rows], kind="stable")]
-    col, values = residuals.place[0, rows], off[:, rows].T / found.noise
-    edges = _divided(np.vstack([np.zeros(2), np.cumsum(values, axis=0)]), 0, len(rows), price)
-    smooth, at = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS), np.arange(len(rows))
+    left = linear.left(found.step) + others / linear.sigma
+    off, known = off_from_right(linear, left, found.right)
+    rows = (
+        (linear.view == view)
+        & linear.taking_part
+        & (found.right > 0.5 if own is not None else known | (found.right > 0.5))
+    )
+    order = np.flatnonzero(rows)[np.argsort(residuals.place[0, rows], kind="stable")]
+    col, plain = residuals.place[0, order], _clipped(off[:, order].T / found.noise)
+    values = plain
+    if own is not None:  # of a large displacement, different shares are absorbed by points of two and of three images
+        moved = own / linear.sigma
+        off, _ = off_from_right(linear, left + moved, found.right)
+        values = _clipped((off - moved)[:, order].T / found.noise)
+    edges = _divided(_summed(values), 0, len(order), price)
+    smooth, at = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS), np.arange(len(order))
     while edges:
         design = np.column_stack([at[:, None] >= edges, smooth])
         inverse = np.linalg.pinv(design.T @ design)
@@ -85,20 +102,43 @@ def change_points(residuals: Residuals, view: int, found: MixtureFit, others: Ar
         if gain.min() > price:
             break
         del edges[int(gain.argmin())]
+    sums = _summed(plain)
+    for n in range(len(edges)):  # each was found before its neighbours
+        first, stop = (edges[n - 1] if n else 0), (edges[n + 1] if n + 1 < len(edges) else len(order))
+        edges[n] = _split(sums, first, stop)[0]
     return [0.5 * float(col[n - 1] + col[n]) for n in edges]
+
+
+def _clipped(values: Array) -> Array:
+    """Return values (n, 2), limited to `OUTLIER` times their spread."""
+    most = OUTLIER * max(robust_spread(values.ravel()), 1.0) if len(values) else 0.0
+    return np.clip(values, -most, most)
+
+
+def _summed(values: Array) -> Array:
+    """Return the sums (n + 1, 2) of the first 0, 1 ... n values."""
+    return np.vstack([np.zeros(2), np.cumsum(values, axis=0)])
 
 
 def _divided(sums: Array, first: int, stop: int, price: float) -> list[int]:
     """Return the indices between `first` and `stop` at which a mean changes, ascending, by binary segmentation.
 
-    `sums` (n + 1, 2) are cumulative sums of values of unit variance. A part is divided where the log-likelihood gain is
-    largest, with at least `FEW` values on each side, if it exceeds `price` [nats].
+    A part is divided where `_split` says, if the gain exceeds `price` [nats].
+    """
+    at, gain = _split(sums, first, stop)
+    return [*_divided(sums, first, at, price), at, *_divided(sums, at, stop, price)] if gain > price else []
+
+
+def _split(sums: Array, first: int, stop: int) -> tuple[int, float]:
+    """Return the index between `first` and `stop` with the largest log-likelihood gain [nats] by two means, and this.
+
+    `sums` (n + 1, 2) are cumulative sums of values of unit variance. Each side has at least `FEW` values; a part with
+    fewer has no gain.
     """
     count, whole = np.arange(FEW, stop - first - FEW + 1), stop - first
     if not len(count):
-        return []
+        return first, 0.0
     left, right = sums[first + count] - sums[first], sums[stop] - sums[first + count]
     change = left / count[:, None] - right / (whole - count)[:, None]
     gain = 0.5 * (change**2).sum(axis=1) * count * (whole - count) / whole
-    at = first + int(count[gain.argmax()])
-    return [*_divided(sums, first, at, price), at, *_divided(sums, at, stop, price)] if gain.max() > price else []
+    return first + int(count[gain.argmax()]), float(gain.max())
