@@ -91,7 +91,7 @@ def _left(one: JustificationEntry) -> str:
 
 def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
     """Yield the degree of the attitude drift, and the residuals of a lower one; `asked`: the option."""
-    degree, words = scene.drift_degree, "The attitude may drift along the rows as a polynomial of degree"
+    degree, words = scene.drift_degree, "A drift of the attitude along the rows is estimated, a polynomial of degree"
     if asked is not None:
         yield f"The degree of the attitude drift, {degree}, was set by an option."
     elif not degree:
@@ -100,7 +100,7 @@ def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
         yield f"{words} {degree}, as in the earlier run."
     else:
         sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m)
-        yield f"{words} {degree} (1 sigma on the ground at the first and last row: {sigma})."
+        yield f"{words} {degree} (1 sigma of the prior on the ground at the first and last row: {sigma})."
         if scene.drift_justification is not None:
             yield f"Degree {degree - 1} left {_left(scene.drift_justification)}."
 
@@ -132,11 +132,11 @@ def _priors(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     if widened := [(one.prior_scale, one.name) for one in views if (one.prior_scale or 0.0) > _WIDENED]:
         most, name = max(widened)
         yield (
-            "The corrections exceed the stated accuracies: these were widened in "
+            "The corrections exceed the accuracies assumed of the cameras, which were widened in "
             f"{counted(len(widened), 'image')}, at most {most:.1f} times ({name})."
         )
     else:
-        yield "The stated accuracies were kept."
+        yield "The corrections are within the accuracies assumed of the cameras."
     if (scene.prior_shared or 1.0) > _WIDENED:
         yield f"For an error common to all images they were widened {scene.prior_shared:.1f} times."
 
@@ -153,4 +153,4 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:
-        yield "Check tie points fit the corrected cameras equally well in all parts of every image."
+        yield "The residuals of check tie points are alike in all parts of every image."

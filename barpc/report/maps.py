@@ -356,7 +356,7 @@ def residual_panels(
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    key = f"Scale bar: {_px(longest)} of a single residual; bold arrows are drawn twice as long."
+    key = f"Scale bar: {_px(longest)} for thin lines, half of that for bold arrows."
     if len(charts) < len(views):
         key += f" Of {len(views)} images {len(charts)} are shown: "
         key += "those that need review, then " * bool(first) + "those with the largest systematic part."

@@ -63,7 +63,8 @@ def _use(summary: Summary) -> Iterator[StepEntry]:
     best = ""
     if heights:
         pair = min(heights, key=lambda pair: pair.height_m_per_px or np.inf)
-        best = f" Best pair for heights: {pair.a} - {pair.b} (one pixel is {metres(pair.height_m_per_px or np.nan)})."
+        height = metres(pair.height_m_per_px or np.nan)
+        best = f" Best pair for heights: {pair.a} - {pair.b} (one pixel of parallax is {height} of height)."
         commands = ["barpc dsm . -o dsm.tif", "barpc export . s2p --to s2p", *commands]
     start = "Use" if summary.passed else "After review, use"
     yield StepEntry("use", f"{start} {listed(files, NAMED)}.{best}", tuple(commands))

@@ -203,10 +203,11 @@ def _randomness_section(files: RunFiles) -> Section | None:
     if adjusted:
         before, _, lengths = residual_panels(views, files.observations, "before", first)
         parts["folds"].append((f"Before the adjustment. {lengths}", before))
-    random = "Yes: in no image do most cells have a significant mean residual."
+    random = "Yes: no image has a significant mean residual in most of its cells."
     if marked:
         random = f"Not in {listed(marked)}: most cells there have a significant mean residual."
-    legend = "Colour: size. Thin lines: single residuals. Bold arrows: significant means of cells."
+    legend = "The colour shows the size of a residual."
+    legend += " Thin lines: single residuals. Bold arrows: significant means of cells."
     return Section("random", "Are the residuals random?", f"{random} {legend} {key}", **parts)
 
 

@@ -13,7 +13,7 @@ from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, medians
 
-PICTURE_KEY = "On the pictures tie points in use are blue, their rejected observations red."
+PICTURE_KEY = "On the pictures tie points used in an image are blue; those rejected there are red."
 _DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 
 
@@ -88,8 +88,9 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
     """Draw the tiles of the worst pair along its epipolar lines, with captions."""
     draw = template("drawings.svg.j2").module.strip
     words = (
-        "{0.image}, the worst pair: {0.tiles} tie points, {0.half_px:.0f} px to every side, resampled along epipolar "
-        "lines. With correct cameras a feature lies on the line in every row; shifts along it come from terrain height."
+        "{0.image}, the worst pair: windows of {0.half_px:.0f} px to every side of {0.tiles} of its tie points, "
+        "resampled along epipolar lines. With correct cameras a feature lies on the line in all windows; shifts along "
+        "the line come from terrain height."
     )
     told = [(one, words.format(one)) for one in files.strips]
     return [(draw(one, said, WIDTH, WIDTH * one.size[1] / one.size[0]), said) for one, said in told]

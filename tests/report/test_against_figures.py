@@ -306,7 +306,7 @@ def figures(view: ViewEntry, text: str) -> None:
 
 @says(
     r"(After review, use|Use) (.*?)(?: and (\d+) more)?\."
-    r"(?: Best pair for heights: (\S+) - (\S+) \(one pixel is (.*)\)\.)?"
+    r"(?: Best pair for heights: (\S+) - (\S+) \(one pixel of parallax is (.*) of height\)\.)?"
 )
 def _(s, start, names, more, a, b, per_pixel):
     assert (start == "Use") == s.passed
@@ -385,7 +385,7 @@ def _(s, degree):
     assert int(degree) == s.scene.drift_degree == s.options["adjust"]["drift"]
 
 
-@says(r"The attitude may drift along the rows as a polynomial of degree (\d+)(.*)\.")
+@says(r"A drift of the attitude along the rows is estimated, a polynomial of degree (\d+)(.*)\.")
 def _(s, degree, rest):
     assert int(degree) == s.scene.drift_degree
     assert s.options["adjust"]["drift"] is None
@@ -410,9 +410,10 @@ def _(summary, times):
     assert not summary.passed
 
 
-@says(r"The stated accuracies were kept\.()()")
+@says(r"The corrections are within the accuracies assumed of the cameras\.()()")
 @says(
-    rf"The corrections exceed the stated accuracies: these were widened in (\d+) images?, at most {NUM} times \(.*\)\."
+    r"The corrections exceed the accuracies assumed of the cameras, which were widened in (\d+) images?, "
+    rf"at most {NUM} times \(.*\)\."
 )
 def _(s, num, times):
     wide = [view.prior_scale for view in s.views if (view.prior_scale or 1.0) > 1.005]
@@ -443,7 +444,7 @@ def _(s, times):
     near(times, s.scene.prior_shared)
 
 
-@says(r"Check tie points fit the corrected cameras equally well in all parts of every image\.")
+@says(r"The residuals of check tie points are alike in all parts of every image\.")
 def _(s):
     assert s.scene.held_out_places == ()
     errors = [view.held_out_px for view in s.views if view.num_observations]
@@ -489,7 +490,7 @@ def _(s, how, groups, lengths):
         assert s.tracks.by_length[length] == int(count)
 
 
-@says(r"(Yes|Not in [^:]*): (?:in no image|most cells) .*")
+@says(r"(Yes|Not in [^:]*): (?:no image has|most cells) .*")
 def _(s, start):
     assert start
 

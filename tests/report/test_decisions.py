@@ -73,10 +73,12 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     )
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
-    assert "as a polynomial of degree 1 (1 sigma on the ground at the first and last row: 12 cm)." in plain
+    assert "a polynomial of degree 1 (1 sigma of the prior on the ground at the first and last row: 12 cm)." in plain
     assert "left" not in plain
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
-    assert "as a polynomial of degree 2 (1 sigma on the ground at the first and last row: 12 cm, 30 cm)." in more
+    assert (
+        "a polynomial of degree 2 (1 sigma of the prior on the ground at the first and last row: 12 cm, 30 cm)." in more
+    )
     left = "systematic residuals of 0.31 px in B, and 0.12 px correlated between neighbours."
     assert f"Degree 1 left {left}" in more
     surely = said(
@@ -92,7 +94,7 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
 def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed(record):
     plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
     assert "No additional parameters were needed: no image has significant systematic residuals." in plain
-    assert "equally well" in plain
+    assert "are alike in all parts" in plain
     text = said(with_views(record, *[{"systematic_p": 0.3}] * 8, {"systematic_p": 9e-69}), held_out_places=())
     last = record.views[8].name
     assert f"px ({last})." in text
@@ -102,21 +104,21 @@ def test_systematic_residuals_are_not_beside_a_word_that_nothing_more_was_needed
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
         assert "No additional parameters were" not in text
         assert "No additional parameters that were tested explain the inconsistent residuals." in text
-        assert "equally well" not in text
+        assert "are alike in all parts" not in text
     odd = with_views(record, *[{"systematic_p": 0.3}] * 8, {"cause": "odd", "advice": "look", "systematic_p": 0.3})
     assert "No additional parameters were needed" in said(odd, held_out_places=())
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
-    assert "equally well" not in untested
+    assert "are alike in all parts" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
     assert "additional" not in nothing
 
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "The stated accuracies were kept." in said(held, prior_ratio=0.7)
+    assert "The corrections are within the accuracies assumed of the cameras." in said(held, prior_ratio=0.7)
     text = said(with_views(held, {"prior_scale": 1.5}, {"prior_scale": 3.2}), prior_ratio=9.0)
-    assert f"stated accuracies: these were widened in 2 images, at most 3.2 times ({record.views[1].name})" in text
-    assert "The stated accuracies were kept" not in text
+    assert f"of the cameras, which were widened in 2 images, at most 3.2 times ({record.views[1].name})" in text
+    assert "The corrections are within the accuracies assumed of the cameras" not in text
     assert "accuracies" not in said(held, prior_ratio=None)
     assert "common to all" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
@@ -180,15 +182,19 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     )
     older = with_views(record, *[{"neighbour_correlated_px": None, "systematic_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
-    assert [line.split()[0] for line in found] == ["The", "Observations"]
+    assert [line.split()[0] for line in found] == ["A", "Observations"]
 
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     calm = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "The stated accuracies were kept" in said(with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0)
+    assert "The corrections are within the accuracies assumed of the cameras" in said(
+        with_views(calm, {"prior_scale": 1.005}), prior_ratio=1.0
+    )
     slightly = said(with_views(calm, {"prior_scale": 1.006}), prior_ratio=1.0)
-    assert "these were widened in 1 image, at most 1.0 times" in slightly
-    assert "The stated accuracies were kept" in said(with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0)
+    assert "which were widened in 1 image, at most 1.0 times" in slightly
+    assert "The corrections are within the accuracies assumed of the cameras" in said(
+        with_views(calm, *[{"prior_scale": None}] * 9), prior_ratio=1.0
+    )
     given = JustificationEntry(
         image="B", systematic_px=None, systematic_p=None, neighbour_correlated_px=0.0, num_images=1
     )
@@ -225,7 +231,7 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
 
 
 def test_what_took_no_part_is_said_to_agree(record):
-    agrees = "Check tie points fit the corrected cameras equally well in all parts of every image."
+    agrees = "The residuals of check tie points are alike in all parts of every image."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)

@@ -439,7 +439,7 @@ def panels(rows, views, when="after"):
 @pytest.mark.parametrize(("size", "said"), [(149.0, "150"), (1234.0, "1200"), (0.0236, "0.024"), (13.2, "13")])
 def test_the_scale_of_residuals_is_written_without_powers_of_ten(size, said):
     _, _, key = panels([(0, k, (60.0, 60.0), (0.0, 0.0), (size, 0.0), True) for k in range(20)], [a_view("A")])
-    assert key.startswith(f"Scale bar: {said} px of")
+    assert key.startswith(f"Scale bar: {said} px for")
 
 
 def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
@@ -451,7 +451,7 @@ def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     ]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
-    assert key == f"Scale bar: {longest:.2g} px of a single residual; bold arrows are drawn twice as long."
+    assert key == f"Scale bar: {longest:.2g} px for thin lines, half of that for bold arrows."
     assert shares == [1.0, 0.0]
     assert [caption for _, caption in charts_of] == [
         f"{name} % of cells with a significant mean" for name in ("A: 100", "B: 0")

@@ -173,7 +173,7 @@ def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
     files = "view_0000.vrt, view_0001.vrt, view_0002.vrt"
     assert use.text.startswith(f"Use {files}. Best pair for heights: ")
     best = min(plain.pairs, key=lambda pair: pair.height_m_per_px)
-    assert f"{best.a} - {best.b} (one pixel is " in use.text
+    assert f"{best.a} - {best.b} (one pixel of parallax is " in use.text
     assert [command.split()[1:4] for command in use.commands] == [
         ["dsm", ".", "-o"], ["export", ".", "s2p"], ["ortho", ".", "-o"]
     ]  # fmt: skip
@@ -247,7 +247,7 @@ def test_a_flagged_image_is_not_handed_over_and_the_part_that_shows_it_is_linked
     assert "A.tif" in use.text
     assert "C.tif" in use.text
     assert "B." not in use.text
-    assert "A - C (one pixel is 2.0 m)" in use.text
+    assert "A - C (one pixel of parallax is 2.0 m of height)" in use.text
     assert review.text.startswith("Review B (")
     views = [replace(view, correction=a_correction()) for view in views]
     files = files_of(a_summary(views, pairs), observed=seen([(0, 0, (0.0, 0.0), (1.0, 1.0), (0.1, 0.1), True)]))

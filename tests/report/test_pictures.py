@@ -147,7 +147,7 @@ def test_a_strip_names_its_rows_and_draws_a_line_through_each():
     assert drawn.box == (420, 210)
     assert [text for text, *_ in drawn.texts("name")] == list(strip.rows)
     assert drawn.points("epipolar") == [[(0, y), (420, y)] for y in (35, 105, 175)]
-    assert "the worst pair: 6 tie points, 12 px to every side" in caption
+    assert "the worst pair: windows of 12 px to every side of 6 of its tie points" in caption
 
 
 @pytest.mark.parametrize("num", [5, 39, 400])

@@ -117,12 +117,14 @@ def pushed(view: int, cells: int, of: int):
 
 def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
     calm = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
-    assert calm.answer.startswith("Yes: in no image do most cells have a significant mean residual. Colour: size.")
+    assert calm.answer.startswith(
+        "Yes: no image has a significant mean residual in most of its cells. The colour shows the size of a residual."
+    )
     assert len(calm.panels) == 3
     assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
     assert len(calm.folds[0][1]) == 3
     told = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
-    assert told.answer.startswith("Not in B: most cells there have a significant mean residual. Colour")
+    assert told.answer.startswith("Not in B: most cells there have a significant mean residual. The colour")
     check = asked("random", observed=seen(pushed(1, 2, 3)), kind="check")
     assert check.folds == []
     assert 'id="panel-before0-t"' in check.panels[0][0]

@@ -10,7 +10,7 @@ from barpc.report.records import Number, Record, column
 from barpc.report.summary.words import Count, Vector
 
 AXES = "columns", "rows"
-DATUM = "Uncertainty of the scene's position and, at its edge, shape (1 sigma), and the shares of its sources"
+DATUM = "Uncertainty (1 sigma) of the scene's position and of its shape at its edge, and the share of each source"
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
     "north": "the whole scene may lie {0} farther north or south",

@@ -10,7 +10,7 @@ import numpy as np
 from barpc.report.records import Column, Number, Record, column
 from barpc.report.summary.words import ABOVE, Count, Pixel, Vector
 
-GCP_CAPTION = "GCP residuals, each predicted without that GCP (prediction minus given)"
+GCP_CAPTION = "GCP residuals, each with that GCP left out (predicted minus given position)"
 
 
 class KnownPoint(Record):
