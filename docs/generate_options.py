@@ -91,7 +91,7 @@ def option_list(name: str, record: type[Options], flags: dict[str, str]) -> list
 
 def parts(command: click.Command, name: str) -> tuple[str, str, str, list[tuple[str, str]]]:
     """Return a command in four parts: its usage, its first words, its examples, its flags with their help."""
-    context = click.Context(command, info_name=name, terminal_width=100)
+    context = click.Context(command, info_name=name, **{**cli.context_settings, "terminal_width": 100})
     usage = " ".join([name, *command.collect_usage_pieces(context)])
     first, *examples = command.help.replace("\b", "\\b").split("\\b")
     text = inspect.cleandoc("\n".join(examples[0].strip("\n").splitlines()[1:])).strip() if examples else ""
