@@ -36,12 +36,14 @@ from barpc.ba.unseen import unseen_steps, with_unseen
 from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import OFF, AdjustOptions
+from barpc.base.process import one_blas_thread
 from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.geometry import camera_center
 from barpc.sensor.radar import Radar
 
 
+@one_blas_thread()
 def adjust_tracks(
     views: Sequence[View],
     tracks: Tracks,
