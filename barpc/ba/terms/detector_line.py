@@ -80,11 +80,8 @@ def change_points(
     linear, price = residuals.linear, Step.at(residuals, view, (0, 0.0, 1.0, 0.0, 0.0)).price + SURE
     left = linear.left(found.step) + others / linear.sigma
     off, known = off_from_right(linear, left, found.right)
-    rows = (
-        (linear.view == view)
-        & linear.taking_part
-        & (found.right > 0.5 if own is not None else known | (found.right > 0.5))
-    )
+    right = found.right > 0.5
+    rows = (linear.view == view) & linear.taking_part & (known | right if own is None else right)
     order = np.flatnonzero(rows)[np.argsort(residuals.place[0, rows], kind="stable")]
     col, plain = residuals.place[0, order], _clipped(off[:, order].T / found.noise)
     values = plain
