@@ -102,8 +102,8 @@ def _another_ground(rpc: RPC, size: tuple[int, int]) -> Doubt | None:
     if not found > BEYOND:
         return None
     return Doubt(
-        f"its corners lie {found:.1f} half widths from the middle of the ground that its RPC is made for (1 is its "
-        "border): the RPC of another image, of a coarser product, or of other pixels of this one",
+        f"its corners lie outside of the ground that its RPC was made for, {found:.1f} half widths from the middle: it "
+        "may be the RPC of another image, of a coarser product, or of other pixels of this one",
         refused=found > FAR_BEYOND,
     )
 

@@ -240,7 +240,7 @@ FAULTS: dict[str, tuple[Prepare, int, tuple[str, ...]]] = {
     "an RPC that is wrong by 5 km": (
         camera(samp_off=10_000.0),
         1,
-        ("view_01.tif", "half widths from the middle of the ground"),
+        ("view_01.tif", "outside of the ground that its RPC was made for"),
     ),
     "an RPC of a place far away": (camera(long_off=20.0), 1, ("overlap",)),
     "a zero scale": (damaged(tag(7, 0.0)), 1, ("view_01.tif", "scale")),

@@ -33,7 +33,7 @@ def the_rpc(number: int = 0) -> RPC:
 
 
 def kinds(rpc: RPC, size: tuple[int, int] = SIZE, frame: RasterFrame | None = None) -> list[str]:
-    words = {"geotransform": "map", "half widths": "ground", "was made for": "size"}
+    words = {"geotransform": "map", "half widths": "ground", " px, and its RPC": "size"}
     found = [one.sentence for one in doubts_of(rpc, size, frame)]
     return [next(kind for word, kind in words.items() if word in sentence) for sentence in found]
 
@@ -86,7 +86,7 @@ def test_the_case_from_the_field(shared_data: Path, tmp_path: Path, capsys: pyte
     assert run("adjust", *given, "-o", tmp_path / "run") == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "view_00.tif: its corners lie 6.0 half widths from the middle of the ground that its RPC is made for" in said
+    assert "view_00.tif: its corners lie outside of the ground that its RPC was made for, 6.0 half widths from" in said
     assert not (tmp_path / "run").exists()
     with pytest.raises(RpcError, match="half widths from the middle"):
         barpc.ortho(given[0], tmp_path / "map", alt=200)
