@@ -15,7 +15,6 @@ from barpc.report.summary.words import counted, known, metres, two_digits
 
 _UNEXPLAINED = "systematic", "held_out", "wrong_matches", "beside", "contradicted", "rejected", "left", "place"
 """Causes of a reservation whose residuals nothing explains."""
-_SIGNIFICANT = 1e-4  # probability of the F test below which systematic residuals are no noise
 _WIDENED = 1.005  # factor that reads as more than 1.0
 
 
@@ -30,9 +29,9 @@ def decisions(summary: Summary) -> list[str]:
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
     if (test := summary.control_test) is not None:
         found.append(
-            f"{test.num_beyond} of {counted(test.num, 'residual')} of control points in the images are significant "
-            f"({two_digits(test.expected)} expected by chance). The largest is that of {test.point} in {test.image} "
-            f"(w = {known(test.largest_w):.1f}; limit: {test.critical:.3g})."
+            f"Of {counted(test.num, 'residual')} of control points in the images, {test.num_beyond} exceed Baarda's w "
+            f"of {test.critical:.3g} ({two_digits(test.expected)} expected by chance). The largest is that of "
+            f"{test.point} in {test.image} (w = {known(test.largest_w):.1f})."
         )
     return found
 
@@ -45,7 +44,7 @@ def _matched(pairs: Sequence[PairEntry], matcher: object) -> Iterator[str]:
         yield f"Not all pairs were matched by {matcher or 'one matcher'}: {by}."
     if shares := [(pair.decoy_share, pair.a, pair.b) for pair in tied if pair.decoy_share is not None]:
         share, a, b = max(shares)
-        yield f"At most {100 * share:.2g} % of a pair's matches are false ({a} - {b})."
+        yield f"The matcher expects at most {100 * share:.2g} % of a pair's matches to be wrong ({a} - {b})."
     if any(pair.chosen_by not in (None, "overlap and angle") for pair in tied):
         yield f"Pairs by selection criterion: {_tally((pair.chosen_by for pair in tied), ' ')}."
     if pairs and not tied:
@@ -70,15 +69,9 @@ def _added(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     elif not any(view.num_observations for view in views):
         return
     elif scene.left or scene.held_out_places or any(view.cause in _UNEXPLAINED for view in views):
-        yield "No additional parameters that were tested explain the inconsistent residuals."
-    elif more := [view for view in views if known(view.systematic_p) < _SIGNIFICANT]:
-        most = max(more, key=lambda view: (view.systematic_px or 0.0, view.name))
-        size = two_digits(known(most.systematic_px))
-        yield f"No additional parameters were selected. Systematic residuals are at most {size} px ({most.name})."
-    elif any(view.systematic_p is None for view in views):
-        yield "No additional parameters were selected."
+        yield "None of the additional parameters that were tested explains the inconsistent residuals."
     else:
-        yield "No additional parameters were needed: no image has significant systematic residuals."
+        yield "No additional parameters were selected."
 
 
 def _left(one: JustificationEntry) -> str:
@@ -91,7 +84,7 @@ def _left(one: JustificationEntry) -> str:
 
 def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
     """Yield the degree of the attitude drift, and the residuals of a lower one; `asked`: the option."""
-    degree, words = scene.drift_degree, "A drift of the attitude along the rows is estimated, a polynomial of degree"
+    degree, words = scene.drift_degree, "The attitude may drift along the rows, as a polynomial of degree"
     if asked is not None:
         yield f"The degree of the attitude drift, {degree}, was set by an option."
     elif not degree:
@@ -100,7 +93,7 @@ def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
         yield f"{words} {degree}, as in the earlier run."
     else:
         sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m)
-        yield f"{words} {degree} (1 sigma of the prior on the ground at the first and last row: {sigma})."
+        yield f"{words} {degree}. Its prior sigma on the ground is {sigma} at the first and last row."
         if scene.drift_justification is not None:
             yield f"Degree {degree - 1} left {_left(scene.drift_justification)}."
 
@@ -126,19 +119,19 @@ def _jitter(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def _priors(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield whether the corrections are within the stated accuracies."""
+    """Yield which accuracies of cameras were widened, as the corrections exceed them."""
     if scene.prior_ratio is None:
         return
-    if widened := [(one.prior_scale, one.name) for one in views if (one.prior_scale or 0.0) > _WIDENED]:
-        most, name = max(widened)
+    if widened := [(by, one.name) for one in views if (by := one.prior_scale or 0.0) > _WIDENED]:
+        (least, _), (most, name) = min(widened), max(widened)
+        named = len(widened) == 1 or most > _WIDENED * least  # the priors of two images are widened alike
+        times = f"up to {most:.1f} times ({name})" if named else f"{most:.1f} times"
         yield (
-            "The corrections exceed the accuracies assumed of the cameras, which were widened in "
-            f"{counted(len(widened), 'image')}, at most {most:.1f} times ({name})."
+            "The corrections exceed the accuracies assumed of the cameras. The prior sigmas of "
+            f"{counted(len(widened), 'image')} were widened, {times}."
         )
-    else:
-        yield "The corrections are within the accuracies assumed of the cameras."
     if (scene.prior_shared or 1.0) > _WIDENED:
-        yield f"For an error common to all images they were widened {scene.prior_shared:.1f} times."
+        yield f"The prior sigmas of an error common to all images were widened {scene.prior_shared:.1f} times."
 
 
 def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
@@ -147,8 +140,8 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         sum(getattr(view, f"num_{name}") for view in views) for name in ("observations", "rejected", "moving")
     )
     if used + scene.num_held_out + cut + moving:
-        counts = f"{used} used, {scene.num_held_out} check (independent of the adjustment), {cut} rejected as outliers"
-        counts += f", {moving} excluded, as they move together" * bool(moving)
+        counts = f"{used} used, {scene.num_held_out} check (independent of the adjustment)"
+        counts += f", {cut} rejected (wrong or imprecise)" + f", {moving} excluded (they move together)" * bool(moving)
         yield f"Observations of tie points: {counts}."
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)

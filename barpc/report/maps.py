@@ -26,7 +26,7 @@ from barpc.report.runfiles import MAX_PICTURES, ObservationTable, RunFiles
 from barpc.report.summary.ground_points import CheckPointEntry, GcpEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry, cell_numbers
-from barpc.report.summary.words import two_digits
+from barpc.report.summary.words import counted, two_digits
 
 WIDTH = 420.0  # Units of a map from left to right
 MAX_MARKS = 1500  # Tie points on the map, and lines between images
@@ -151,7 +151,9 @@ def ground_map(files: RunFiles) -> str:
     named = worst_first([view for _, view, _ in drawn if view.name in middles])
     shown = map_labels([(view, middles[view.name]) for view in named], taken, triangles)
     taken += [(x, y, 4.1 * len(name)) for _, name, x, y in shown] + triangles
+    counts = {"image": summary.views, "pair": summary.pairs, "GCP": summary.gcps, "check point": summary.check_points}
     text: str = template("drawings.svg.j2").module.ground(
+        described=", ".join(counted(len(rows), noun) for noun, rows in counts.items() if rows) + ".",
         plane=plane,
         lines=lines,
         words=words,
@@ -170,7 +172,6 @@ def ground_map(files: RunFiles) -> str:
             (kind, "doubted" * doubted(point), point.name, x, y, up)
             for (kind, up, point), (x, y) in zip(points, plane(placed), strict=True)
         ],
-        summary=summary,
     )
     return text
 
@@ -333,7 +334,7 @@ def residual_panels(
     """Draw small maps of the residuals "before" or "after", with captions: `first`, then by their systematic part.
 
     Darker cells have larger errors; thin lines are single residuals; a bold arrow is the mean of a cell where it is
-    significant. Also returns the systematic share of every image's cells, and the scale in words.
+    significant. Also returns the systematic share of every image's cells, and which images are shown if not all.
     """
     residuals: Array = getattr(observations, when)
     use = observations.used & np.isfinite(residuals).all(axis=1)
@@ -356,15 +357,9 @@ def residual_panels(
         rows = evenly(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
-    key = f"Scale bar: {_px(longest)} for thin lines, half of that for bold arrows."
-    if len(charts) < len(views):
-        key += f" Of {len(views)} images {len(charts)} are shown: "
-        key += "those that need review, then " * bool(first) + "those with the largest systematic part."
+    some = "those that need review, then " * bool(first) + "those with the largest systematic part"
+    key = f"Of {len(views)} images {len(charts)} are shown: {some}." * (len(charts) < len(views))
     return charts, shares, key
-
-
-def _px(length: float) -> str:
-    return f"{two_digits(length)} px"
 
 
 def panel_box(view: ViewEntry) -> Array:
@@ -404,7 +399,7 @@ def _panel(when: str, number: int, view: ViewEntry, cells: Cells, drawn: Array, 
         shafts=np.hstack([start, start + drawn[:, 2:] * (_ARROW_LENGTH / longest)]).tolist(),
         arrows=arrows,
         bar=_ARROW_LENGTH,
-        length=_px(longest),
+        length=f"{two_digits(longest)} px",
         described=f"{len(drawn)} residuals are drawn; {_panel_note(cells)}{'; shaded: few tie points' * len(gaps)}.",
     )
     return text

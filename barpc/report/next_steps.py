@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from functools import partial
+from textwrap import shorten
 
 import numpy as np
 
@@ -103,18 +105,18 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         then = _sigma_with(covariance, *_dem_observations(options))
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
-            words.append(f"--dem FILE --geoid NAME (height to {metres(then[2])})")
+            words.append(f"--dem FILE --geoid NAME (to {metres(then[2])} up)")
     up = now[2] * _height_ratio(summary, scene)
     if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))
-        words.append(f"a third image {NEW_ANGLE:g} deg from both (height to {metres(up)})")
+        words.append(f"a third image {NEW_ANGLE:g} deg from both (to {metres(up)} up)")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
     if (now > LEAST_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
         accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
-        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} ({lengths(then)})")
+        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} (to {lengths(then)})")
     if found:
-        text = f"To improve the position, add {', or '.join(words)}."
+        text = f"To lower the uncertainty of the position, add {', or '.join(words)}."
         yield StepEntry("improve", text, expected=tuple(found), part="gauge")
 
 
@@ -189,7 +191,7 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         alike = [view.name for view in views if (view.cause, view.status) == (views[0].cause, views[0].status)]
         label = CAUSES[views[0].cause].label if views[0].cause in CAUSES else STATUS_WORDS[views[0].status]
         rest = len(views) - len(alike)
-        more = f", then at {counted(rest, 'more image')}" if rest else ""
+        more = f", then {counted(rest, 'more image')}" if rest else ""
         part = _REPORT_PARTS.get(views[0].cause or "", "images")
         yield StepEntry("review", f"Review {listed(alike, NAMED)} ({label}){more}.", part=part)
     elif summary.left_out:
@@ -197,5 +199,6 @@ def _review(summary: Summary) -> Iterator[StepEntry]:
         yield StepEntry("review", f"Check the files that were left out: {names}.")
     elif summary.reasons:
         of_control = any(gcp.status not in ("used", "not seen") for gcp in summary.gcps)
-        text = f"Review the reservation{'s' * (len(summary.reasons) > 1)} on the scene."
+        first, rest = shorten(re.split(r"[.:] |\.$", summary.reasons[0])[0], 110), len(summary.reasons) - 1
+        text = f"Review: {first}" + f" (and {counted(rest, 'more reservation')})" * bool(rest) + "."
         yield StepEntry("review", text, part="gauge" if of_control or value_of(summary, "scene.dem") else "decisions")

@@ -18,6 +18,7 @@ from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
 from barpc.base.options import RunOptions
 from barpc.base.statistics import CRITICAL
 from barpc.fit import RpcFit
+from barpc.report.ranking import SMOOTH_LEFT
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
@@ -33,7 +34,6 @@ WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
 """A whole shift [px], and the share of a pair's matches, `MIN_COPY_MATCHES` or more, that must have it."""
 _COPIED = 0.5  # of the smaller image: less is what two frames of a pass have in common
 MIN_COPY_MATCHES = 20  # Of others a hundredth lies at a whole shift by chance: 18 of 20 never do
-SMOOTH_LEFT = 0.06  # A view whose residuals hold more than this [px] that is no scatter is called doubtful
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
 LEAST_MOVED = 0.1  # px over an eighth of an image: a finding that moves what is handed over by less is a remark
 MANY_REJECTED = 0.3  # A view that lost a larger share of its observations, not at random, is called doubtful

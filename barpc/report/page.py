@@ -21,6 +21,7 @@ from barpc.report.pictures import PICTURE_KEY, image_panels, length_bars, pair_s
 from barpc.report.ranking import (
     GOOD_RMSE,
     MIN_PAIR_MATCHES,
+    SMOOTH_LEFT,
     TABLE_ROWS_SHOWN,
     VERDICT_SENTENCES,
     flagged,
@@ -37,16 +38,16 @@ from barpc.report.summary.block import DATUM, DatumEntry, ExplanationEntry, Held
 from barpc.report.summary.ground_points import GCP_CAPTION, CheckPointEntry, GcpEntry, ReferenceViewEntry
 from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import counted, largest, metres
+from barpc.report.summary.words import capital, counted, known, largest, metres, two_digits
 from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
 _ROUNDING = 1e-6  # px
+_SIGNIFICANT = 1e-4  # probability of the F test below which residuals are systematic: `SmoothTest.found`
 _FOOTER = (
-    "Residuals are projected minus observed. Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of "
-    "the first pixel. The numbers of this page are in summary.json and in the folder tables: residuals.csv, "
-    "observations.csv, pairs.csv, footprints.geojson."
+    "Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of the first pixel. The numbers of this page "
+    "are in summary.json and in the folder tables: residuals.csv, observations.csv, pairs.csv, footprints.geojson."
 )
 REPORT_STAGE = "report"  # the stage that makes the page
 
@@ -127,28 +128,26 @@ _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
 _FOLDED = "places", "control", "decided", "again", "fits", "files", "options"
 
 
-def _tables_of(
-    key: str, rows: Sequence[Record], adjusted: bool = True, without: str = " ", more: str = ""
-) -> list[Table]:
-    """Return a table, if it has rows; `without`: columns to omit."""
+def _tables_of(key: str, rows: Sequence[Record], adjusted: bool = True) -> list[Table]:
+    """Return a table, if it has rows, without the columns that are empty in all of them."""
     caption, kind, columns = _TABLE_CAPTIONS[key]
-    columns = columns.replace(without, " ") + more
-    return [table(key, caption, rows, kind, columns, adjusted)] if rows else []
+    found = table(key, caption, rows, kind, columns, adjusted)
+    filled = [k for k in range(len(found.columns)) if any(row[k].text != "-" for row in found.rows)]
+    heads, cells = [found.columns[k] for k in filled], [[row[k] for k in filled] for row in found.rows]
+    return [replace(found, columns=heads, rows=cells)] if rows else []
 
 
 def _images_section(files: RunFiles) -> Section:
     views, number, adjusted = worst_first(files.summary.views), files.number, files.summary.adjusted
-    (shown,) = _tables_of("images", views, adjusted, " " if any(view.cause for view in views) else " wrong ")
+    (shown,) = _tables_of("images", views, adjusted)
     marks = [f"{number[view.name]}" for view in views]
     shown = replace(shown, caption=shown.caption + "; worst first" * bool(flagged(views)), marks=marks)
-    agree = "Residuals measure how well the images agree with each other, not their accuracy on the ground. "
-    panels = image_panels(files)
-    answer = agree * (adjusted and _num_in_use(files) > 0) + PICTURE_KEY * bool(panels)
-    return Section("images", "Which images can I use?", answer.strip(), tables=[shown], **_panels(panels))
-
-
-def _num_in_use(files: RunFiles) -> int:
-    return sum(view.num_observations for view in files.summary.views)
+    good, panels = sum(not view.advice for view in views), image_panels(files)
+    answer = f"{good} of {counted(len(views), 'image')}{', after review' * (good and not files.summary.passed)}."
+    if adjusted and files.summary.pairs:
+        answer += " Residuals measure how well the images agree with each other, not their accuracy on the ground."
+    answer += f" {PICTURE_KEY}" * bool(panels)
+    return Section("images", "Which images can I use?", answer, tables=[shown], **_panels(panels))
 
 
 def _panels(panels: Pictures) -> dict[str, Any]:
@@ -168,7 +167,7 @@ def _map_section(files: RunFiles) -> Section:
         "those that need review on top": any(view.advice for view in summary.views),
         "dots: tie points": len(files.points),
         f"triangles: GCPs{', red where they contradict others' * any(map(doubted, summary.gcps))}": summary.gcps,
-        f"arrows: their residuals in plan, at most {metres(miss)}": miss,
+        f"arrows: their residuals in plan (predicted minus given), at most {metres(miss)}": miss,
         "inverted triangles: check points": summary.check_points,
         "thicker lines: more matches": len(links) > 1,
         "dashed: tie points that move": any(one.box for one in (summary.scene.explanations if summary.scene else ())),
@@ -180,15 +179,14 @@ def _map_section(files: RunFiles) -> Section:
     lengths = {length: count for length, count in summary.tracks.by_length.items() if count}
     charts = [(ground_map(files), caption)] if any(files.outlines) else []
     groups = len(connected_groups(num, links))
-    tied = "all images" if groups == 1 else f"the images in {groups} separate groups"
-    answer = f"Tie points connect {tied}." if lengths else "There are no tie points in use."
+    tied = "All images are connected" if groups == 1 else f"The images form {groups} separate groups"
+    said = ", ".join(f"{count} in {images} images" for images, count in lengths.items())
+    said = f": {said}" * (1 < len(lengths) <= MAX_LENGTHS_SAID)
+    answer = f"{tied}, with {counted(summary.tracks.num_tracks, 'tie point')}{said}."
+    answer = answer if links else "There are no tie points in use."
     answer += f" Connected to one other image only: {listed(lonely)}." * bool(lonely)
     if len(lengths) > MAX_LENGTHS_SAID:
         charts.append((length_bars(lengths), "Tie points by the number of images that see them."))
-    elif lengths:
-        (first, most), *rest = lengths.items()
-        said = [f"{counted(most, 'tie point')} in {first} images", *(f"{count} in {images}" for images, count in rest)]
-        answer += f" {', '.join(said)}."
     return Section("map", "Where are the images, and which are connected?", answer, charts=charts)
 
 
@@ -201,14 +199,36 @@ def _randomness_section(files: RunFiles) -> Section | None:
     marked = [view.name for view, share in zip(views, shares, strict=True) if share > 0.5]
     parts = _panels(panels)
     if adjusted:
-        before, _, lengths = residual_panels(views, files.observations, "before", first)
-        parts["folds"].append((f"Before the adjustment. {lengths}", before))
-    random = "Yes: no image has a significant mean residual in most of its cells."
+        parts["folds"].append(("Before the adjustment", residual_panels(views, files.observations, "before", first)[0]))
+    answer = f"{_randomness(views, marked)} {_LEGEND} {key}".strip()
+    return Section("random", "Are the residuals random?", answer, **parts)
+
+
+_LEGEND = (
+    "Thin lines: residuals, projected minus observed. Colour: their RMS in each of 8 x 8 cells. Bold arrows, at twice "
+    "the scale: means of cells that exceed three standard errors."
+)
+
+
+def _randomness(views: Sequence[ViewEntry], marked: Sequence[str]) -> str:
+    """Return whether residuals are random; `marked`: images in most of whose cells they have a significant mean."""
+    systematic = [(view.systematic_px or 0.0, view.name) for view in views if known(view.systematic_p) < _SIGNIFICANT]
+    correlated = [(size, view.name) for view in views if (size := view.neighbour_correlated_px)]
+    tests = ("systematic residuals (F test: p < 1e-4)", systematic), ("correlated neighbouring residuals", correlated)
+    found = [
+        f"{what} in {counted(len(sizes), 'image')}, at most {two_digits(max(sizes)[0])} px ({max(sizes)[1]})."
+        for what, sizes in tests
+        if sizes
+    ]
+    large = max([*systematic, *correlated], default=(0.0, ""))[0] > SMOOTH_LEFT
+    found += [f"An image needs review above {SMOOTH_LEFT:g} px."] * bool(found)
     if marked:
-        random = f"Not in {listed(marked)}: most cells there have a significant mean residual."
-    legend = "The colour shows the size of a residual."
-    legend += " Thin lines: single residuals. Bold arrows: significant means of cells."
-    return Section("random", "Are the residuals random?", f"{random} {legend} {key}", **parts)
+        found.append(f"Most cells of {listed(marked)} have a significant mean.")
+    if found:
+        return f"{'No' if marked or large else 'Nearly'}. {' '.join(map(capital, found))}"
+    if all(view.systematic_p in (None, 1.0) for view in views):  # too few to test
+        return "No image has a significant mean in most of its cells."
+    return f"Yes: no image has {tests[0][0]}."
 
 
 def _surface_section(files: RunFiles) -> Section | None:
@@ -262,9 +282,9 @@ def _corrections_section(files: RunFiles) -> Section | None:
         return None
     tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
-    return Section(
-        "moves", "How was each camera corrected?", f"By up to {max(moves):.2f} px at the image centre.", tables=tables
-    )
+    answer = f"By up to {max(moves):.2f} px at the image centre (corrected minus delivered). "
+    answer += "The sigmas include that of the scene's position."
+    return Section("moves", "How was each camera corrected?", answer, tables=tables)
 
 
 def _decisions_section(files: RunFiles) -> Section | None:
@@ -290,7 +310,10 @@ def _gauge_section(files: RunFiles) -> Section | None:
     tables += _tables_of("gcps", summary.gcps)
     tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
     tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)
-    answer = "Tie points fix the images relative to each other, not on the Earth. " * (_num_in_use(files) > 0)
+    answer = "Tie points fix the images relative to each other. " * bool(summary.pairs)
+    if placed := DatumEntry.columns(scene.datum[:3], least=0.05).split()[2:]:  # of east, north, up
+        sources = table("", "", (), DatumEntry, " ".join(placed)).columns
+        answer += f"The position on the Earth comes from {listed([f'the {source}' for source in sources])}. "
     if scene.num_held_in_height:
         held = counted(scene.num_held_in_height, "tie point")
         answer += f"The heights of {held} with too small a convergence angle were constrained."
@@ -301,9 +324,7 @@ def _check_points_section(files: RunFiles) -> Section | None:
     points = files.summary.check_points
     if not points:
         return None
-    answer = (
-        f"{counted(len(points), 'check point')}, not used in the adjustment. The RMS of residuals is in the verdict."
-    )
+    answer = f"The verdict has the RMS of {counted(len(points), 'check point')}, which the adjustment did not use."
     return Section("accuracy", "How accurate is it on the ground?", answer, tables=_tables_of("check-points", points))
 
 
@@ -315,27 +336,21 @@ def _files_section(files: RunFiles) -> Section | None:
         rows = [
             [cell_of(file), *(cell_of(found.get(name), ".1e") for name in consumers)] for file, found in outputs.items()
         ]
-        caption = "Written files, read again by other programs: largest difference from the corrected cameras [px]"
+        caption = "Written files, read again: largest difference from the corrected cameras [px]"
         tables.append(Table("files", caption, ["file", *(f"{consumer} [px]" for consumer in consumers)], rows))
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
     if not tables:
         return None
-    exact = "Not known for every image." if worst is None else "Yes, exactly."
-    if worst is not None and worst > _ROUNDING:
-        exact = f"To {worst:.1e} px over each image and its altitude range."
-    answer = f"{exact} The old images still carry the old RPC."
+    exact = "Not known for every image" if worst is None else f"Within {two_digits(max(worst, _ROUNDING))} px"
+    answer = f"{exact}. The original images still carry the delivered RPC."
     return Section("files", "Do the new RPC files reproduce the corrected cameras?", answer, tables=tables)
 
 
 def _run_section(files: RunFiles) -> Section:
     rows = [[cell_of(key), cell_of(str(value))] for key, value in flat_options(files.summary.options or {}).items()]
     options = Table("options", "Options of the run", ["option", "value"], rows)
-    summary = files.summary
-    counts = len(summary.views), summary.tracks.num_tracks, summary.tracks.num_observations
-    answer = ", ".join(map(counted, counts, ("image", "tie point", "observation"))) + "."
-    if not summary.tables.complete:
-        answer += f" Tables and charts show {summary.tables.num_written_tracks} tie points, sampled evenly."
-    return Section("run", "With which options, and how much data?", answer, tables=[options])
+    some = f"Tables and charts show {files.summary.tables.num_written_tracks} tie points, sampled evenly."
+    return Section("run", "With which options?", some * (not files.summary.tables.complete), tables=[options])
 
 
 SECTIONS: Sequence[Callable[[RunFiles], Section | None]] = (

@@ -38,7 +38,7 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
             kept=kept.tolist(),
             cut=cut.tolist(),
             parts=boxes,
-            described=f"{PICTURE_KEY} {counted(len(boxes), 'part')} with reservations.",
+            described=PICTURE_KEY + f" {counted(len(boxes), 'part')} with reservations." * bool(boxes),
         )
         panels.append((text, view.name + f": {STATUS_WORDS[view.status]}" * bool(view.advice)))
     return panels
@@ -88,9 +88,8 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
     """Draw the tiles of the worst pair along its epipolar lines, with captions."""
     draw = template("drawings.svg.j2").module.strip
     words = (
-        "{0.image}, the worst pair: windows of {0.half_px:.0f} px to every side of {0.tiles} of its tie points, "
-        "resampled along epipolar lines. With correct cameras a feature lies on the line in all windows; shifts along "
-        "the line come from terrain height."
+        "{0.image}: windows of {0.half_px:.0f} px to every side of {0.tiles} tie points, along epipolar lines. "
+        "With correct cameras a feature lies on the line in all windows; shifts along the line come from heights."
     )
     told = [(one, words.format(one)) for one in files.strips]
     return [(draw(one, said, WIDTH, WIDTH * one.size[1] / one.size[0]), said) for one, said in told]

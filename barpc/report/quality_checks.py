@@ -15,8 +15,8 @@ from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.base.statistics import SURE, SURELY
 from barpc.report.measures.block import left_entries, matters, strangeness
-from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, SMOOTH_LEFT, WHOLE_PIXELS, Run
-from barpc.report.ranking import GOOD_RMSE
+from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, WHOLE_PIXELS, Run
+from barpc.report.ranking import GOOD_RMSE, SMOOTH_LEFT
 from barpc.report.summary.block import AXES, LeftEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, counted, enu, known, metres, two_digits
@@ -100,9 +100,8 @@ def _weakly_tied(view: ViewEntry, run: Run) -> Causes:
     controlled = by_reference or view.num_gcps >= ENOUGH_GCPS
     held = view.name in run.known  # by an earlier run: it needs no tie points of its own
     if view.num_observations < MIN_TIE_POINTS and not controlled and not held:
-        gcps = f"{view.num_gcps} GCP{'s' * (view.num_gcps > 1)}"
         what = "few" if view.num_observations else "few_gcps" if view.num_gcps else "none"
-        yield what, {"few": view.num_observations, "gcps": gcps}
+        yield what, {"few": view.num_observations, "gcps": counted(view.num_gcps, "GCP")}
     if view.name in run.whole_pixels and run.kind != "match" and not controlled:
         yield "whole_pixels", {"shared": WHOLE_PIXELS}
     if (gap := run.gaps.get(run.number[view.name])) is not None:
@@ -356,13 +355,15 @@ def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
             alike = word == "rejected" and tested.agreed is not None and tested.agreed.alike
             datum = " They agree with each other: check their datum and heights, too." * alike
             them = "it" if len(wrong) == 1 else "them"
-            yield f"{words.format(counted(len(wrong), 'GCP'), them)}: {listed(wrong)}. {cure}.{datum}"
+            start = words.format(counted(len(wrong), "GCP"), them)
+            sign = ", predicted minus given" * any(", w = " in one for one in wrong)
+            yield f"{start}: {listed(wrong)}{sign}. {cure}.{datum}"
     if tested.sets:
         one, other = (listed([names[g] for g in np.flatnonzero(points).tolist()], NAMED) for points in tested.sets)
         middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
         apart = ""
         if all(len(residual) for residual in middle):
-            apart = f" ({enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))} between them)"
+            apart = f" (predicted minus given differs by {enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))})"
         yield (
             f"GCPs contradict each other, {one} against {other}{apart}, and none was used. Check coordinates, axes, "
             "datum and image positions, or add a point."

@@ -11,6 +11,7 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import CAUSES, NAMED, STATUS_WORDS, capital
 
 GOOD_RMSE = 0.5  # px: a view with a larger RMS of its tie points needs review
+SMOOTH_LEFT = 0.06  # px: a view with larger systematic residuals needs review
 VERDICT_SENTENCES = 20  # sentences of the verdict that are shown at least
 TABLE_ROWS_SHOWN = 10  # rows of a table on the terminal, images and pairs alike
 MIN_PAIR_MATCHES = 30  # Of a pair that is called good for heights: they tell its offset to a fifth of its scatter

@@ -101,14 +101,11 @@ def _carried_lines(run: Run) -> Iterator[str]:
 
 
 def _headline(run: Run, num: int, bad: int, look: int, more: str) -> str:
-    text, parts = _ALL_WELL[run.kind][min(num, 3) - 1].format(num), []
-    if bad:
-        word = "not adjusted" if run.kind == "adjust" else "not usable"
-        parts.append(f"{bad} {'image is' if bad == 1 else 'images are'} {word}")
-    if look:
-        parts.append(f"{counted(look, 'image')} {'needs' if look == 1 else 'need'} review")
+    text, word = _ALL_WELL[run.kind][min(num, 3) - 1].format(num), "adjusted" if run.kind == "adjust" else "usable"
+    parts = [f"{bad} {'is' if bad == 1 else 'are'} not {word}"] * bool(bad)
+    parts += [f"{look} {'needs' if look == 1 else 'need'} review"] * bool(look)
     if parts:
-        text = f"{', '.join(parts)} (of {num + len(run.left_out)})"
+        text = ", ".join(parts).replace(" ", f" of {counted(num + len(run.left_out), 'image')} ", 1)
     return f"{text}; {more} review." if more else f"{text}."
 
 
@@ -153,9 +150,10 @@ def _common_scale(found: Adjustment) -> float:
 def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
     common = _common_scale(found)
     if common > PRIOR_WIDENED and any(is_stated(view, found.options) for view in run.views):
+        either = " Tie points of two images cannot show which camera is wrong." * (len(run.views) == 2)
         yield (
-            f"The cameras are {common:.1f} times less accurate than stated, and so is the scene's position. Check the "
-            "stated accuracies, or add GCPs or a DEM."
+            f"The cameras are {common:.1f} times less accurate than stated, and so is the scene's position.{either} "
+            "Check the RPCs and the stated accuracies, or add GCPs or a DEM."
         )
     yield from _of_image_model(run, found)
     if found.apart is not None and not found.apart.clear:
@@ -380,25 +378,23 @@ def _unseen_lines(found: Adjustment) -> Iterator[str]:
     view, axis = np.unravel_index(int(unseen.metres.argmax()), unseen.metres.shape)
     if (pixels := float(unseen.pixels[view, axis])) > LEAST_MOVED:
         yield (
-            f"A jump of {AXES[axis]} of {found.names[view]} along their axis by {two_digits(pixels)} px or less would "
-            "not show in tie points of two images. Heights behind it would be off by "
-            f"{metres(float(unseen.metres[view, axis]))} or less."
+            f"A jump between {AXES[axis]} of {found.names[view]} by up to {two_digits(pixels)} px would not show in "
+            f"two images. Heights behind it would be off by up to {metres(float(unseen.metres[view, axis]))}."
         )
 
 
 def _pointing_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield the pointing errors of cameras without a stated accuracy, where they exceed the default."""
-    common, off = _common_scale(found) > PRIOR_WIDENED, dict[str, float]()
+    """Yield the corrections of cameras without a stated accuracy that exceed the default."""
+    assumed = np.sqrt(2.0) * DEFAULT_ACCURACY / median([view.gsd_m for view in views])  # rotation and translation
+    common, off = _common_scale(found) > PRIOR_WIDENED, list[str]()
     for view, given, odd in zip(views, run.views, found.prior.odd, strict=False):
-        shift = value_of(view, "correction.center_shift_px")
-        if shift is not None and (common or odd) and not is_stated(given, found.options):
-            off[view.name] = float(np.hypot(*shift))
+        size = np.hypot(*(value_of(view, "correction.center_shift_px") or (0.0, 0.0)))
+        if size > assumed and (common or odd) and not is_stated(given, found.options):
+            off.append(f"{view.name} ({size:.0f} px)")
     if off:
-        assumed = np.sqrt(2.0) * DEFAULT_ACCURACY / median([view.gsd_m for view in views])  # rotation and translation
-        names = listed([f"{name} ({px:.0f} px)" for name, px in off.items()], NAMED)
         yield (
-            f"The delivered pointing of {names} was off by more than the {assumed:.0f} px assumed where no file states "
-            "its accuracy, and was corrected."
+            f"Corrections exceed the pointing error of {assumed:.0f} px that is assumed where no file states one: "
+            f"{listed(off, NAMED)}."
         )
 
 

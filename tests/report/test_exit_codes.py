@@ -40,7 +40,7 @@ def test_every_status_of_an_image_decides_the_whole(status, kind, verdict):
     assert set(found["reasons"]) <= set(found["verdict"])
     if status in OVERALL:
         assert ADVICE[status] in found["reasons"][0]
-        assert "(of 9)" in found["headline"]
+        assert "1 of 9 images" in found["headline"]
 
 
 @pytest.mark.parametrize("kind", PASSED_STATUS)

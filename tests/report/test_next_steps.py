@@ -260,7 +260,7 @@ def test_one_line_names_some_of_three_hundred_images_and_counts_the_others():
     views += [flagged_view("contradicted", f"x{k:02d}") for k in range(3)]
     steps = next_steps(a_summary(views, passed=False, status="look"))
     assert all(len(step.text) < 250 for step in steps)
-    assert "then at 20 more images" in steps[-1].text
+    assert "then 20 more images" in steps[-1].text
 
 
 def test_one_image_is_handed_over_for_an_orthoimage_and_for_no_surface():
@@ -294,6 +294,11 @@ def test_files_that_were_left_out_and_reservations_of_the_block_are_reviewed():
     (step,) = next_steps(summary)
     assert step.part == "decisions"
     assert len(step.text) <= 160
+    of_dem = "The DEM was not used: its relief is 0.1 times that of the tie points. Check its place."
+    (step,) = next_steps(replace(summary, reasons=(of_dem,)))
+    assert step.text == "Review: The DEM was not used."
+    (step,) = next_steps(replace(summary, reasons=("p7 is outside of all images.", of_dem, of_dem)))
+    assert step.text == "Review: p7 is outside of all images (and 2 more reservations)."
     (step,) = next_steps(replace(summary, left_out=(LeftOutEntry("c.tif", "no RPC"),)))
     assert "c.tif" in step.text
 

@@ -35,15 +35,15 @@ def texts(table) -> list[list[str]]:
 
 
 def test_residuals_of_adjusted_images_are_no_accuracy():
-    section = asked("images")
+    section = asked("images", pairs=[a_pair()])
     agreement = "Residuals measure how well the images agree with each other, not their accuracy on the ground."
-    assert section.answer == agreement
+    assert section.answer == f"3 of 3 images. {agreement}"
     (table,) = section.tables
     assert table.columns[:3] == ["image", "verdict", "used"]
     assert [row[0].text for row in table.rows] == ["A", "B", "C"]
     assert table.marks == ["0", "1", "2"]
     check = asked("images", [a_view(status="consistent", rmse_after=None)], kind="check")
-    assert check.answer == ""
+    assert check.answer == "1 of 1 image."
     assert "after [px]" not in check.tables[0].columns
     assert "after [px]" in table.columns
 
@@ -68,13 +68,27 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
             "+1.00, -2.00",
             "0.51",
             "12.3",
-            "-",
         ]
     ]
     assert [cell.key for cell in table.rows[0]][1:6] == [4, 60, 0, 25.0, 0.254]
     assert table.rows[0][1].kind == "status doubtful"
-    (nothing,) = asked("images", [a_view(num_observations=0, num_rejected=0)]).tables
-    assert nothing.rows[0][4].text == "-"
+    none = a_view(num_observations=0, num_rejected=0)
+    (nothing,) = asked("images", [none]).tables  # a column that is empty in all rows is none
+    assert "rejected [%]" not in nothing.columns
+    assert {len(row) for row in nothing.rows} == {len(nothing.columns)}
+    (some,) = asked("images", [none, view]).tables
+    assert [row[some.columns.index("rejected [%]")].text for row in some.rows] == ["-", "25.0"]
+
+
+def test_the_images_to_use_are_counted_and_a_reservation_asks_for_a_review_first():
+    bad = [replace(view, **BAD) for view in VIEWS]
+    for views, passed, answer in (
+        (VIEWS, True, "3 of 3 images."),
+        (VIEWS, False, "3 of 3 images, after review."),
+        ([VIEWS[0], *bad[1:]], False, "1 of 3 images, after review."),
+        (bad, False, "0 of 3 images."),
+    ):
+        assert asked("images", views, passed=passed).answer == answer
 
 
 def test_a_map_needs_an_outline_and_says_where_some_are_left_out(sized):
@@ -91,18 +105,17 @@ def test_how_images_hang_together():
     def answer(pairs, num=4):
         tracks = TracksEntry(10, 26, {"2": 8, "3": 0, "5": 2})
         found = asked("map", [a_view(name) for name in "ABCD"[:num]], pairs, tracks=tracks).answer
-        assert found.endswith(" 8 tie points in 2 images, 2 in 5.")
-        return found.removesuffix(" 8 tie points in 2 images, 2 in 5.")
+        assert pairs == [] or ", with 10 tie points: 8 in 2 images, 2 in 5 images." in found
+        return found.replace(", with 10 tie points: 8 in 2 images, 2 in 5 images", "")
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
-    assert answer(ring) == "Tie points connect all images."
-    assert answer(ring[:3]) == "Tie points connect all images. Connected to one other image only: A, D."
-    assert (
-        answer(ring[:1])
-        == "Tie points connect the images in 3 separate groups. Connected to one other image only: A, B."
-    )
-    assert answer(ring[:1], 2) == "Tie points connect all images."
-    assert answer([]) == "Tie points connect the images in 4 separate groups."
+    assert answer(ring) == "All images are connected."
+    assert answer(ring[:3]) == "All images are connected. Connected to one other image only: A, D."
+    assert answer(ring[:1]) == "The images form 3 separate groups. Connected to one other image only: A, B."
+    assert answer(ring[:1], 2) == "All images are connected."
+    assert answer([]) == "There are no tie points in use."
+    pair = asked("map", VIEWS[:2], ring[:1], tracks=TracksEntry(10, 20, {"2": 10}))
+    assert pair.answer == "All images are connected, with 10 tie points."
 
 
 def pushed(view: int, cells: int, of: int):
@@ -115,21 +128,50 @@ def pushed(view: int, cells: int, of: int):
     return rows
 
 
+LEGEND = (
+    " Thin lines: residuals, projected minus observed. Colour: their RMS in each of 8 x 8 cells. Bold arrows, at twice "
+    "the scale: means of cells that exceed three standard errors."
+)
+
+
 def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
     calm = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)]))
-    assert calm.answer.startswith(
-        "Yes: no image has a significant mean residual in most of its cells. The colour shows the size of a residual."
-    )
+    assert calm.answer == f"No image has a significant mean in most of its cells.{LEGEND}"
     assert len(calm.panels) == 3
-    assert [words.split(".")[0] for words, _ in calm.folds] == ["Before the adjustment"]
+    assert [words for words, _ in calm.folds] == ["Before the adjustment"]
     assert len(calm.folds[0][1]) == 3
     told = asked("random", observed=seen([*pushed(0, 1, 2), *pushed(1, 2, 3)]))
-    assert told.answer.startswith("Not in B: most cells there have a significant mean residual. The colour")
+    assert told.answer == f"No. Most cells of B have a significant mean.{LEGEND}"
     check = asked("random", observed=seen(pushed(1, 2, 3)), kind="check")
     assert check.folds == []
     assert 'id="panel-before0-t"' in check.panels[0][0]
     assert 'id="panel-after0-t"' in calm.panels[0][0]
     assert asked("random", observed=seen([])) is None
+
+
+YES = "Yes: no image has systematic residuals (F test: p < 1e-4)."
+ABOVE = "An image needs review above 0.06 px."
+
+
+@pytest.mark.parametrize(("figures", "said"), [
+    ([(0.3, 0.0, 0.0), (1e-4, 0.2, 0.0)], YES),
+    ([(1.0, 0.0, 0.0), (1.0, 0.0, 0.0)], "No image has a significant mean in most of its cells."),  # too few to test
+    ([(None, None, None), (0.2, 0.0, None)], YES),
+    ([(6e-30, 0.0023, 0.0), (9e-5, 0.0014, 0.0)],
+     f"Nearly. Systematic residuals (F test: p < 1e-4) in 2 images, at most 0.0023 px (A). {ABOVE}"),
+    ([(0.4, 0.0, 0.0), (1e-9, 0.07, 0.0)],
+     f"No. Systematic residuals (F test: p < 1e-4) in 1 image, at most 0.07 px (B). {ABOVE}"),
+    ([(0.4, 0.0, 0.05), (0.4, 0.0, 0.0)],
+     f"Nearly. Correlated neighbouring residuals in 1 image, at most 0.05 px (A). {ABOVE}"),
+])  # fmt: skip
+def test_systematic_residuals_are_said_with_their_size_and_the_limit_of_a_review(figures, said):
+    """Many tie points show a thousandth of a pixel: the answer is by its size, too, and by the p of the table."""
+    names = "systematic_p", "systematic_px", "neighbour_correlated_px"
+    views = [a_view(name, **dict(zip(names, of, strict=True))) for name, of in zip("AB", figures, strict=True)]
+    assert asked("random", views, observed=seen([*pushed(0, 1, 2), *pushed(1, 0, 2)])).answer == said + LEGEND
+    decided = asked("decisions", views, scene=a_scene(model="rotation")).tables[0]
+    if figures[0][0]:
+        assert decided.rows[0][decided.columns.index("F test p")].text == f"{figures[0][0]:.1e}"
 
 
 def test_pairs_are_told_by_the_worst_offset():
@@ -144,15 +186,11 @@ def test_pairs_are_told_by_the_worst_offset():
     assert texts(section.tables[0])[0] == [
         "A - B",
         "100",
-        "-",
-        "-",
-        "-",
         "20.0",
         "0.35",
         "1.4",
         "+0.300 ± 0.200",
         "+0.000 ± 0.100",
-        "-",
     ]
     kept = OffsetEntry(0.0, 0.08, 0.09, 50)  # of those in use: ranked by
     section = asked("pairs", pairs=[replace(pairs[0], epipolar_kept=kept)])
@@ -180,12 +218,15 @@ def test_corrections_are_told_by_the_farthest_move():
         ),
     ]
     section = asked("moves", views)
-    assert section.answer == "By up to 5.00 px at the image centre."
+    assert section.answer == (
+        "By up to 5.00 px at the image centre (corrected minus delivered). The sigmas include that of the scene's "
+        "position."
+    )
     assert [table.key for table in section.tables] == ["corrections", "places"]
-    assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-", "-", "-"]
-    assert texts(section.tables[0])[1][-2:] == ["694,000", "line"]
+    assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-"]
+    assert texts(section.tables[0])[1][-1] == "694,000"
     assert [cell.key for cell in section.tables[0].rows[0]][1:3] == [3.0, -4.0]
-    assert texts(section.tables[1])[1] == ["B", "3.00", "1.00", "45", "5.00", "-"]
+    assert texts(section.tables[1])[1] == ["B", "3.00", "1.00", "45", "5.00"]
     assert not section.charts
     assert [table.key for table in asked("moves", views[:1]).tables] == ["corrections"]
     assert asked("moves", [views[0], a_view("B")]) is None
@@ -201,9 +242,10 @@ def a_scene(**fields) -> SceneEntry:
 
 
 def test_points_too_nearly_in_line_are_counted_where_the_scene_is_uncertain():
-    plain = asked("gauge", scene=a_scene()).answer
-    assert plain == "Tie points fix the images relative to each other, not on the Earth."
-    held = asked("gauge", scene=a_scene(num_held_in_height=7))
+    pairs = [a_pair()]
+    plain = asked("gauge", pairs=pairs, scene=a_scene()).answer
+    assert plain == "Tie points fix the images relative to each other."
+    held = asked("gauge", pairs=pairs, scene=a_scene(num_held_in_height=7))
     assert held.answer == f"{plain} The heights of 7 tie points with too small a convergence angle were constrained."
     assert held.tables == []
     assert asked("gauge") is None
@@ -219,6 +261,10 @@ def test_what_holds_the_scene_and_the_control_in_each_image_are_tables():
     datum = DatumEntry("up", 2.0, 0.996, 0.0, 0.0, 0.004, 0.0, None)
     views = [a_view("A", control_w=2.5, control_w_point="P"), a_view("B")]
     section = asked("gauge", views, scene=a_scene(datum=(datum,)), gcps=(a_gcp("P", 0.0, 0.0),))
+    assert section.answer == "The position on the Earth comes from the delivered cameras."
+    held = replace(datum, cameras=0.02, gcps=0.93, heights=0.05)
+    both = asked("gauge", views, scene=a_scene(datum=(held,) * 3)).answer
+    assert both == "The position on the Earth comes from the GCPs, the DEM or assumed heights."
     assert [table.key for table in section.tables] == ["datum", "gcps", "control"]
     assert texts(section.tables[0]) == [["up", "2.00", "100%"]]
     assert texts(section.tables[2]) == [["A", "2.5", "P"]]
@@ -243,7 +289,7 @@ def test_check_points_are_shown():
         a_check("R", (4.0, 0.0, 0.3)),
     )
     section = asked("accuracy", check_points=points)
-    assert section.answer == ("3 check points, not used in the adjustment. The RMS of residuals is in the verdict.")
+    assert section.answer == "The verdict has the RMS of 3 check points, which the adjustment did not use."
     assert texts(section.tables[0]) == [
         ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
         ["R", "0", "-", "+4.000", "0", "+0.300"],
@@ -255,7 +301,7 @@ def test_files_are_held_to_what_their_readers_found():
     fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
     outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
     section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
-    assert section.answer.startswith("To 4.0e-03 px over each image")
+    assert section.answer == "Within 0.004 px. The original images still carry the delivered RPC."
     fits, files = section.tables
     assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100%", "500", "lstsq"]
     assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
@@ -264,6 +310,8 @@ def test_files_are_held_to_what_their_readers_found():
     assert asked("files", [a_view("A")]) is None
     partly = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B")])
     assert partly.answer.startswith("Not known for every image.")
+    exact = asked("files", [a_view("A", fit=replace(fit, max_px=(4e-9, 3e-9)))])
+    assert exact.answer.startswith("Within 1e-06 px.")
     assert [table.key for table in partly.tables] == ["files"]
     unknown = asked("files", [a_view("A", fit=replace(fit, max_px=(None, 0.1)))])
     assert unknown.answer.startswith("Not known")
@@ -272,12 +320,10 @@ def test_files_are_held_to_what_their_readers_found():
 def test_how_it_was_made_says_its_options_and_no_time():
     stages = (StageEntry("matching", 8.0, 8.0, 100.4),)
     section = asked("run", stages=stages, options={"tie": {"band": 1}, "dem": None})
-    assert section.answer == "3 images, 5 tie points, 12 observations."
+    assert section.answer == ""
     assert [texts(one) for one in section.tables] == [[["tie.band", "1"], ["dem", "None"]]]
     some = asked("run", tables=TablesEntry(900, 300, complete=False))
-    assert (
-        some.answer == "3 images, 5 tie points, 12 observations. Tables and charts show 300 tie points, sampled evenly."
-    )
+    assert some.answer == "Tables and charts show 300 tie points, sampled evenly."
 
 
 def test_decisions_have_a_table_of_images_where_cameras_were_adjusted():

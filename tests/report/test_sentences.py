@@ -273,16 +273,16 @@ def test_headlines_count_one_and_many():
 
     well = ["adjusted"] * 3
     assert headline(well) == "All 3 images are adjusted."
-    assert headline(["weak", "adjusted", "adjusted"]) == "1 image needs review (of 3)."
-    assert headline(["weak", "doubtful", "adjusted"]) == "2 images need review (of 3)."
-    assert headline(["failed", "doubtful", "adjusted"]) == "1 image is not adjusted, 1 image needs review (of 3)."
-    assert headline(["failed", "failed", "adjusted"]) == "2 images are not adjusted (of 3)."
-    assert headline(well, left_out=(("x", "y"),)) == "1 image is not adjusted (of 4)."
+    assert headline(["weak", "adjusted", "adjusted"]) == "1 of 3 images needs review."
+    assert headline(["weak", "doubtful", "adjusted"]) == "2 of 3 images need review."
+    assert headline(["failed", "doubtful", "adjusted"]) == "1 of 3 images is not adjusted, 1 needs review."
+    assert headline(["failed", "failed", "adjusted"]) == "2 of 3 images are not adjusted."
+    assert headline(well, left_out=(("x", "y"),)) == "1 of 4 images is not adjusted."
     check = {"kind": "check", "left_out": (("x", "y"), ("z", "y")), "adjustment": None}
-    assert headline(well, **check) == "2 images are not usable (of 5)."
+    assert headline(well, **check) == "2 of 5 images are not usable."
     noisy = adjusted(noise=2.6)
     assert headline(well, adjustment=noisy) == "All 3 images are adjusted; the block needs review."
-    assert headline(["weak", *well[1:]], adjustment=noisy) == "1 image needs review (of 3); the block needs review."
+    assert headline(["weak", *well[1:]], adjustment=noisy) == "1 of 3 images needs review; the block needs review."
     assert headline(well, kind="check", adjustment=None) == "The cameras of all 3 images agree."
 
 
@@ -293,6 +293,9 @@ def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
     assert bool(found) == said_of
     if said_of:
         assert found[0].startswith("The cameras are 2.1 times less accurate than stated")
+        assert "two images" not in found[0]
+        two = block_verdict(run_of(adjusted(prior=prior), views=run_of().views[:2]), views()[:2])["reasons"]
+        assert two[0].split(". ")[1] == "Tie points of two images cannot show which camera is wrong"
 
 
 def test_an_accuracy_that_nobody_stated_is_no_reason():
@@ -310,7 +313,11 @@ def test_an_accuracy_that_nobody_stated_is_no_reason():
         assert found["reasons"] == []
         assert [view_status(view, run)["cause"] for view in off] == [None] * 3
         (line,) = (line for line in found["verdict"] if "pointing" in line)
-        assert line.startswith(f"The delivered pointing of {names} was off by more than the 21 px assumed")
+        assert (
+            line == f"Corrections exceed the pointing error of 21 px that is assumed where no file states one: {names}."
+        )
+        near = [replace(view, correction=a_correction(center_shift_px=(0.0, 21.0))) for view in off]
+        assert not any("pointing" in line for line in block_verdict(run, near)["verdict"])
     assert reasons(moved(600.0, options=nobody), views=silent) == []
 
 
@@ -413,10 +420,10 @@ def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
     residual, w = np.array([[3.0, 4.0, 0.0], [0, 0, 0], [0, 0, 0.02]]), np.array([6.0, 1.0, 4.5])
     found = reasons(adjusted(control=control(residual=residual, w=w, used=np.array([False, True, True]))), gcps=gcps())
     assert found == [
-        "1 GCP rejected, as the others contradict it: P0 (+3.00 m east, +4.00 m north, +0.00 m up, w = 6.0). Check "
-        "coordinates, axes and image positions.",
+        "1 GCP rejected, as the others contradict it: P0 (+3.00 m east, +4.00 m north, +0.00 m up, w = 6.0), predicted "
+        "minus given. Check coordinates, axes and image positions.",
         "1 GCP used, with residuals above 4 standard deviations: P2 (+0.00 m east, +0.00 m north, +0.02 m up, "
-        "w = 4.5). Check coordinates and stated accuracies.",
+        "w = 4.5), predicted minus given. Check coordinates and stated accuracies.",
     ]
     two = reasons(adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps())
     assert two[0].startswith("3 GCPs rejected")
@@ -669,7 +676,10 @@ def test_control_that_contradicts_is_named_with_what_it_is_off_by():
     off = f"A ({enu(np.array([1.0, -2.0, 3.0]))}, w = 9.5)"
     assert line.startswith("2 GCPs rejected, as the others contradict them: ")
     assert off in line
-    assert line.endswith("B (in too few images to determine its error). Check coordinates, axes and image positions.")
+    of_few = "B (in too few images to determine its error)"
+    assert line.endswith(f"{of_few}, predicted minus given. Check coordinates, axes and image positions.")
+    (line,) = said("used rejected used")
+    assert line.endswith(f"{of_few}. Check coordinates, axes and image positions.")
     (line,) = said("used used rejected", agreed=SimpleNamespace(alike=True))
     assert line.endswith("They agree with each other: check their datum and heights, too.")
     (line,) = said("contradicts used used", fits=False)
@@ -680,7 +690,7 @@ def test_control_that_contradicts_is_named_with_what_it_is_off_by():
     sets = (np.array([True, True, False]), np.array([False, False, True]))
     (line,) = said("undecided undecided undecided", sets=sets)
     apart = enu(np.array([-2.0, -2.0, 2.0]))
-    assert f"GCPs contradict each other, A, B against C ({apart} between them), and none was used." in line
+    assert f"GCPs contradict each other, A, B against C (predicted minus given differs by {apart}), and none was used." in line
     (line,) = said("undecided undecided undecided", sets=(sets[0] & [False, True, True], sets[1]))
     assert "GCPs contradict each other, B against C, and none was used." in line
     (line,) = said("rejected rejected rejected", torn=(0.1, 0.25))

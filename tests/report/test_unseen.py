@@ -105,7 +105,7 @@ def test_a_pair_says_what_step_it_would_not_have_seen_and_passes() -> None:
     assert not run.adjustment.findings
     assert unseen is not None
     assert summary.passed
-    assert "would not show in tie points of two images. Heights behind it would be off by" in said(run)
+    assert "would not show in two images. Heights behind it would be off by up to" in said(run)
     largest = max(summary.scene.unseen, key=lambda one: one.height_m)
     assert largest.height_m / largest.largest_px == pytest.approx(off / 2.0, rel=0.3)
     heights, without = (pair_heights(replace(run.adjustment, unseen=u), 0, 1) for u in (unseen, None))

@@ -35,7 +35,7 @@ def test_a_block_that_came_out_well_needs_no_advice(block_run):
 def test_a_check_of_wrong_cameras_says_to_adjust_them(check_run):
     summary = check_run.summary
     assert summary["status"] == "look"
-    assert summary["headline"] == "9 images need review (of 9)."
+    assert summary["headline"] == "9 of 9 images need review."
     assert all(view["advice"].endswith("Adjust the cameras") for view in summary["views"])
     assert not summary["passed"]
 
@@ -51,7 +51,7 @@ def test_a_view_with_few_tie_points_is_weakly_tied():
     view = summary["views"][2]
     assert view["status"] == "weak"
     assert str(view["num_observations"]) in view["advice"]
-    assert summary["headline"] == "1 image needs review (of 4)."
+    assert summary["headline"] == "1 of 4 images needs review."
     assert any(line.startswith(f"{view['name']}: weakly connected. Only") for line in summary["verdict"])
 
 
@@ -62,7 +62,7 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
         adjustment = adjust_tracks(made.views, tracks, keep_largest=True)
     summary = summarize(Run("adjust", made.views, (), tracks, adjustment=adjustment))
     assert summary["views"][3]["status"] == "failed"
-    assert summary["headline"] == "1 image is not adjusted (of 4)."
+    assert summary["headline"] == "1 of 4 images is not adjusted."
     assert summary["status"] == "bad"
     assert not summary["passed"]
 

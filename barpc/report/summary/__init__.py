@@ -32,7 +32,7 @@ class LeftOutEntry(Record):
     @property
     def reason_text(self) -> str:
         """The same as a sentence."""
-        return f"{self.path} was left out: {self.reason}"
+        return f"{self.path} was left out: {self.reason.removeprefix(f'{self.path}: ')}"
 
 
 class InputEntry(Record):

@@ -10,7 +10,9 @@ from barpc.report.records import Number, Record, column
 from barpc.report.summary.words import Count, Vector
 
 AXES = "columns", "rows"
-DATUM = "Uncertainty (1 sigma) of the scene's position and of its shape at its edge, and the share of each source"
+DATUM = (
+    "Uncertainty (1 sigma) of the scene's position, and of its shape at its edge; share of each source of information"
+)
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
     "north": "the whole scene may lie {0} farther north or south",
@@ -50,21 +52,21 @@ class DatumEntry(Record):
 
     part: str = column("Motion of the scene", head="motion", enum=MODES)
     sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "sigma", ".2f")
-    cameras: Number = column("Accuracies of the cameras as delivered", head="cameras", form=".0%")
+    cameras: Number = column("Accuracies of the cameras as delivered", head="delivered cameras", form=".0%")
     earlier_run: Number = column("The earlier run", head="earlier run", form=".0%")
     fixed_views: Number = column("Fixed views", head="fixed views", form=".0%")
     gcps: Number = column("Ground control points", head="GCPs", form=".0%")
-    heights: Number = column("The DEM, or altitudes assumed", head="heights", form=".0%")
+    heights: Number = column("The DEM, or altitudes assumed", head="DEM or assumed heights", form=".0%")
     reference: Number = column("A reference orthoimage", head="reference", form=".0%", default=None)
     altimetry: Number = column(
         "Altimetry: heights without image coordinates", head="altimetry", form=".0%", default=None
     )
 
     @classmethod
-    def columns(cls, entries: Sequence[DatumEntry]) -> str:
-        """Return the columns of a table, without the sources that contribute to no motion."""
+    def columns(cls, entries: Sequence[DatumEntry], least: float = 0.005) -> str:
+        """Return the columns of a table, without the sources that contribute less to every motion."""
         part, sigma, *sources = field_names(cls)  # type: ignore[arg-type]  # a class can be hashed
-        told = [name for name in sources if any((getattr(one, name) or 0.0) >= 0.005 for one in entries)]
+        told = [name for name in sources if any((getattr(one, name) or 0.0) >= least for one in entries)]
         return " ".join([part, sigma, *told])
 
 

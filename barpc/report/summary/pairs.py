@@ -36,7 +36,7 @@ class PairEntry(Record):
     }
     CAPTION: ClassVar = "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)"
     PAGE: ClassVar = (
-        "pair num_matches tied_by decoy_share noise_px convergence_deg base_to_height height_m_per_px before after kept"
+        "pair num_matches tied_by decoy_share convergence_deg base_to_height height_m_per_px before after kept"
     )
     AGAIN: ClassVar = "pair tied_by num_matches beaten"
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
@@ -64,7 +64,7 @@ class PairEntry(Record):
         "Share of false matches, by search bands without true ones", head="false matches", form=".1%", default=None
     )
     noise_px: Number = column(
-        "Spread across epipolar lines before registration", "px", "matching noise", ".2f", default=None
+        "Spread across epipolar lines of matches before their positions are refined", "px", default=None
     )
     beaten: tuple[str, ...] = column("Attempts with too few matches: matcher, matches of those required", default=())
     chosen_by: str | None = column("Reason of its selection: overlap and angle, same date, listed, ...", default=None)

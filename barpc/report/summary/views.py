@@ -66,10 +66,8 @@ class CenterEntry(Record):
     """Projection centre of a camera."""
 
     ecef_m: Vector = column("Position, ECEF", "m")
-    altitude_m: Number = column("Altitude above the ellipsoid", "m", "camera centre", ",.0f")
-    method: str = column(
-        "line: intersection of the rays of an image line; nominal: assumed where implausible", head="centre from"
-    )
+    altitude_m: Number = column("Altitude above the ellipsoid", "m", "camera altitude", ",.0f")
+    method: str = column("line: intersection of the rays of an image line; nominal: assumed where implausible")
 
 
 class FitEntry(Record):
@@ -115,9 +113,7 @@ class ViewEntry(Record):
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
     )
     TERMINAL: ClassVar = "name verdict num_observations lost rmse_before rmse_after correction.center_shift_px"
-    CORRECTIONS: ClassVar = (
-        "name moves correction.angle_urad correction.translation_norm_m camera_center.altitude_m camera_center.method"
-    )
+    CORRECTIONS: ClassVar = "name moves correction.angle_urad correction.translation_norm_m camera_center.altitude_m"
     PLACES: ClassVar = (
         "name correction.ellipse.major_m correction.ellipse.minor_m correction.ellipse.azimuth_deg "
         "correction.ellipse.ce90_m stated_ce90_m"
@@ -176,7 +172,7 @@ class ViewEntry(Record):
     held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
     stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
     systematic_p: Number = column(
-        "Probability of systematic_px by noise alone (F test)", "", "F test p", ".0e", default=None
+        "Probability of systematic_px by noise alone (F test)", "", "F test p", ".1e", default=None
     )
     neighbour_correlated_px: Number = column(
         "Error correlated between neighbours in row or column", "px", "correlated", ".3f", default=None
