@@ -44,7 +44,7 @@ def _matched(pairs: Sequence[PairEntry], matcher: object) -> Iterator[str]:
         yield f"Not all pairs were matched by {matcher or 'one matcher'}: {by}."
     if shares := [(pair.decoy_share, pair.a, pair.b) for pair in tied if pair.decoy_share is not None]:
         share, a, b = max(shares)
-        yield f"The matcher expects at most {100 * share:.2g} % of a pair's matches to be wrong ({a} - {b})."
+        yield f"The matcher expects at most {100 * share:.2g} % of a pair's matches to be false ({a} - {b})."
     if any(pair.chosen_by not in (None, "overlap and angle") for pair in tied):
         yield f"Pairs by selection criterion: {_tally((pair.chosen_by for pair in tied), ' ')}."
     if pairs and not tied:
@@ -141,7 +141,7 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     )
     if used + scene.num_held_out + cut + moving:
         counts = f"{used} used, {scene.num_held_out} check (independent of the adjustment)"
-        counts += f", {cut} rejected (wrong or imprecise)" + f", {moving} excluded (they move together)" * bool(moving)
+        counts += f", {cut} rejected (false or imprecise)" + f", {moving} excluded (they move together)" * bool(moving)
         yield f"Observations of tie points: {counts}."
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)

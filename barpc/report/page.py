@@ -264,9 +264,8 @@ def _pairs_section(files: RunFiles) -> Section | None:
     if not heights:
         enough = f"{MIN_PAIR_MATCHES} matches and a convergence angle that determines heights"
         answer += f" No pair of images that passed has {enough}."
-    (shown,) = _tables_of("pairs", pairs, files.summary.adjusted)
     marks = ["{}-{}".format(*sorted((number[pair.a], number[pair.b]))) for pair in pairs]
-    shown = replace(shown, marks=marks)
+    shown = replace(_tables_of("pairs", pairs, files.summary.adjusted)[0], marks=marks)
     return Section("pairs", "Do the pairs fit for stereo and heights?", answer, pair_strips(files), tables=[shown])
 
 
@@ -305,8 +304,8 @@ def _gauge_section(files: RunFiles) -> Section | None:
     summary, scene = files.summary, files.summary.scene
     if scene is None:
         return None
-    columns = DatumEntry.columns(scene.datum)
-    tables = [table("datum", DATUM, scene.datum, DatumEntry, columns)] if scene.datum else []
+    shown = table("datum", DATUM, scene.datum, DatumEntry, DatumEntry.columns(scene.datum))
+    tables = [shown] if scene.datum else []
     tables += _tables_of("gcps", summary.gcps)
     tables += _tables_of("control", [view for view in summary.views if view.control_w is not None])
     tables += _tables_of("reference", () if summary.reference is None else summary.reference.views)

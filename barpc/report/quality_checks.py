@@ -354,8 +354,7 @@ def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
         if wrong:
             alike = word == "rejected" and tested.agreed is not None and tested.agreed.alike
             datum = " They agree with each other: check their datum and heights, too." * alike
-            them = "it" if len(wrong) == 1 else "them"
-            start = words.format(counted(len(wrong), "GCP"), them)
+            start = words.format(counted(len(wrong), "GCP"), "it" if len(wrong) == 1 else "them")
             sign = ", predicted minus given" * any(", w = " in one for one in wrong)
             yield f"{start}: {listed(wrong)}{sign}. {cure}.{datum}"
     if tested.sets:

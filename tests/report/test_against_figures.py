@@ -419,7 +419,7 @@ def _(s, num, times, name):
 
 
 @says(
-    r"Observations of tie points: (\d+) used, (\d+) check \(independent of the adjustment\), (\d+) rejected \(wrong or "
+    r"Observations of tie points: (\d+) used, (\d+) check \(independent of the adjustment\), (\d+) rejected \(false or "
     r"imprecise\)(?:, (\d+) excluded \(they move together\))?\."
 )
 def _(s, *counts):

@@ -56,7 +56,7 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
     text = said(other)
     assert f"Not all pairs were matched by guided: {count - 1} by guided, 1 by structure." in text
     first = record.pairs[0]
-    assert f"The matcher expects at most 3 % of a pair's matches to be wrong ({first.a} - {first.b})." in text
+    assert f"The matcher expects at most 3 % of a pair's matches to be false ({first.a} - {first.b})." in text
     assert "Pairs by selection criterion: 1 same date." in text
 
 
@@ -130,11 +130,11 @@ def test_the_model_is_said(record):
 
 def test_what_was_cut_and_kept_out_is_counted(record):
     none = with_views(record, *[{"num_rejected": 0, "num_observations": 100}] * 9)
-    assert "900 used, 0 check (independent of the adjustment), 0 rejected (wrong or imprecise)." in said(
+    assert "900 used, 0 check (independent of the adjustment), 0 rejected (false or imprecise)." in said(
         none, num_held_out=0
     )
     text = said(with_views(none, {"num_moving": 4}, {"num_rejected": 100}), num_held_out=70)
-    counts = "900 used, 70 check (independent of the adjustment), 100 rejected (wrong or imprecise), 4 excluded (they"
+    counts = "900 used, 70 check (independent of the adjustment), 100 rejected (false or imprecise), 4 excluded (they"
     assert f"Observations of tie points: {counts} move together)." in text
 
 

@@ -690,7 +690,10 @@ def test_control_that_contradicts_is_named_with_what_it_is_off_by():
     sets = (np.array([True, True, False]), np.array([False, False, True]))
     (line,) = said("undecided undecided undecided", sets=sets)
     apart = enu(np.array([-2.0, -2.0, 2.0]))
-    assert f"GCPs contradict each other, A, B against C (predicted minus given differs by {apart}), and none was used." in line
+    assert (
+        f"GCPs contradict each other, A, B against C (predicted minus given differs by {apart}), and none was used."
+        in line
+    )
     (line,) = said("undecided undecided undecided", sets=(sets[0] & [False, True, True], sets[1]))
     assert "GCPs contradict each other, B against C, and none was used." in line
     (line,) = said("rejected rejected rejected", torn=(0.1, 0.25))
