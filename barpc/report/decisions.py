@@ -92,7 +92,7 @@ def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
     elif None in scene.drift_sigma_m:
         yield f"{words} {degree}, as in the earlier run."
     else:
-        sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m)
+        sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m) + " (by degree)" * (degree > 1)
         yield f"{words} {degree}. Its prior sigma on the ground is {sigma} at the first and last row."
         if scene.drift_justification is not None:
             yield f"Degree {degree - 1} left {_left(scene.drift_justification)}."

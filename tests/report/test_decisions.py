@@ -76,7 +76,10 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert "a polynomial of degree 1. Its prior sigma on the ground is 12 cm at the first and last row." in plain
     assert "left" not in plain
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
-    assert "a polynomial of degree 2. Its prior sigma on the ground is 12 cm, 30 cm at the first and last row." in more
+    assert (
+        "a polynomial of degree 2. Its prior sigma on the ground is 12 cm, 30 cm (by degree) at the first and last row."
+        in more
+    )
     left = "systematic residuals of 0.31 px in B, and 0.12 px correlated between neighbours."
     assert f"Degree 1 left {left}" in more
     surely = said(
