@@ -197,14 +197,13 @@ def _levenberg_marquardt(
         if not damping and _is_as_told(cost, ahead.cost, tolerance):
             status = _status(state, "the last step gained what it should")
             return Minimum(replace(ahead, cost=cost), reduced, factor, status, (residual, projected))
-        del reduced, factor  # of a large block no two fit
-        reduced = problem.reduce(ahead.params, ahead.points, weight, projected)
-        if reduced.cost <= state.cost * (1.0 + 1e-12):
+        if cost <= state.cost * (1.0 + 1e-12):
+            del reduced, factor  # of a large block no two fit
+            reduced = problem.reduce(ahead.params, ahead.points, weight, projected)
             state = replace(ahead, cost=reduced.cost, history=(*state.history, reduced.cost))
             before = gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
             continue
-        reduced = problem.reduce(state.params, state.points, weight)
         # a cost does not fall any more where so little is promised, or what is tolerated and no damping makes it fall
         if gain <= TOLERANCE * (CONVERGED if damping < 1e8 else 1.0) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
