@@ -107,7 +107,7 @@ class JointPrior:
 
     @classmethod
     def of_values(cls, index: IntArray, values: Array, shape: tuple[int, ...]) -> JointPrior:
-        """Return the prior that unknowns `index` (m,) of the raveled `shape` have `values` (m,), sigma `ALIKE_SIGMA`."""
+        """Return the prior that unknowns `index` (m,) of the raveled `shape` are `values` (m,), sigma `ALIKE_SIGMA`."""
         size, mean_and_information = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
         mean_and_information[0, index], mean_and_information[1, index] = values, ALIKE_SIGMA**-2.0
         return cls(np.arange(size), mean_and_information[0], np.diag(mean_and_information[1]), earlier=False)
