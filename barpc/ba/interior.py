@@ -97,7 +97,7 @@ class LineCurve:
         return np.asarray(la.block_diag(one, one))
 
     def sizes(self, unknowns: Array) -> Array:
-        """Return the RMS (2,) of col and row [px] over the columns: of a curve (n,), or of sigmas from its covariance."""
+        """Return the RMS (2,) of col and row [px] over the columns: of a curve (n,), or of its sigmas (n, n)."""
         basis = self.basis(self.columns)
         parts = slice(0, self.size), slice(self.size, None)
         if unknowns.ndim == 1:
