@@ -80,7 +80,7 @@ def adjust_tracks(
     altimetry : Altimetry or None, heights without image coordinates
     keep_largest, hold_out : bool
         Continue with the largest group of connected views; exclude a tenth of the tracks to check the result.
-    common : CommonErrors or None, uncertainty of errors common to images that were removed from `tracks` before
+    common : CommonErrors or None, uncertainty of common errors of images, already subtracted from `tracks`
 
     Returns
     -------

@@ -39,7 +39,7 @@ SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "referenc
 """Sources of information: camera priors as delivered, or of an earlier run; fixed views; GCPs; the DEM or assumed
 altitudes, with their common errors; a reference orthoimage, with its common errors; altimetry (heights without image
 coordinates)."""
-_NUM_DEM_ERRORS = 3  # common errors of the DEM (offset, tilts) if there is a reference, whose own errors follow
+_NUM_DEM_ERRORS = 3  # with a reference: its DEM has three common errors (offset, tilts), listed first
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def weakest_modes(motion_covariance: Array) -> tuple[Mode, ...]:
 def datum_shares(
     covariance: Covariance, by_unknown: Array, problem: Problem, state: State, weight: Array, known: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Return the share (10,) of each source in the information on the motions; NaN for motions of fixed cameras.
+    """Return the share (10,) of each source in the information on the motions; NaN where fixed cameras prevent one.
 
     Parameters
     ----------

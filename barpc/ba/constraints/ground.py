@@ -126,6 +126,7 @@ def staying(points: Array, index: IntArray) -> PointPrior:
 def _heights(
     foot: Array, index: IntArray, normal: Array, sigma: float, common_sigma: float, span: Array | None = None
 ) -> PointPrior:
+    """Return priors that constrain points to planes through ground points `foot` (Q, 3), with normals (Q, 3) (ENU)."""
     known = np.isfinite(foot[:, 2])
     foot = foot[known]
     rows, common = np.zeros((len(foot), 3, 3)), np.zeros((len(foot), 3, 3))

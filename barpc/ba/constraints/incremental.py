@@ -59,7 +59,8 @@ class BlockPrior:
     center : (n, 3)
         Camera centres [m], ECEF.
     less : (m, n q)
-        B: the information is `information` - B^T B, if that is sparse. B^T B is the part of common errors of heights.
+        B, only with a sparse `information`: the joint information is `information` - B^T B. B stems from common errors
+        of heights.
     layout : AdditionalParameters or None
         Layout of the additional parameters in the images; None: there are none.
     scene : EarlierScene or None

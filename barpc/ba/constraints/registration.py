@@ -34,7 +34,7 @@ from barpc.scene import BoolArray, IntArray
 PATCH_POINTS = 15  # tie points of a patch: six unknowns, nine redundant
 _MIN_RELIEF = 0.01  # m: least scatter about a patch; also, a smaller change of the motion ends the iteration
 _SIDE = 25  # trial shifts along each axis of the search
-_MIN_SLOPE_SHARE = 0.2  # least part of the information by slopes that is not due to their errors, to determine a motion
+_MIN_SLOPE_SHARE = 0.2  # least share of the information on a motion that is not due to errors of slopes
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.scene import View
 from barpc.sensor.rpc import localize_stack
 
-MOST_SIGMAS = 5.0  # prior standard deviations: largest deformation of an image by control alone
+MOST_SIGMAS = 5.0  # largest deformation of an image by control alone, in prior standard deviations
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 
 

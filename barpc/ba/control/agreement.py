@@ -381,7 +381,7 @@ class SetEvidence:
     def _misfit(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
         """Return the deviations (B, n, 3) of points from their predictions by each set.
 
-        The second result are the roots (B, n, 3, r) of the covariances of the predictions.
+        The second result are roots R (B, n, 3, r) of the covariances R R^T of the predictions.
         """
         motions, motion_root = self.offsets.motions[points], self._root[part]
         root = (motions.reshape(-1, motions.shape[2]) @ motion_root).reshape(len(motion_root), *motions.shape)

@@ -137,7 +137,7 @@ class AdditionalParameters:
         return np.concatenate(groups)
 
     def stretches(self, rows: float) -> float:
-        """Return the number of intervals, in an image of `rows` rows, that have independent common errors.
+        """Return the number of intervals of an image of `rows` rows whose common errors are independent of each other.
 
         One per unknown, which follows the error; for a sinusoid, one per half period and coordinate.
         """

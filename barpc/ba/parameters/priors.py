@@ -92,7 +92,7 @@ class JointPrior:
 
     @classmethod
     def of_alike(cls, waves: AdditionalParameters, views: int, size: int) -> JointPrior | None:
-        """Return the prior that displacements of a part common to all images differ by `ALIKE_SIGMA`; None: no part.
+        """Return the prior, of `ALIKE_SIGMA`, that a part common to all images has one displacement; None: no part.
 
         There are `views` views of `size` unknowns each; the last of these are those of `waves`.
         """

@@ -66,7 +66,7 @@ class Unknowns:
 
     @property
     def sight(self) -> Array | None:
-        """Unit vectors (N, q), among the unknowns, of a rotation about the line of sight; None without rotations."""
+        """Unit changes (N, q) of the unknowns that rotate a view about its line of sight; None without rotations."""
         if self.direction is None or not self.geometric or not self.rotates:
             return None
         out = np.zeros((len(self.direction), self.size))

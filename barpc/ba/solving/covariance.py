@@ -34,7 +34,7 @@ class Covariance:
     reduced: Reduced  # the problem linearised at its solution
     factor: Factor  # of its reduced matrix S, free unknowns only
     free: BoolArray  # (N q,) unknowns that are not fixed
-    shared: SharedErrors | None = None
+    shared: SharedErrors | None = None  # errors shared by several images; None: there are none
 
     @property
     def num_unknowns(self) -> int:
@@ -73,9 +73,9 @@ class Covariance:
     def probed_views(self) -> Array:
         """Estimate the covariances (N, q, q) of every view's unknowns by random probes (Hutchinson 1990).
 
-        This costs a few solutions; the relative error of a variance is a quarter (RMS).
-        Each unknown is scaled by its standard deviation with all other views fixed. Otherwise variances a hundred
-        times as large would hide the small ones in the noise of the probes.
+        This costs a few solutions; the relative error of a variance is a quarter (RMS). Each unknown is scaled by its
+        standard deviation with all other views fixed. Otherwise the noise of the probes, which grows with the largest
+        variances, would exceed the small ones.
         """
         q = self.num_unknowns
         views, scale = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
@@ -164,7 +164,7 @@ class Covariance:
         return out if self.reduced.common is None else self._with_common(index, inverse, out)
 
     def _with_common(self, index: IntArray, inverse: Array, out: Array) -> Array:
-        """Return `out` (n, 3, 3), new for points with errors in common: these depend on every camera."""
+        """Return `out` (n, 3, 3), recomputed for points with errors in common, which depend on every camera."""
         structure, common, q = self.reduced.structure, self.reduced.common, self.num_unknowns
         assert common is not None
         place = {int(p): n for n, p in enumerate(common.index)}

@@ -130,7 +130,7 @@ class Cholesky:
 
     @cached_property
     def _pairs_by_front(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Pairs sorted by the front that eliminates one view first; that view; the other; bounds of each front."""
+        """Pairs sorted by the front of their earlier view; the earlier views; the later ones; bounds of each front."""
         rank, owner = self.order.rank, self.order.owner
         pairs = np.flatnonzero((rank[self.blocks.pair_view] >= 0).all(axis=1))
         i, j = self.blocks.pair_view[pairs].T

@@ -148,8 +148,8 @@ class Problem:
     def counted_once(self, params: Array, points: Array, weight: Array) -> Problem:
         """Return the problem whose joint prior lacks the information of the observations with `weight` (K,) [1/px].
 
-        These are in the prior already, and would count twice. Other observations of their tie points
-        keep the information that they add to these. The same holds for observations that the prior does not contain.
+        The prior contains them already: they would count twice. Other observations of the same tie points still add
+        the information that they have given these. The same holds for observations that the prior does not contain.
         """
         prior = self.joint_prior
         assert prior is not None

@@ -138,8 +138,7 @@ def has_converged(gain: float, before: float, cost: float, tolerance: float) -> 
     """Return whether a step that should lower the cost by `gain`, after a step with `before`, is the last.
 
     `cost` is the cost before the step, `tolerance` its negligible fraction. Gains shrink at least in the ratio of the
-    last two, so the next one is at most gain^2 / before. A cost below 1 counts as 1, since without noise the cost is
-    rounding only; for a tolerance of 1e-6 a gain of (sigma / 1000)^2 is then negligible.
+    last two, so the next one is at most gain^2 / before. A cost below 1 counts as 1: without noise it is only rounding.
     """
     cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
@@ -234,6 +233,7 @@ class WhitenedProblem:
         self.lowest = self.key, self.state, self.reduced
 
     def _compress(self, upper: Array) -> None:
+        """Set the compressed residuals `whitened` and `rest` and their derivative `slope`, from S = U^T U."""
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
         rest = self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened)
@@ -293,7 +293,7 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         tr_options={"regularize": False, "atol": ROUNDING, "btol": ROUNDING},
         ftol=tolerance,
         xtol=ROUNDING,  # steps below rounding
-        gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
+        gtol=np.sqrt(tolerance),  # for whitened unknowns, whose squared gradient is the gain of a step
         max_nfev=ITERATIONS,
     )
     compressed.at(found.x)

@@ -60,7 +60,7 @@ def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None
 
 
 def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: IntArray) -> list[Front]:
-    """Return the fronts of the pieces, in order; a border has later neighbours of its pivots, and child borders."""
+    """Return the fronts of the pieces, in order; a border joins later neighbours of the pivots and child borders."""
     fronts: list[Front] = []
     child_borders: list[list[IntArray]] = [[] for _ in pieces]
     for number, piece in enumerate(pieces):
@@ -197,8 +197,8 @@ class Structure:
     by_point: IntArray  # (K,) observations sorted by point
     # (P + 1,) observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]]
     point_bounds: IntArray
-    first: IntArray  # (Q,) of all pairs of observations of one point, sorted by their pair of views
-    second: IntArray  # (Q,)
+    first: IntArray  # (Q,) first observations of all pairs on one point; pairs are sorted by views
+    second: IntArray  # (Q,) their second observations
     pair_view: IntArray  # (M, 2) pairs of views i < j that share a point
     pair_bounds: IntArray  # (M + 1,) observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1]
     place: Array  # (N, 2) approximate position of each view on the ground
