@@ -65,22 +65,22 @@ def adjust_tracks(
     Parameters
     ----------
     views, tracks : sequence of View, Tracks
-        N views and their tie points; `Tracks.view` counts the views.
+        N views and their tie points; `Tracks.view` has indices of the views.
     options : AdjustOptions or None, None: the defaults
     gcps : GroundPoints or None, points of known position with their image coordinates
     dem : callable or None, lon, lat (n,) [deg] -> altitude (n,) [m above the ellipsoid], NaN outside
     centers : (N, 3) or None, camera centres [m], ECEF; None: regressed from the sensors
     prior : BlockPrior or None
-        An earlier block, some of whose views are among these: their corrections and joint covariance are the prior,
-        and they need no tie points. `tracks` then holds tie points with a new view only.
+        An earlier block, some of whose views are among these: the prior is their corrections and joint covariance.
+        They need no tie points; `tracks` only has tie points seen in a new view.
     known : (K,) or None
-        Observations that `prior` contains, or may contain: only their information together with new ones is added.
-        None: all are new.
+        Mask of observations that `prior` contains, or may contain: only the information that new observations of the
+        same tie points add is used. None: all are new.
     reference : Reference or None, points matched in an orthoimage, with heights of `dem`
     altimetry : Altimetry or None, heights without image coordinates
     keep_largest, hold_out : bool
-        Continue with the largest group of connected views; hold out a tenth of the tracks, to check the result.
-    common : CommonErrors or None, uncertainty of errors common to images that were removed from `tracks` before
+        Continue with the largest group of connected views; exclude a tenth of the tracks to check the result.
+    common : CommonErrors or None, uncertainty of common errors of images, already subtracted from `tracks`
 
     Returns
     -------
@@ -117,7 +117,7 @@ def adjust_tracks(
 def consistent_observations(views: Sequence[View], tracks: Tracks, options: AdjustOptions | None = None) -> BoolArray:
     """Return the mask (K,) of inliers with the cameras fixed as delivered.
 
-    Errors as of `adjust_tracks`.
+    Raises the errors of `adjust_tracks`.
     """
     names = tuple(view.name for view in views)
     held = replace(options or AdjustOptions(), fixed=names, drift=0, terms="none", jitter=OFF, detectors=())
@@ -141,7 +141,7 @@ def _solved_adjustment(
         whole = _with_unseen(whole, found, parts.inner)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
-        return _with_apart(whole, apart, found, parts.inner, given)
+        return _with_foreign_view(whole, apart, found, parts.inner, given)
     except np.linalg.LinAlgError as error:
         raise AdjustError(
             f"the normal equations cannot be solved ({error}): is a standard deviation among the options, or of a "
@@ -150,7 +150,7 @@ def _solved_adjustment(
 
 
 def _warn(outcome: Outcome) -> None:
-    """Warn if the last solve did not converge, or prior variances could not be estimated."""
+    """Warn if the last solve did not converge, or if prior variances could not be estimated."""
     if not outcome.settled:
         message = f"the adjustment did not settle in {ITERATIONS} steps: check its residuals before its result is used"
         warnings.warn(message, BarpcWarning, stacklevel=4)
@@ -159,12 +159,12 @@ def _warn(outcome: Outcome) -> None:
         warnings.warn(message, BarpcWarning, stacklevel=4)
 
 
-def _with_apart(
+def _with_foreign_view(
     whole: Adjustment, apart: ForeignCamera, found: Solution, others: Block, parts: tuple[Block, Block]
 ) -> Adjustment:
     """Return the result with the foreign view added: resected, or as delivered.
 
-    `parts` are the adjusted and the held-out observations with that view. Its residuals are at the others' points.
+    `parts`: adjusted and check observations with that view. Its residuals are at the points of the other views.
     """
     v, params = apart.view, whole.params.copy()
     placed = None if apart.placed is None else resect(found, others, parts[0], v)
@@ -254,29 +254,29 @@ def _adjustment(
 def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, Array]:
     """Return the points (P, 3) [m], NaN without an inlier, and the residuals of all observations before and after.
 
-    For check tie points and moving groups, points are triangulated with the cameras fixed.
+    Points of check tracks and moving groups are triangulated with fixed cameras.
     """
     outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
-    moved = [measure(found.problem, params, parts.apart) for params in cameras]
+    moving = [measure(found.problem, params, parts.apart) for params in cameras]
     points = np.where(found.seen[:, None], found.final.points, np.nan)
-    for one in (found.after, moved[1]):
+    for one in (found.after, moving[1]):
         points[one.index] = one.points
-    inside = found.before, found.outcome.residual
+    inner = found.before, found.outcome.residual
     before, after = (
-        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.apart.in_order(gone.residual.T)
-        for one, out, gone in zip(inside, (found.start, found.after), moved, strict=True)
+        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.apart.in_order(of_moving.residual.T)
+        for one, out, of_moving in zip(inner, (found.start, found.after), moving, strict=True)
     )
     return points, before, after
 
 
 def _neighbour_correlation(block: Block, outcome: Outcome, is_tie: BoolArray) -> Array:
-    """Return the evidence (N,) [nats] that rejected tie points of an image are displaced like their neighbours."""
+    """Return the evidence (N,) [nats] that rejected tie points of a view have residuals like their neighbours."""
     wrong = is_tie & block.use & ~outcome.inlier & np.isfinite(outcome.residual).all(axis=0)
     return neighbours_alike(block.view[wrong], block.xy[:, wrong], outcome.residual[:, wrong], len(block.views))
 
 
 def _reported_findings(found: Solution, parts: Parts, points: Array) -> Iterator[Finding]:
-    """Yield the findings for the report; a moving group as its position and size."""
+    """Yield the findings for the report; moving groups get their position and displacement."""
     number = 0
     for one in found.findings:
         if one.moved is None:
@@ -289,7 +289,7 @@ def _reported_findings(found: Solution, parts: Parts, points: Array) -> Iterator
 
 
 def _control(found: Solution, block: Block, covariance: Covariance, inlier: BoolArray) -> dict[str, Any]:
-    """Return the fields of `Adjustment` on GCPs and reference points; `inlier` (M + R,) is of their observations."""
+    """Return the fields of `Adjustment` on GCPs and reference points; `inlier` (M + R,) has their observations."""
     w, gcps = block.in_order(_control_w(found, block, covariance.of_noise)), len(block.gcps.view)
     w = w[len(w) - len(inlier) :]
     return {
@@ -303,12 +303,12 @@ def _control(found: Solution, block: Block, covariance: Covariance, inlier: Bool
 
 
 def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
-    """Return Baarda's w (K,) of the observations of known points; NaN for others, outliers and those not sampled."""
+    """Return Baarda's w (K,) of observations of points with priors; NaN for outliers, and for those not sampled."""
     outcome, w = found.outcome, np.full(len(block.point), np.nan)
-    held = outcome.problem.point_prior
-    is_held = outcome.inlier & (False if held is None else np.isin(block.point, held.index))
-    of_gcps = np.flatnonzero(is_held & (block.point >= block.num_tracks) & (block.point < block.num_known))
-    others = np.flatnonzero(is_held & (block.point >= block.num_known))
+    prior = outcome.problem.point_prior
+    has_prior = outcome.inlier & (False if prior is None else np.isin(block.point, prior.index))
+    of_gcps = np.flatnonzero(has_prior & (block.point >= block.num_tracks) & (block.point < block.num_known))
+    others = np.flatnonzero(has_prior & (block.point >= block.num_known))
     rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
@@ -317,7 +317,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
 
 
 def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tuple[GaugeReport, Mapping[str, Array]]:
-    """Return motion and accuracy of the scene, and the shares of their sources; a continued run keeps its own scene."""
+    """Return motion and accuracy of the scene (in a continued run, of the earlier one), and the shares of sources."""
     known, outcome = (block.num_tracks, block.num_known), found.outcome
     gauge = _with_survey_errors(_datum_report(found, block, covariance), found, block)
     shares = datum_shares(covariance, gauge.by_unknown, outcome.problem, found.final, outcome.weight, known)
@@ -325,7 +325,7 @@ def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tu
 
 
 def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment:
-    """Return the result of two images without findings with the displacements that they would not have shown."""
+    """Return the result; for two images without findings, with the uncertainty by undetectable displacements."""
     cameras = found.problem.cameras
     index = np.flatnonzero(np.isfinite(whole.points[:, 0]) & ~whole.held)
     other = any(isinstance(sensor, Radar) for sensor in cameras.sensors) or found.problem.joint_prior is not None
@@ -337,7 +337,7 @@ def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment
         known = np.asarray(terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)
     _, pull, image = height_derivatives(cameras, whole.params, (0, 1), points)
     sizes = np.array([view.size for view in block.views], dtype=np.float64)
-    # residuals of two rays are half of their offset; all points count
+    # a residual is half the offset of two rays; the sample stands for all points
     sigma = float(whole.rmse().sum() * np.sqrt(len(points) / len(index)))
     unseen = unseen_steps(sizes, ground, image, pull, (sigma, whole.options.noise_floor), known)
     held = bool(found.heights.kinds) or whole.altimetry is not None
@@ -345,9 +345,9 @@ def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment
 
 
 def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> GaugeReport:
-    """Return the accuracy of a scene with the common errors of GCPs from one survey.
+    """Return the accuracy of the scene with the common errors of GCPs, as from one survey.
 
-    These weigh no more than `MAX_INDEPENDENT_ERRORS` independent points, however many there are.
+    Any number of GCPs weighs at most as much as `MAX_INDEPENDENT_ERRORS` independent ones.
     """
     used = np.ones(len(block.gcps.names), dtype=bool) if found.tested is None else found.tested.used
     if not found.heights.has_control or used.sum() <= MAX_INDEPENDENT_ERRORS:
@@ -359,12 +359,12 @@ def _with_survey_errors(gauge: GaugeReport, found: Solution, block: Block) -> Ga
 
 
 def _datum_report(found: Solution, block: Block, covariance: Covariance) -> GaugeReport:
-    """Return motion and accuracy of the scene without common errors of GCPs."""
+    """Return motion and accuracy of the scene, without common errors of GCPs."""
     joint = found.problem.joint_prior
     if joint is not None and joint.scene is not None:
         return earlier_scene(covariance, joint, joint.scene, found.final.params)
     number = np.arange(len(found.seen))
-    # known points do not move with the cameras: they represent the scene only if there are no tracks
+    # control does not move with the cameras: it represents the scene only if there are no tracks
     kinds = (found.seen & (number < last) for last in (block.num_tracks, block.num_known, len(number)))
     counted = next((kind for kind in kinds if kind.any()), found.seen)
     prior = found.outcome.problem.camera_prior.sigma

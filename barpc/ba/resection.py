@@ -21,15 +21,15 @@ from barpc.sensor.image_corrections import bsplines
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A resected view: its camera was estimated alone, from known ground points."""
+    """A resected view: its camera alone was estimated, from ground points of the other views."""
 
     params: Array  # (q,) unknowns of the camera
-    covariance: Array  # (q, q) of these, uncertainty of the points included
-    rows: BoolArray  # (K,) of the block: the n observations used
+    covariance: Array  # (q, q) of the unknowns, with the uncertainty of the points
+    rows: BoolArray  # (K,) mask of the n observations of the block that were used
     xy: Array  # (2, n) their image coordinates [px]
-    squared: Array  # (n,) squared residuals over variances
-    left: Array  # (2, n) residuals over sigmas of a second fit, with splines over the rows
-    noise: float  # observed over expected standard deviation of the residuals, by the median
+    squared: Array  # (n,) squared whitened residuals (sum of two)
+    left: Array  # (2, n) whitened residuals of a second fit, which also has splines over the rows
+    noise: float  # ratio of observed to expected standard deviation of the residuals, from their median
 
     @property
     def meets(self) -> bool:
@@ -37,41 +37,42 @@ class Placed:
         return self.noise < MUCH_NOISE
 
     def agree(self, limit: float) -> BoolArray:
-        """Return the mask (n,) of observations within `limit` standard deviations."""
+        """Return the mask (n,) of observations with residuals within `limit` standard deviations."""
         return np.asarray(self.squared <= 2.0 * limit * limit)
 
     def contradicted(self, limit: float) -> float:
-        """Return the share of observations beyond `limit` standard deviations of the fit with splines."""
-        return float(self._far(limit).mean())
+        """Return the fraction of observations with residuals beyond `limit` standard deviations, with splines."""
+        return float(self._exceeds(limit).mean())
 
     def is_coherent(self, limit: float) -> bool:
-        """Return whether outliers have residuals like their neighbours: then the camera is wrong, not the matches.
+        """Return whether outliers have residuals like those of their neighbours: then the camera is wrong.
 
-        Independent residuals differ by 1.4 times their size; coherent ones by less than it.
+        Otherwise the matches are wrong. The difference of two independent residuals is 1.4 times their size, that of
+        coherent residuals less than their size.
         """
         seen = np.asarray(np.isfinite(self.left).all(axis=0))
         if seen.mean() < 0.5:  # most points are outside the domain of the camera
             return True
-        far = self._far(limit) & seen
-        if far.sum() < FEW:
+        is_outlier = self._exceeds(limit) & seen
+        if is_outlier.sum() < FEW:
             return False
-        left = self.left[:, far].T
-        nearest = np.asarray(kd_tree(self.xy[:, far].T).query(self.xy[:, far].T, k=2)[1])[:, 1]
-        difference, size = (np.linalg.norm(x, axis=1) for x in (left - left[nearest], left))
+        outliers = self.left[:, is_outlier].T
+        nearest = np.asarray(kd_tree(self.xy[:, is_outlier].T).query(self.xy[:, is_outlier].T, k=2)[1])[:, 1]
+        difference, size = (np.linalg.norm(x, axis=1) for x in (outliers - outliers[nearest], outliers))
         return bool(np.median(difference) < np.median(size))
 
-    def _far(self, limit: float) -> BoolArray:
+    def _exceeds(self, limit: float) -> BoolArray:
         return ~np.asarray((self.left**2).sum(axis=0) <= 2.0 * limit * limit)
 
 
 @dataclass(frozen=True, eq=False)
 class RpcDiagnosis:
-    """The change that makes the RPC of a view as accurate as stated; unknown if all fields have their defaults."""
+    """The one change that makes the RPC of a view as accurate as stated; none was found if all fields are defaults."""
 
-    offset: Array | None = None  # (2,) col, row [px] of projected minus observed points
-    height: float | None = None  # [m] by which heights are too high, if that explains the offset
+    offset: Array | None = None  # (2,) projected minus observed points, col and row [px]
+    height: float | None = None  # [m] error of the heights, if it explains the offset
     swapped: bool = False  # whether col and row are exchanged
-    as_stated: bool = False  # no change: then its tie points may be wrong instead of the RPC
+    as_stated: bool = False  # whether it is as accurate as stated already: tie points may be wrong
 
 
 def retained_tracks(found: Solution, block: Block) -> BoolArray:
@@ -82,9 +83,9 @@ def retained_tracks(found: Solution, block: Block) -> BoolArray:
 
 
 def resect(found: Solution, others: Block, block: Block, view: int) -> Placed | None:
-    """Resect a view by the ground points of a solution of the `others`; None with too few common points.
+    """Resect a view by the ground points in the solution of the `others`; None with too few common points.
 
-    The camera prior is so wide that it hardly acts. Variances of residuals are those of the noise and of the points.
+    The camera prior is too wide to matter. The variances of the residuals are those of noise and ground points.
     """
     rows = (block.view == view) & retained_tracks(found, others)[block.point]
     unknowns = found.problem.cameras.unknowns
@@ -99,12 +100,12 @@ def resect(found: Solution, others: Block, block: Block, view: int) -> Placed | 
 
 
 def median_noise(squared: Array) -> float:
-    """Return the observed over expected standard deviation, from the median of squares (n,) of two coordinates."""
+    """Return the ratio of observed to expected standard deviation, from `Placed.squared` (n,)."""
     return float(np.sqrt(np.median(squared) / chdtri(2.0, 0.5)))
 
 
 class _Sight:
-    """Observations of one view, of ground points from the other views, with covariances."""
+    """Observations of one view of ground points from the other views, with the covariances of their residuals."""
 
     def __init__(self, found: Solution, others: Block, block: Block, view: int, rows: BoolArray) -> None:
         self.problem, self.view, self.xy = found.problem, view, block.xy[:, rows]
@@ -121,52 +122,53 @@ class _Sight:
         self.covariance += ((block.sigma[rows] * noise) ** 2)[:, None, None] * np.eye(2)
 
     def project(self, params: Array) -> Projected:
-        """Project the points through cameras of unknowns (N, q), with derivatives."""
+        """Project the points with derivatives, through cameras with unknowns (N, q)."""
         return self.cameras.project(params, self.ecef, self.bounds)
 
     def fit(self, splines: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return the unknowns (q,) of the view, their covariance, and residuals (2, n) over standard deviations.
+        """Return the unknowns (q,) of the view, their covariance (q, q), and whitened residuals (2, n).
 
-        Robust, with a scale that shrinks as in `barpc.ba.robust.rounds`. `splines` (m, n) also displace col and row.
+        The robust loss has a scale that shrinks as in `barpc.ba.robust.rounds`. Splines with values (m, n) displace col
+        and row, too.
         """
         params = self.problem.camera_prior.mean.copy()
         beside = np.zeros((0, self.xy.shape[1])) if splines is None else splines
         size, m = params.shape[1], len(beside)
         # wide priors: of the camera, and of splines [px]
         sigma = np.append(GROSS * self.problem.camera_prior.sigma[self.view], np.full(2 * m, TIMES))
-        moved, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
+        solution, residual, scale = np.zeros(size + 2 * m), np.zeros((0, 2)), np.inf
         matrix = np.diag(sigma**-2.0)
         root = np.linalg.inv(np.linalg.cholesky(self.covariance))
         for _ in range(FEW):
-            params[self.view] = moved[:size]
+            params[self.view] = solution[:size]
             projected = self.project(params)
-            along = np.zeros((2, size + 2 * m, self.xy.shape[1]))
-            along[:, :size] = projected.by_unknown
-            along[0, size : size + m] = along[1, size + m :] = beside
-            image = projected.image + moved[size:] @ along[:, size:]
+            derivatives = np.zeros((2, size + 2 * m, self.xy.shape[1]))
+            derivatives[:, :size] = projected.by_unknown
+            derivatives[0, size : size + m] = derivatives[1, size + m :] = beside
+            image = projected.image + solution[size:] @ derivatives[:, size:]
             residual = np.einsum("ncd,dn->nc", root, image - self.xy)
             residual[~np.isfinite(residual).all(axis=1)] = np.inf
             squared = (residual**2).sum(axis=1)
-            middle = median_noise(squared)
-            if not np.isfinite(middle):
+            noise = median_noise(squared)
+            if not np.isfinite(noise):
                 break
-            scale = SURELY * max(middle, 1.0) if np.isinf(scale) else max(SURELY, SHRINK * scale)
+            scale = SURELY * max(noise, 1.0) if np.isinf(scale) else max(SURELY, SHRINK * scale)
             near = np.flatnonzero(np.isfinite(squared))
-            counted = geman_mcclure(squared[near] / (2.0 * scale**2))[1]
-            rows = root[near] @ along[:, :, near].transpose(2, 0, 1)
-            weighted = (rows * counted[:, None, None]).reshape(-1, len(sigma)).T
+            weight = geman_mcclure(squared[near] / (2.0 * scale**2))[1]
+            rows = root[near] @ derivatives[:, :, near].transpose(2, 0, 1)
+            weighted = (rows * weight[:, None, None]).reshape(-1, len(sigma)).T
             matrix = weighted @ rows.reshape(-1, len(sigma)) + np.diag(sigma**-2.0)
-            gradient = weighted @ residual[near].ravel() + moved / sigma**2
-            moved = moved - np.linalg.solve(matrix, gradient)
+            gradient = weighted @ residual[near].ravel() + solution / sigma**2
+            solution = solution - np.linalg.solve(matrix, gradient)
         covariance = np.asarray(np.linalg.inv(matrix)[:size, :size], dtype=np.float64)
-        return moved[:size], covariance, residual.T
+        return solution[:size], covariance, residual.T
 
 
 def diagnose_rpc(found: Solution, block: Block, placed: Placed, view: int) -> RpcDiagnosis:
     """Find the one change with which the RPC of a view is as accurate as stated.
 
-    Each change is applied to the delivered camera at the ground points of the others. The median residual must then be
-    below the stated accuracy.
+    Each change is applied to the delivered camera, at the ground points of the other views. It is accepted if the
+    median residual is then below the stated accuracy.
     """
     problem, point = found.problem, block.point[placed.rows]
     xy = block.xy[:, placed.rows]
@@ -189,12 +191,12 @@ def diagnose_rpc(found: Solution, block: Block, placed: Placed, view: int) -> Rp
     if not (_median_length(off - offset[:, None]) < stated):
         return RpcDiagnosis()
     height = float(np.nanmedian((by_height * off).sum(axis=0) / (by_height**2).sum(axis=0)))
-    near = abs(height) < GEOID  # height surfaces differ by less
+    near = abs(height) < GEOID  # the geoid differs from the ellipsoid by less
     explains = near and _median_length(off - height * by_height) < stated
     return RpcDiagnosis(offset=offset, height=height if explains else None)
 
 
 def _median_length(off: Array) -> float:
-    """Return the median length of residuals (2, n) [px]; those that are not finite count as infinite."""
+    """Return the median length of residuals (2, n) [px]; values that are not finite count as infinite."""
     length = np.linalg.norm(off, axis=0)
     return float(np.median(np.where(np.isfinite(length), length, np.inf)))

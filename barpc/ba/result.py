@@ -1,4 +1,4 @@
-"""The result of an adjustment, the prior of a later run, and the height accuracy of pairs of views."""
+"""The result of an adjustment, the prior that it gives a later run, and the height accuracy of pairs of views."""
 
 from __future__ import annotations
 
@@ -36,107 +36,107 @@ from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, RowSplin
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """Corrections of a block of views, and how far they can be trusted.
+    """Corrections of a block of N views, with their uncertainty and the results of tests.
 
     Parameters
     ----------
     names : tuple of str
-        Views, as given.
+        Names of the views, in the order given.
     sensors : tuple of SensorModel
-        P_BA of every view: the delivered sensor behind its correction.
+        Corrected camera (P_BA) of each view: the delivered sensor with its correction.
     params : (N, q)
-        The unknowns in metres (or px for image models), see `barpc.ba.parameters.unknowns`.
+        Unknowns in metres (px for image models), see `barpc.ba.parameters.unknowns`.
     points : (P, 3)
-        Ground points of the tracks, ECEF [m]; NaN for a track of which nothing was kept.
+        Ground points of the tracks, ECEF [m]; NaN for a track without inliers.
     residuals_before, residuals : (K, 2)
-        Projected - observed [px], in the order of the tracks given; before: cameras as they came (those of
-        an earlier block as it left them), points triangulated with them.
+        Projected - observed [px], in the order of the tracks given. Before: with delivered cameras (after an earlier
+        block, those of its result) and points triangulated with them.
     inlier : (K,)
-        Observations that were kept.
+        Mask of the observations that were kept.
     held_out : (K,)
-        Observations of check tie points; their residuals are those of points triangulated anew.
+        Mask of the observations of check tie points. Their residuals are from points triangulated with fixed cameras.
     held_out_rms, held_out_noise : (N,)
-        Root mean square residual [px] of every view's held-out observations, from their median, and over the
-        stated one; NaN without any.
+        RMS residual [px] of the check observations of each view, from their median, and the ratio of this to the
+        stated one; NaN without such observations.
     view : (K,)
-        The tracks' views.
+        View of each observation.
     noise : float
-        Observed over stated standard deviation of the observations.
+        Ratio of the observed to the stated standard deviation of the observations.
     cost_history : tuple of float
-        Sum of squared whitened residuals at each linearisation of the passes, and where each pass ended.
+        Sum of squared whitened residuals at each linearisation, and at the end of each pass of outlier rejection.
     steps : int
-        Linearisations of the passes in all.
+        Number of linearisations in all passes.
     status : str
-        One line: what the solver did.
+        Summary of the solver runs, one line.
     cameras : Cameras
-        The views as the solver saw them.
+        The cameras and the layout of their unknowns.
     covariance : Covariance
         Covariance of corrections, points and relative heights.
     gauge : GaugeReport
-        Shift of the scene, its standard deviation, the weakest modes.
+        Shift of the scene, its standard deviation, and the weakest modes.
     datum : mapping
-        Source (`barpc.ba.constraints.gauge.SOURCES`) -> its share (10,) of the information on the scene's `MOTIONS`.
+        Source (`barpc.ba.constraints.gauge.SOURCES`) -> share (10,) of the information on the `MOTIONS` of the scene.
     prior : PriorTest
-        Comparison of the corrections with the priors given, and the priors learnt.
+        Comparison of the corrections with the given priors, and the estimated priors.
     told : (N,)
-        What tie points tell of each view, before what all of a view share caps it [1/px^2].
+        Information of the tie points of each view [1/px^2], not limited by the common error of the view.
     smooth : SmoothTest
-        Smooth part of the residuals that are left, with its test.
+        Systematic (smooth) part of the final residuals, and its test.
     asked : mapping
-        "drift" or "jitter" -> the smooth part that asked for another degree, or for splines and steps.
+        "drift" or "jitter" -> systematic residuals for which the degree was raised, or splines and steps were added.
     findings : tuple of Finding
-        Explanations of tie points beside the cameras' errors as stated, the first taken first.
+        Additional terms and moving groups that explain residuals, in order of selection.
     moving : (K,)
-        Observations of tie points that were found to move together; they were excluded.
+        Mask of the observations of tie points on ground that moved; they were excluded.
     left : tuple of Interval
-        Rows and columns in which ties were cut, or are off, more than elsewhere and chance allow, at the end.
+        Intervals of rows and columns with significantly more rejected tie points, or larger residuals, than elsewhere.
     alike : (N,)
-        Evidence that neighbours among a view's rejected tie points are displaced in the same direction, which wrong
-        matches do
-        not (`barpc.ba.evidence.scan.neighbours_alike`) [nats].
+        Evidence for each view [nats] that neighbouring rejected tie points have similar residuals, unlike wrong matches
+        (`barpc.ba.evidence.scan.neighbours_alike`).
     in_space_rms : float or None
-        Where an affine in the image was chosen: RMS of held-out tracks under rotations, translations and drifts
+        If an affine in the image was selected: RMS of check tie points with rotation, translation and drift instead
         [px].
     changed : float
-        By how much the terms beside the plain model move images against each other, the largest median of a band of
-        eighths of their rows or columns [px]; 0 for the plain model.
+        Displacement of images relative to each other by additional terms [px]: the largest median over an eighth of
+        the rows or columns. 0 without additional terms.
     two_groups : tuple of TwoGroups
         Pairs of views whose tie points fall into two groups.
     held : (P,)
-        Tracks constrained in height because their convergence angle is too small.
+        Mask of the tracks constrained in height because their convergence angle is too small.
     terrain : TerrainTest or None
-        Result of holding tie points to a terrain; None without one.
+        Comparison of the DEM with the tie points; None without a DEM.
     altimetry : AltimetryTest or None
-        Result of registering heights without image coordinates; None without any.
+        Result of the registration to altimetry; None without altimetry.
     left_out : tuple of str
-        Views outside the largest group (`AdjustOptions.keep_largest`); they keep their cameras.
-    apart : Apart or None
-        A view whose RPC does not match the image: the others were adjusted without it, it alone against their points,
-        or not at all. Its points, residuals and observations kept are by these; in the covariance it is as its prior.
-        Where it may be one of several, nothing was done.
+        Views outside the largest connected group (`keep_largest`); they keep their cameras.
+    apart : ForeignCamera or None
+        A view whose RPC does not match the image. The others were adjusted without it; it was resected on their points,
+        or keeps its RPC. Its residuals and inliers refer to these points; in the covariance it has its prior. Nothing
+        was changed if several views are candidates.
     control : ControlTest or None
-        Ground control points against each other and the cameras.
+        Tests of the GCPs against each other and the cameras.
     gcp_w, reference_w : (M,), (R,)
-        Baarda's w of the observations of GCPs and of a reference's points (`control.snooping.image_test`);
-        NaN for those that do not count, and of a large reference for all but every n-th.
+        Baarda's w of the observations of GCPs and of reference points (`control.snooping.image_test`). NaN for outliers
+        and for points without a prior; of a large reference, only a sample is tested.
     gcp_inlier : (M,)
-        Observations of GCPs that were kept.
-    reference_inlier : (M,)
-        Observations of a reference's points that were kept.
+        Mask of the observations of GCPs that were kept.
+    reference_inlier : (R,)
+        Mask of the observations of reference points that were kept.
     gcp_residuals : (G, 3)
-        East, north, up [m] of the adjusted GCPs minus their given place.
+        Adjusted minus given positions of the GCPs, east, north, up [m].
     seconds : float
         CPU time.
     common : CommonErrors or None
-        Errors that images have in common, which are in the covariance.
+        Errors common to several images; the covariance includes them.
     deformed : Deformation or None
-        A deformation of an image by control, which tie points do not show; drifts were held to what these show.
+        A deformation of an image by control that tie points do not confirm; then only tie points determined the drift
+        priors.
     unseen : UnseenSteps or None
-        Of two images without findings: displaced rows and columns that nothing would have shown; they are in `gauge`.
+        For two images without findings: undetectable displacements of rows and columns; `gauge` includes them.
     earlier : BlockPrior or None
-        What an earlier block knew of those of its views that are among these.
+        Marginal prior from an earlier block on those of its views that are among these.
     options : AdjustOptions
-        As given.
+        The options given.
     """
 
     names: tuple[str, ...]
@@ -193,17 +193,17 @@ class Adjustment:
 
     @property
     def splines(self) -> tuple[RowSpline | None, ...]:
-        """Corrections in the image behind each view's camera; None: nothing."""
+        """Image correction of each view, applied after its camera; None: there is none."""
         return tuple(sensor.correction if isinstance(sensor, Splined) else None for sensor in self.sensors)
 
     @property
     def bases(self) -> tuple[SensorModel, ...]:
-        """The sensors without corrections that act in the image alone."""
+        """The sensors without these image corrections."""
         return tuple(sensor.sensor if isinstance(sensor, Splined) else sensor for sensor in self.sensors)
 
     @property
     def corrections(self) -> tuple[Correction | ImageAffine, ...]:
-        """The correction of every view."""
+        """The correction of the camera of each view."""
         found = []
         for sensor in self.bases:
             assert isinstance(sensor, Corrected | ImageCorrected)
@@ -212,11 +212,11 @@ class Adjustment:
 
     @property
     def observations(self) -> IntArray:
-        """Observations kept, of every view (N,)."""
+        """Number of inliers of each view (N,)."""
         return np.bincount(self.view[self.inlier], minlength=len(self.names))
 
     def rmse(self, before: bool = False) -> Array:
-        """Return the root mean square reprojection error (N,) [px] of every view's kept observations."""
+        """Return the root mean square reprojection error (N,) [px] of the inliers of each view."""
         residual = self.residuals_before if before else self.residuals
         square = (residual[self.inlier] ** 2).sum(axis=1)
         total = np.bincount(self.view[self.inlier], square, len(self.names))
@@ -227,7 +227,7 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class PairHeights:
-    """Standard deviations of heights measured in two views, from the uncertainty of their corrections alone.
+    """Standard deviations of heights measured in two views, due to the uncertainty of their corrections alone.
 
     Parameters
     ----------
@@ -236,9 +236,9 @@ class PairHeights:
     absolute : float
         Standard deviation of a height [m].
     relative : float
-        Standard deviation of a height against the mean height of the pair's tie points [m].
+        Standard deviation of a height relative to the mean height of the common tie points [m].
     count : int
-        Tie points that it was evaluated at.
+        Number of tie points at which these were evaluated.
     """
 
     views: tuple[int, int]
@@ -248,7 +248,7 @@ class PairHeights:
 
 
 def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights:
-    """Return the height uncertainty of a pair at the tie points that both views see.
+    """Return the height uncertainty of a pair at the tie points seen in both views.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     Returns
     -------
     PairHeights
-        NaN where the views share no point.
+        NaN if the views share no point.
     """
     structure = adjustment.covariance.reduced.structure
     by_view = [structure.point[slice(*structure.bounds[v : v + 2])] for v in (first, second)]
@@ -275,7 +275,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     by_camera, pull, image = height_derivatives(cameras, params, pair, points)
     by_camera, covariance = by_camera.reshape(n, -1), adjustment.covariance.joint(np.array(pair))
     if adjustment.common is not None:
-        by_camera, covariance = _with_common(adjustment, pair, points, (by_camera, pull, covariance))
+        by_camera, covariance = _extended_by_common(adjustment, pair, points, (by_camera, pull, covariance))
     if adjustment.unseen is not None:
         steps = adjustment.unseen.heights(image, pull)
         by_camera, covariance = np.hstack([by_camera, steps]), la.block_diag(covariance, np.eye(steps.shape[1]))
@@ -285,11 +285,11 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     )
 
 
-def _with_common(
-    adjustment: Adjustment, pair: tuple[int, int], points: Array, known: tuple[Array, Array, Array]
+def _extended_by_common(
+    adjustment: Adjustment, pair: tuple[int, int], points: Array, given: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
-    """Return the derivative of heights by unknowns and by errors in common, and the covariance of both together."""
-    common, (by_camera, pull, covariance) = adjustment.common, known
+    """Return the derivatives of heights by unknowns and common errors, and the joint covariance of these."""
+    common, (by_camera, pull, covariance) = adjustment.common, given
     assert common is not None
     assert adjustment.covariance.shared is not None
     shared = adjustment.covariance.shared.by_unknown
@@ -307,7 +307,7 @@ def _with_common(
 def height_derivatives(
     cameras: Cameras, params: Array, pair: tuple[int, int], points: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the derivatives of heights that two views measure, and where these see the points.
+    """Return the derivatives of heights measured in two views, and the image points.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def height_derivatives(
     Returns
     -------
     by_unknown, pull, image : (n, 2, q), (n, 2, 2), (n, 2, 2)
-        Derivatives by the unknowns of either view, and by its image points [m/px]; image points [px].
+        Derivatives by the unknowns of each view, and by its image points [m/px]; image points [px].
     """
     n, num, ground = len(points), len(cameras.sensors), ground_from_ecef(points)
     image = np.stack([cameras.sensors[view].project(ground) for view in pair], axis=1)
@@ -341,7 +341,7 @@ def _rms_uncertainty(rows: Array, covariance: Array) -> float:
 
 
 def block_prior(adjustment: Adjustment) -> BlockPrior:
-    """Return the prior that a later run starts from: of a run that goes on from a block, of all views of both.
+    """Return the prior for a later run; after a run that continued an earlier block, it has the views of both.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
     BlockPrior
     """
     reduced, n = adjustment.covariance.reduced, len(adjustment.names)
-    used = ~np.isin(adjustment.names, adjustment.left_out)  # others are as they came, and may be given again
+    used = ~np.isin(adjustment.names, adjustment.left_out)  # left-out views were not adjusted, and may be added later
     free = adjustment.covariance.free & np.repeat(used, len(adjustment.covariance.free) // n)
     waves = adjustment.cameras.unknowns.waves
     views, matrix = np.flatnonzero(free.reshape(n, -1)[:, 0]), reduced.matrix
@@ -376,40 +376,40 @@ def block_prior(adjustment: Adjustment) -> BlockPrior:
 
 
 def moved_px(before: BlockPrior, after: BlockPrior, places: Array, pixel: Array) -> Array:
-    """Return how far (n,) [px] the cameras of a block move, where it has grown out of another.
+    """Return the displacements (n,) [px] of the cameras of a block by its extension with other views.
 
     Parameters
     ----------
     before, after : BlockPrior
-        A block of n views, and one whose first n views are these.
+        A block of n views, and the extended one, which begins with these.
     places : (n, 3)
-        ECEF [m] of a ground point in the middle of each image.
+        Ground point at the middle of each image, ECEF [m].
     pixel : (n,)
-        Side of a pixel on the ground there [m].
+        Pixel size on the ground there [m].
 
     Returns
     -------
     moved : (n,)
-        The largest of the first, middle and last row, across the line of sight; of models in the image an upper bound.
+        Largest displacement of first, middle and last row across the line of sight; an upper bound for image models.
     """
     change, n = after.params[: len(before.names)] - before.params, len(before.names)
     if not {"rotation", "translation"} & set(before.model.split("+")):
         return np.asarray(np.abs(change).sum(axis=1))
     rotates, translates = (word in before.model for word in ("rotation", "translation"))
-    turned = change[:, :3] if rotates else np.zeros((n, 3))
-    shifted = change[:, 3 * rotates : 3 * rotates + 3] if translates else np.zeros((n, 3))
+    rotation = change[:, :3] if rotates else np.zeros((n, 3))
+    translation = change[:, 3 * rotates : 3 * rotates + 3] if translates else np.zeros((n, 3))
     first = 3 * (rotates + translates)
     drift = change[:, first : first + 3 * before.drift].reshape(n, before.drift, 3)
     sight = places - before.center
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     up = enu_basis(ground_from_ecef(places))[:, 2]
-    # as wide as it is seen, along the line of sight
+    # pixel size across the line of sight
     side = pixel * np.sqrt(np.abs((sight * up).sum(axis=1)))
     most = np.zeros(n)
     for row in (-1.0, 0.0, 1.0):
         powers = row ** np.arange(1, before.drift + 1)
-        vector = turned + np.einsum("d,ndx->nx", powers, drift)
-        moved = np.cross(vector, sight) - shifted
+        vector = rotation + np.einsum("d,ndx->nx", powers, drift)
+        moved = np.cross(vector, sight) - translation
         moved -= (moved * sight).sum(axis=1, keepdims=True) * sight
         most = np.maximum(most, np.linalg.norm(moved, axis=1))
     return np.asarray(most / side)

@@ -29,11 +29,11 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, SURELY
 from barpc.scene import BoolArray
 
-_FAR_OFF = 150.0  # m: offset from a reference beyond the accuracy of delivered cameras
-_TREND = MUCH_NOISE * NOISE_FLOOR  # px: systematic residuals above it make other models be tried
-_SKEW = 1e-3  # of half the length of an image, of a drift: 3 microradian a second
-MUCH_BETTER = 0.7  # largest ratio of check residuals at which another model is accepted that may change heights
-CLEARLY = 0.8  # the same ratio for another start or model; also least share of inliers of a view
+_FAR_OFF = 150.0  # m: larger offsets from a reference exceed the accuracy of delivered cameras
+_TREND = MUCH_NOISE * NOISE_FLOOR  # px: with larger systematic residuals, other models are tried
+_SKEW = 1e-3  # largest usual drift, relative to half the image length: 3 microradian per second
+MUCH_BETTER = 0.7  # largest ratio of check residuals to accept another model that may change heights
+CLEARLY = 0.8  # largest ratio of noise to accept another start; also least fraction of inliers of a view
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +42,16 @@ class Solution:
 
     problem: Problem  # of the last solve
     state: State  # at the start: delivered cameras, points triangulated with them
-    before: Array  # (2, K) residuals at the start [px]
+    before: Array  # (2, K) residuals at `state` [px]
     heights: PointConstraints  # priors on points
-    outcome: Outcome  # of the rounds
-    start: HeldOut  # residuals of check tie points at the start
-    after: HeldOut  # and at the end
+    outcome: Outcome  # of the rounds of outlier rejection
+    start: HeldOut  # check tie points at the start
+    after: HeldOut  # check tie points at the end
     tested: ControlTest | None  # tests of control points
     # "drift", "jitter" -> systematic residuals for which the degree was raised, or splines and steps were added
     asked: Mapping[str, SmoothTest] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()  # terms and moving groups, in order of selection
-    agreed: Agreement | None = None  # control points in use
+    agreed: Agreement | None = None  # selection of control points
     deformed: Deformation | None = None  # of an image by control
 
     @property
@@ -74,38 +74,38 @@ class Solution:
     def first_points(self, block: Block, some: BoolArray) -> Array:
         """Return the points `some` (P,) triangulated by the delivered cameras, (P, 3) [m]; NaN for others.
 
-        Observations are the projections by the adjusted cameras, without priors but for the altitude of weak points.
-        So the difference to the adjusted points is that of the cameras alone.
+        The image points are projections by the adjusted cameras, so the difference to the adjusted points is due to the
+        cameras alone. There are no priors on points, except on the altitude of weak points.
         """
-        points, shown, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
-        mended = replace(self.problem, xy=shown, point_prior=staying(points, np.flatnonzero(some & weak)))
-        points = np.where(weak[:, None], points, self.state.points)  # from there it is linear
+        points, projected, weak = self.final.points, self.outcome.residual + self.problem.xy, self.heights.weak
+        reprojected = replace(self.problem, xy=projected, point_prior=staying(points, np.flatnonzero(some & weak)))
+        points = np.where(weak[:, None], points, self.state.points)  # close enough for one linear step
         delivered = self.problem.project_points(self.problem.camera_prior.mean, points)
-        points = mended.triangulate(points, delivered, block.use / block.sigma)
+        points = reprojected.triangulate(points, delivered, block.use / block.sigma)
         return np.where(some[:, None], points, np.nan)
 
     @property
     def has_trend(self) -> bool:
-        """Whether residuals are systematic, or larger at check tie points, so that another model may be better."""
-        return bool(self.outcome.smooth.found(_TREND).any()) or self._meets_worse
+        """Whether another model may be better: residuals are systematic, or much larger at check tie points."""
+        return bool(self.outcome.smooth.found(_TREND).any()) or self._has_large_check_residuals
 
     @property
     def has_waves(self) -> bool:
-        """Whether neighbouring residuals are correlated, so that splines or detector steps may explain them.
+        """Whether splines or detector steps may be better: neighbouring residuals are correlated.
 
-        Observations of a view with jitter may be rejected; then the residuals of check tie points are larger.
+        Jitter may also cause rejections; then the residuals of check tie points are much larger than those of inliers.
         """
         tested = self.outcome.smooth
-        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any()) or self._meets_worse
+        return bool((tested.found(_TREND) | (tested.shared > _TREND)).any()) or self._has_large_check_residuals
 
     @property
-    def _meets_worse(self) -> bool:
+    def _has_large_check_residuals(self) -> bool:
         """Whether residuals of check tie points are much larger than those of the inliers."""
         return self.after.error > MUCH_NOISE * self.outcome.noise
 
     @property
     def is_skew(self) -> bool:
-        """Whether the estimated drift shears images more than platforms do, as where an image was resampled."""
+        """Whether the estimated drift shears images more than platforms do; the image may have been resampled."""
         learnt = self.outcome.prior.drift_sigma
         if not learnt or learnt[0] < 2.0 * DRIFT_SIGMA:
             return False
@@ -123,13 +123,13 @@ def solve_block(
     centers: Array | None,
     prior: BlockPrior | None,
 ) -> Solution:
-    """Solve a block with the model of the options: with tie points first, then with the consistent control points.
+    """Solve a block with the model in the options: with tie points first, then with the control points that agree.
 
-    Where residuals suggest it, solved again from a consensus of observations, or with a higher degree of the drift.
-    `outer` has the check observations.
+    If residuals suggest it, the block is solved again from a consensus of observations or with a higher degree of the
+    drift. `outer` has the check observations.
     """
     problem = make_problem(block, options, centers, prior)
-    state, given = first_state(_placed(problem, block), block, options, dem)
+    state, given = first_state(_shifted_to_reference(problem, block), block, options, dem)
     heights = given.loose(UNCONSTRAINED_SIGMA) if block.gcps.names else given
     start = measure(problem, state.params, outer)
     rounds = Rounds(problem, block, state, heights, block.use)
@@ -160,13 +160,13 @@ def solve_block(
     found = finished(first, problem, block, outer, outcome)
     if free is not None and found.heights.has_control:
         found = _without_distorting_control(found, free, block, outer, options)
-    return found if prior is not None else _held_in_shape(found, block, outer)
+    return found if prior is not None else _without_deformation(found, block, outer)
 
 
-def _placed(problem: Problem, block: Block) -> Problem:
-    """Return the problem with cameras translated by their offsets from a reference, if these are large.
+def _shifted_to_reference(problem: Problem, block: Block) -> Problem:
+    """Return the problem with cameras translated by their offsets from a reference, where these are large.
 
-    Hundreds of metres are beyond the convergence radius of the adjustment.
+    The adjustment would not converge over hundreds of metres.
     """
     unknowns = problem.cameras.unknowns
     if block.reference is None or not unknowns.translates or problem.joint_prior is not None:
@@ -183,10 +183,10 @@ def _placed(problem: Problem, block: Block) -> Problem:
     return replace(problem, camera_prior=replace(problem.camera_prior, mean=mean))
 
 
-def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
-    """Return the solution; if control deforms an image, solved again with drift priors from the tie points alone.
+def _without_deformation(found: Solution, block: Block, outer: Block) -> Solution:
+    """Return the solution; if control deforms an image, it is solved again with drift priors from tie points alone.
 
-    Without tie points the control points determine the drift.
+    Without tie points nothing is changed: control points must determine the drift.
     """
     heights, problem = found.heights, found.problem
     if not heights.kinds or not (block.point < block.num_tracks).any():
@@ -196,9 +196,9 @@ def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
         return found
     start = State(np.zeros_like(found.final.params), found.state.points)
     free = Rounds(problem, block, start, heights.without_control(UNCONSTRAINED_SIGMA), block.use).run()
-    asked, _ = shape_change(problem, free.state.params, block.views)
-    view = int((sigmas - asked).argmax())
-    if not sigmas[view] - asked[view] > MOST_SIGMAS:
+    by_ties, _ = shape_change(problem, free.state.params, block.views)
+    view = int((sigmas - by_ties).argmax())
+    if not sigmas[view] - by_ties[view] > MOST_SIGMAS:
         return found
     heights = replace(heights, widest=free.prior.wide)
     outcome = Rounds(problem, block, start, heights, block.use).run()
@@ -209,20 +209,20 @@ def _held_in_shape(found: Solution, block: Block, outer: Block) -> Solution:
 def _with_more_drift(
     solved: tuple[Problem, Outcome], block: Block, options: AdjustOptions, heights: PointConstraints
 ) -> tuple[Problem, Outcome]:
-    """Return problem and outcome with one degree of drift more; those given if most inliers are lost by it."""
+    """Return problem and outcome with one more degree of drift; those given if that rejects most of the inliers."""
     problem, outcome = solved
     unknowns = problem.cameras.unknowns
     more = make_problem(block, options, unknowns.center, None, unknowns.drift + 1)
-    ended, weight = outcome.state, block.use / block.sigma
-    there, _ = retriangulate_rejected(problem, ended, outcome.residual, outcome.inlier, weight)
-    there = replace(there, params=np.hstack([there.params, np.zeros((len(block.views), 3))]))
-    tried = Rounds(more, block, there, heights, outcome.inlier).run()
+    final, weight = outcome.state, block.use / block.sigma
+    start, _ = retriangulate_rejected(problem, final, outcome.residual, outcome.inlier, weight)
+    start = replace(start, params=np.hstack([start.params, np.zeros((len(block.views), 3))]))
+    tried = Rounds(more, block, start, heights, outcome.inlier).run()
     # few remaining observations fit any model
     return (more, tried) if tried.inlier.sum() > 0.5 * outcome.inlier.sum() else solved
 
 
 def _check_inliers(outcome: Outcome, block: Block) -> None:
-    """Raise AdjustError if no control and in no view enough tie points are inliers."""
+    """Raise AdjustError if no view has enough inliers and no control point is an inlier."""
     kept = np.bincount(block.view[outcome.inlier])
     if kept.max(initial=0) < MIN_OBSERVATIONS and not (block.point[outcome.inlier] >= block.num_tracks).any():
         raise AdjustError(
@@ -234,12 +234,12 @@ def _check_inliers(outcome: Outcome, block: Block) -> None:
 def _without_distorting_control(
     found: Solution, free: Solution, block: Block, outer: Block, options: AdjustOptions
 ) -> Solution:
-    """Return the constrained solution, or the one `free` of control if control raises check residuals."""
+    """Return the solution with control `found`, or the one without, `free`, if control raises the check residuals."""
     without = measure(free.problem, free.final.params, outer)
     raised = found.after.whole_rms**2 - without.whole_rms**2
-    # allowed increase [px^2]: the common error noise_floor of the tie points of a view, for each of its q unknowns
-    known = free.final.params.shape[1] * options.noise_floor**2
-    if raised <= known or not is_better(without, found.after, outer):
+    # allowed increase [px^2]: noise_floor, the common error of the tie points of a view, once for each of q unknowns
+    allowed = free.final.params.shape[1] * options.noise_floor**2
+    if raised <= allowed or not is_better(without, found.after, outer):
         return found
     assert found.agreed is not None
     none = Agreement(np.zeros_like(found.agreed.used), torn=(without.whole_rms, found.after.whole_rms))
@@ -247,16 +247,16 @@ def _without_distorting_control(
 
 
 def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> tuple[Agreement, PointConstraints]:
-    """Return the control points that are consistent with an outcome without control, and the constraints with these."""
+    """Return the control points selected by an outcome without control, and the constraints with these points."""
     every, first = np.arange(len(block.gcps.names)), block.num_tracks
-    of = block.point - first
-    rejected = np.isin(every, of[block.use & ~outcome.inlier])  # outliers by hundreds of sigmas
-    known = np.isin(every, of[outcome.inlier]) & ~rejected
+    point = block.point - first
+    rejected = np.isin(every, point[block.use & ~outcome.inlier])  # outliers by hundreds of sigmas
+    testable = np.isin(every, point[outcome.inlier]) & ~rejected
     # observed, but on moving ground that was excluded
-    moving = np.isin(every, block.gcps.point) & ~np.isin(every, of[block.use])
+    moving = np.isin(every, block.gcps.point) & ~np.isin(every, point[block.use])
     covariance = outcome.covariance(outcome.problem.free)
     faint = downweighting(block, heights.loose(UNCONSTRAINED_SIGMA))
-    found = agreement(offsets_of(covariance, block, outcome.state.points, faint), known)
+    found = agreement(offsets_of(covariance, block, outcome.state.points, faint), testable)
     found = replace(found, used=found.used & ~rejected & ~moving)
     kept = heights.control[0].select(found.used[heights.control[0].index - first])
     kept = replace(kept, rows=kept.rows / found.scale)
@@ -264,7 +264,7 @@ def _with_control(block: Block, heights: PointConstraints, outcome: Outcome) -> 
 
 
 def finished(found: Solution, problem: Problem, block: Block, outer: Block, outcome: Outcome) -> Solution:
-    """Return `found` with the outcome of a problem, control points tested and check residuals measured."""
+    """Return `found` with a new problem and outcome; control points are tested and check residuals measured."""
     tested = None
     if found.agreed is not None:
         covariance, points = outcome.covariance(problem.free), outcome.state.points
@@ -275,6 +275,6 @@ def finished(found: Solution, problem: Problem, block: Block, outer: Block, outc
 
 
 def _is_suspect(outcome: Outcome, structure: Structure, use: BoolArray) -> bool:
-    """Return whether the rounds may have ended in a local minimum: much noise, or a view with many outliers."""
+    """Return whether the rounds may have ended in a local minimum: large noise, or a view with many outliers."""
     had, kept = (structure.sum_views(rows.astype(np.float64)[None])[:, 0] for rows in (use, outcome.inlier))
     return outcome.noise > MUCH_NOISE or bool((kept < CLEARLY * had).any())

@@ -14,7 +14,7 @@ from barpc.ba.calibration import (
     Line,
     SensorTies,
     Told,
-    _judged,
+    _cross_validated,
     contradicts,
     learn,
     normal_equations,
@@ -149,7 +149,7 @@ def test_blocks_of_one_curve_scatter_as_their_noise_does() -> None:
             rows = rng.normal(size=(300, 2 * curve.size)) * 3.0
             matrix = rows.T @ rows
             told.append(Told(matrix, -matrix @ truth - rows.T @ rng.normal(size=300), 0.0, 300.0))
-        scatter.append(_judged(curve, told, prior, 0.1).scatter)
+        scatter.append(_cross_validated(curve, told, prior, 0.1).scatter)
     assert 0.83 < np.mean(scatter[:8]) < 1.2
     assert np.mean(scatter[8:]) == pytest.approx(1.0, abs=0.075)
 

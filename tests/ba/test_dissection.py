@@ -151,10 +151,10 @@ def _layered(levels: int) -> sp.csr_array:
 
 
 def _covered(graph: sp.csr_array) -> np.ndarray:
-    """What `_touching` takes, of rows then columns of a bipartite graph."""
+    """What `_vertex_cover` takes, of rows then columns of a bipartite graph."""
     rows, cols = graph.shape
     whole = sp.csr_array(sp.block_array([[None, graph], [graph.T, None]]))
-    cover = structure._touching(whole, np.arange(rows), rows + np.arange(cols))
+    cover = structure._vertex_cover(whole, np.arange(rows), rows + np.arange(cols))
     row, col = graph.nonzero()
     assert (np.isin(row, cover) | np.isin(rows + col, cover)).all()
     return cover

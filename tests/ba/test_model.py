@@ -462,7 +462,7 @@ def script(
     monkeypatch.setattr(solved, "agreeing", lambda *_: Agreed(agreed))
     monkeypatch.setattr(solved, "retriangulate_rejected", lambda problem, state, *_: (state, None))
     monkeypatch.setattr(solved, "finished", lambda found, *_: found)
-    monkeypatch.setattr(solved, "_held_in_shape", lambda found, *_: found)
+    monkeypatch.setattr(solved, "_without_deformation", lambda found, *_: found)
     use = np.ones(100)
     seen = {"view": np.zeros(100, dtype=np.int64), "point": np.arange(100), "num_tracks": 100}
     block: Any = SimpleNamespace(use=use, sigma=1.0, views=("a", "b"), gcps=GroundPoints.none(), reference=None, **seen)

@@ -56,7 +56,7 @@ def run(
 
     monkeypatch.setattr(solve, "camera_step", camera_step)
     if kept is None:
-        monkeypatch.setattr(solve, "_is_as_told", lambda *_: False)  # no step is the last for having kept its promise
+        monkeypatch.setattr(solve, "_is_as_predicted", lambda *_: False)  # none is the last for that
     problem: Any = SimpleNamespace(reduce=reduce, prepare=lambda *_: (np.zeros(1), None), cost=cost)
     try:
         return solve._levenberg_marquardt(problem, STATE, np.ones(1), tolerance, None), dampings

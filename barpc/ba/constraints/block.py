@@ -40,11 +40,11 @@ class Block:
 
     views: tuple[View, ...]  # N views
     view: IntArray  # (K,)
-    point: IntArray  # (K,) from `num_tracks` on GCPs, from `num_known` on points of the reference
+    point: IntArray  # (K,) below `num_tracks`: tracks; then below `num_known`: GCPs; then points of the reference
     xy: Array  # (2, K) observed col, row [px]
     sigma: Array  # (K,) [px], view weights applied
     order: IntArray  # (K,) index of each observation in the input: tracks, then GCPs, then reference
-    use: BoolArray  # (K,) false for observations of left-out views
+    use: BoolArray  # (K,) False for observations in left-out views
     gcps: GroundPoints  # may be empty
     reference: Reference | None
     num_tracks: int
@@ -52,7 +52,7 @@ class Block:
     num_points: int  # number of tracks, GCPs and reference points
     num_rows: int  # number of observations in the input
     left_out: tuple[str, ...]  # views outside the largest connected group
-    known: BoolArray | None = None  # (K,) observations that the prior of an earlier block contains; None: no such prior
+    known: BoolArray | None = None  # (K,) observations contained in the prior of an earlier block; None: no prior
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,7 +65,7 @@ class Block:
         return min(v.alt_range[0] for v in self.views), max(v.alt_range[1] for v in self.views)
 
     def without(self, rows: BoolArray) -> Block:
-        """Return the block without the observations of a mask (K,)."""
+        """Return the block without the observations in the mask `rows` (K,)."""
         keep = ~rows
         return replace(
             self,
@@ -79,13 +79,13 @@ class Block:
         )
 
     def in_order(self, rows: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
-        """Return values (K, ...) in the order of the input observations; zeros for those that the block lacks."""
+        """Return values (K, ...) in the order of the input observations; zeros for those not in the block."""
         out = np.zeros((self.num_rows, *rows.shape[1:]), rows.dtype)
         out[self.order] = rows
         return out
 
     def groups(self, rows: BoolArray) -> list[list[int]]:
-        """Return the groups of views that are connected by common points of observations (K,), the largest first."""
+        """Return the groups of views connected by common points in the mask `rows` (K,), the largest first."""
         order = np.flatnonzero(rows)
         order = order[np.lexsort((self.view[order], self.point[order]))]
         same = np.flatnonzero(np.diff(self.point[order]) == 0)
@@ -93,12 +93,12 @@ class Block:
         return connected_groups(len(self.views), [(int(i), int(j)) for i, j in pairs])
 
     def first_points(self) -> Array:
-        """Return the points (P, 3), ECEF [m], on the ray of the first observing view, at its middle altitude."""
+        """Return points (P, 3), ECEF [m]: rays of the first views at their middle altitudes, and control as given."""
         return self._first_points.copy()
 
     @cached_property
     def own_points(self) -> tuple[IntArray, Structure]:
-        """The observed points (Q,), and the structure of observations with points numbered among these."""
+        """Indices (Q,) of the observed points, and a structure that numbers its points 0 to Q - 1 in this order."""
         index, point = np.unique(self.point, return_inverse=True)
         return index, make_structure(self.view, point, len(self.views), len(index))
 
@@ -129,7 +129,7 @@ def join(
 ) -> Block:
     """Join tracks and GCPs into one block; arguments and errors as in `barpc.ba.adjust_tracks`.
 
-    Views `held` by the prior of an earlier block are connected by it, and need no tie points.
+    Views `held` are those with the prior of an earlier block, which connects them: they need no tie points.
     """
     names = [view.name for view in views]
     _check_names(names, options)
@@ -187,7 +187,7 @@ def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
 def _disconnected_views(
     names: Sequence[str], view: IntArray, point: IntArray, num_tracks: int, keep_largest: bool, is_held: BoolArray
 ) -> tuple[str, ...]:
-    """Return the views outside the largest group, observations sorted by point; GCPs connect all their views."""
+    """Return the views outside the largest group, for observations sorted by point. GCPs connect all their views."""
     point = np.where(point >= num_tracks, num_tracks, point)
     same = point[1:] == point[:-1]
     keys = np.unique((view[:-1] * len(names) + view[1:])[same])
@@ -217,7 +217,7 @@ def make_problem(
     drift: int | None = None,
     waves: AdditionalParameters | None = None,
 ) -> Problem:
-    """Return the problem of a block without priors on points; `drift` overrides the degree of the options."""
+    """Return the problem of a block, without priors on points; `drift` replaces the degree in the options."""
     views = block.views
     drift = _first_drift(options, prior) if drift is None else drift
     if prior is not None:
@@ -243,7 +243,7 @@ def make_problem(
 
 
 def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
-    """Return the degree of the drift to start with."""
+    """Return the first degree of the drift."""
     if options.drift is not None:
         return options.drift
     if prior is not None:
@@ -252,7 +252,7 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
 
 
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
-    """Return the camera centres (N, 3) [m]: of views of the earlier block those that it had."""
+    """Return the camera centres (N, 3) [m], ECEF; views of the earlier block keep the centres in its prior."""
     if centers is None:
         centers = make_unknowns(block.views, options.first_model).center
     known = dict(zip(prior.names, prior.center, strict=True))
@@ -287,7 +287,7 @@ def first_state(
 def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: Array) -> Relief:
     """Return the comparison of the DEM with points (P, 3) [m] triangulated by the delivered cameras.
 
-    The expected distance of points from the DEM is linear in the camera priors: points move by -V^-1 A^T B dp.
+    Its standard deviations by the camera priors are linearised: camera changes dp move points by -V^-1 A^T B dp.
     """
     assert heights.dem is not None
     structure, sigma = problem.structure, problem.camera_prior.sigma
@@ -295,14 +295,14 @@ def _relief(problem: Problem, heights: PointConstraints, points: Array, weight: 
     by_point = projected.by_point * weight
     lower = cholesky3(structure.sum_points(point_products(by_point, np.zeros_like(problem.xy))[:6]))
     up = enu_basis(ground)[:, 2].T
-    strong = np.zeros(len(points), dtype=bool)
-    strong[heights.tracks[~heights.weak[heights.tracks]]] = True
-    sharp = np.linalg.norm(solve_lower(lower, up), axis=0)
-    found = Relief.of(heights.dem, ground, strong, sharp, heights.options.dem_sigma)
+    is_strong = np.zeros(len(points), dtype=bool)
+    is_strong[heights.tracks[~heights.weak[heights.tracks]]] = True
+    sigma_up = np.linalg.norm(solve_lower(lower, up), axis=0)
+    found = Relief.of(heights.dem, ground, is_strong, sigma_up, heights.options.dem_sigma)
     deviations = np.zeros(3)
     for m, fit in enumerate(found.fit):
-        moved = solve_transposed(lower, solve_lower(lower, up * fit))
-        pull = np.einsum("cxk,xk->ck", by_point, moved.take(structure.point, axis=1)) * weight
+        solved = solve_transposed(lower, solve_lower(lower, up * fit))
+        pull = np.einsum("cxk,xk->ck", by_point, solved.take(structure.point, axis=1)) * weight
         by_unknown = structure.sum_views(np.einsum("ck,cqk->qk", pull, projected.by_unknown))
         free = problem.free.reshape(by_unknown.shape)
         deviations[m] = np.sqrt(((by_unknown * sigma)[free] ** 2).sum()) if np.isfinite(sigma[free]).all() else np.nan

@@ -3,9 +3,9 @@
 A change dp of the camera unknowns moves the points by dX = -V^-1 W^T dp. Ten motions of the scene (`MOTIONS`) are
 fitted to dX by least squares; they are linear in dp and have a covariance.
 
-Of all changes of cameras and points that have a given motion, one has the least cost. The part of that cost in each
-prior or control is its share of the information on the motion. Tie points have no share: they constrain cameras and
-points only relative to each other.
+Of all changes of cameras and points with a given motion, one has the least cost. The fraction of that cost in a prior
+or a kind of control is its share of the information on the motion. Tie points have no share: they only constrain
+cameras and points relative to each other.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ over the scene of heights proportional to east x north, east^2 and north^2, each
 of cameras that change with the row (drift) cause twist and bends.
 """
 SIMILAR = MOTIONS.index("twist")
-"""Number of motions that keep the shape of the scene; the others, from here on, bend it."""
+"""Index of the first motion that bends the scene; the motions before it keep its shape."""
 SOURCES = ("cameras", "earlier_run", "fixed_views", "gcps", "heights", "reference", "altimetry")
 """Sources of information: camera priors as delivered, or of an earlier run; fixed views; GCPs; the DEM or assumed
 altitudes, with their common errors; a reference orthoimage, with its common errors; altimetry (heights without image
 coordinates)."""
-_OF_HEIGHTS = 3  # number of common errors of the DEM if there is a reference; those of the orthoimage follow
+_NUM_DEM_ERRORS = 3  # with a reference: its DEM has three common errors (offset, tilts), listed first
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One of the motions of the scene, with the correlated part of the others."""
+    """Uncertainty of one motion of the scene, and the errors of the other motions that are correlated with it."""
 
-    sigma: float  # its posterior standard deviation [m]
-    motion: Array  # (10,) expected errors of all `MOTIONS` if this one is wrong by sigma [m]
-    meaning: str  # its name
+    sigma: float  # posterior standard deviation of the motion [m]
+    motion: Array  # (10,) expected errors of all `MOTIONS` where this one has an error of sigma [m]
+    meaning: str  # name of the motion
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class GaugeReport:
     # (3,) mean displacement of the points from those of the delivered cameras, east, north, up [m]
     shift: Array
     sigma: Array  # (3,) posterior standard deviation of the position, east, north, up [m]
-    motion_sigma: Array  # (10,) the same for all `MOTIONS` [m]
+    motion_sigma: Array  # (10,) posterior standard deviations of all `MOTIONS` [m]
     modes: tuple[Mode, ...]  # the weakest first
     radius: float  # RMS distance of the points from their middle [m], at which tilts, turn and scale are measured
-    by_unknown: Array = field(repr=False)  # (10, N q) derivative of the motions by the camera unknowns
-    own: Array = field(repr=False)  # (10, 10) their covariance with the cameras fixed [m^2]
+    by_unknown: Array = field(repr=False)  # (10, N q) derivatives of the motions by the camera unknowns
+    own: Array = field(repr=False)  # (10, 10) covariance of the motions with the cameras fixed [m^2]
     # (3,) prior standard deviation of the position, from camera priors as widened, east, north, up [m]; NaN: unknown
     delivered_sigma: Array = field(default_factory=lambda: np.full(3, np.nan))
 
@@ -70,10 +70,10 @@ class GaugeReport:
 def gauge_report(
     covariance: Covariance, points: Array, before: Array, use: BoolArray, prior: Array | None = None
 ) -> GaugeReport:
-    """Report how an adjustment moved the scene, from points (P, 3), ECEF [m], after and before it.
+    """Report the motion of the scene by an adjustment, from points (P, 3), ECEF [m], after and before it.
 
-    `use` (P,) is the mask of points to use; `prior` (N, q) are prior standard deviations of the camera unknowns,
-    of which infinite ones are ignored.
+    `use` (P,) is the mask of points to use. `prior` (N, q) are the prior standard deviations of the camera unknowns;
+    infinite ones are ignored.
     """
     shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
     index = np.flatnonzero(use)
@@ -94,9 +94,9 @@ def gauge_report(
 
 
 def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene, params: Array) -> GaugeReport:
-    """Report the scene of an earlier block, from the unknowns (N, q) of its cameras that were adjusted again.
+    """Report the scene of an earlier block, whose cameras were adjusted again and now have the unknowns (N, q).
 
-    New observations only reduce its uncertainty. New points form another scene, which may be more uncertain.
+    New observations only reduce its uncertainty. The scene of the new points is another one and may be less certain.
     """
     by_unknown = np.zeros((len(MOTIONS), params.size))
     by_unknown[:, prior.index] = scene.by_unknown
@@ -107,10 +107,10 @@ def earlier_scene(covariance: Covariance, prior: JointPrior, scene: EarlierScene
 def _assembled_report(
     covariance: Covariance, shift: Array, motions: tuple[Array, Array, Array | float], radius: float
 ) -> GaugeReport:
-    """Return the report of a scene moved by `shift` (3,), east, north, up [m].
+    """Return the report of a scene that moved by `shift` (3,), east, north, up [m].
 
-    `motions` are the derivatives of the motions by the camera unknowns, and, with these fixed, the covariance of the
-    motions and their derivatives by common errors.
+    `motions` holds the derivatives of the motions by the camera unknowns (10, N q), their covariance with the cameras
+    fixed (10, 10), and their derivatives by shared errors with the cameras fixed (10, k).
     """
     by_unknown, own, direct = motions
     motion_covariance = by_unknown @ covariance.of_noise.solve(by_unknown.T) + own
@@ -132,8 +132,8 @@ def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> A
 def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:
     """Return the derivatives (10, N q) of the motions by camera unknowns, and their covariance with these fixed.
 
-    `pick` (10, n, 3) are the derivatives of the motions by the points of the mask `use`. `share` is the number of these
-    sampled points over that of all points.
+    `pick` (10, n, 3) are the derivatives of the motions by the points of the mask `use`. `share` is the ratio of
+    these sampled points to all points.
     """
     reduced, index = covariance.reduced, np.flatnonzero(use)
     # with V = L L^T and Y = L^-1 W^T, dX = -L^-T Y dp; the derivatives of the motions are multiplied by L^-T
@@ -169,7 +169,7 @@ def motions_of_moves(local: Array) -> Array:
 
 
 def _bending_modes(east: Array, north: Array) -> Array:
-    """Return the heights (3, n) of a twist and two bends, without a plane, each with a range of one metre."""
+    """Return the heights (3, n) of a twist and two bends, minus their best-fitting planes, each of range one metre."""
     plane = np.stack([np.ones_like(east), east, north])
     curved = np.stack([east * north, east**2, north**2])
     if not len(east):
@@ -189,12 +189,12 @@ def weakest_modes(motion_covariance: Array) -> tuple[Mode, ...]:
 def datum_shares(
     covariance: Covariance, by_unknown: Array, problem: Problem, state: State, weight: Array, known: tuple[int, int]
 ) -> Mapping[str, Array]:
-    """Return the share (10,) of each source in the information on the motions; NaN for motions of fixed cameras.
+    """Return the share (10,) of each source in the information on the motions; NaN where fixed cameras prevent one.
 
     Parameters
     ----------
     covariance : Covariance, at the solution
-    by_unknown : (10, N q), derivatives of the motions by the unknowns of the cameras
+    by_unknown : (10, N q), derivatives of the motions by the camera unknowns
     problem, state, weight : of the last solve; weight (K,) is 1 / sigma of each observation
     known : (int, int), indices of the first GCP and of the first reference point
     """
@@ -231,7 +231,7 @@ def _point_shares(
     points: Array,
     kinds: Mapping[str, BoolArray],
 ) -> Mapping[str, BoolArray]:
-    """Add the costs of points with priors to `cost_of`; return the mask (P,) of such points of each kind."""
+    """Add the costs of priors on points to `cost_of`; return the mask (P,) of points with priors, for each kind."""
     held = {kind: np.zeros(len(rows), dtype=bool) for kind, rows in kinds.items()}
     prior, count = problem.point_prior, unknowns.shape[2]
     if prior is None:
@@ -246,7 +246,7 @@ def _point_shares(
         held[kind][prior.index] = own
         cost_of[kind][:] += own_costs[own].sum(axis=0)
         rest &= ~own
-    of_heights = _OF_HEIGHTS if held["reference"].any() else FIRST_PLACED
+    of_heights = _NUM_DEM_ERRORS if held["reference"].any() else FIRST_PLACED
     by_altimetry = rest & prior.common[:, :, FIRST_PLACED:].any(axis=(1, 2))
     cost_of["altimetry"][:] += own_costs[by_altimetry].sum(axis=0) + (shared[FIRST_PLACED:] ** 2).sum(axis=0)
     cost_of["heights"][:] += own_costs[rest & ~by_altimetry].sum(axis=0) + (shared[:of_heights] ** 2).sum(axis=0)
@@ -262,7 +262,7 @@ def _add_observation_shares(
     moves: tuple[Array, Array],
     held: Mapping[str, BoolArray],
 ) -> None:
-    """Add the costs of observations of known points, and of tie points in fixed views, to `cost_of`."""
+    """Add the costs of observations of points with priors, and of tie points in fixed views, to `cost_of`."""
     structure, (unknowns, points) = problem.structure, moves
     is_free = problem.free[:: len(problem.free) // structure.num_views]  # views are free or fixed as a whole
     known = np.any(list(held.values()), axis=0)

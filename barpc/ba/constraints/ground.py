@@ -1,4 +1,4 @@
-"""Priors on points: GCPs, a DEM, and heights for tracks that rays alone do not determine."""
+"""Priors on points: GCPs, a reference, a DEM, and altitudes of tracks with small convergence angles."""
 
 from __future__ import annotations
 
@@ -30,20 +30,18 @@ from barpc.scene import BoolArray, GroundPoints, IntArray, Reference
 from barpc.sensor.curve import cross
 
 FIRST_PLACED = NUM_BENDS
-"""Index of the first common error of altimetry. Those before it are of a DEM, and of a reference if there is one."""
+"""Index of the first common error of altimetry. The errors before it are those of a DEM and a reference."""
 DEM_BIAS = 20.0  # m: standard deviation of the common error of a DEM, if not stated
 KNOWN_BIAS = 5.0  # m: the same, if the vertical datum of the DEM is known
 MAX_INDEPENDENT_ERRORS = 25.0  # effective number of independent points of a DEM or reference with correlated errors
-# m: constrains points with a small convergence angle, where an error of 0.05 m across rays 0.01 degrees apart is 290 m
-# in height
-_ALTITUDE_SIGMA = 1.0
+_ALTITUDE_SIGMA = 1.0  # m: keeps the altitude of points whose rays are nearly parallel and do not determine it
 _FLAT_SIGMA = 50.0  # m: least prior sigma of altitudes without a DEM
 
 
 def _join_priors(priors: Sequence[PointPrior | None]) -> PointPrior | None:
     """Concatenate priors on different points; None if all are empty.
 
-    Columns of common errors with the same index are the same error.
+    Common errors with the same index are the same error.
     """
     given = [prior for prior in priors if prior is not None and len(prior.index)]
     if not given:
@@ -62,9 +60,9 @@ def ground_control(gcps: GroundPoints, index: IntArray) -> PointPrior:
 def reference_control(reference: Reference, index: IntArray) -> PointPrior:
     """Return the points of a reference as priors on the points `index` (R,).
 
-    Common errors: offset and tilts of the DEM (shared with the points constrained to it), offset of the orthoimage,
-    and a height of matched features above the DEM (houses, trees). Errors of a DEM are correlated: sigmas of heights
-    are enlarged, so that all weigh no more than `MAX_INDEPENDENT_ERRORS` independent ones.
+    The six common errors are: offset and two tilts of the DEM (also those of points constrained to the DEM), east and
+    north offset of the orthoimage, and the height of matched features (houses, trees) above the DEM. DEM errors are
+    correlated, so the height sigmas are enlarged: all weigh at most as `MAX_INDEPENDENT_ERRORS` independent heights.
     """
     sigma = reference.points.sigma * [1.0, 1.0, np.sqrt(max(len(index) / MAX_INDEPENDENT_ERRORS, 1.0))]
     alone = ground_control(replace(reference.points, sigma=sigma), index)
@@ -87,9 +85,9 @@ def terrain_heights(
 ) -> PointPrior:
     """Return priors that constrain points `index` (Q,) of (P, 3) to the local tangent planes of a DEM.
 
-    `sigma` [m] is the standard deviation of single heights. `common_sigma` [m] is that of the common offset, and of
-    common tilts at the edges of the scene. The edges are those of the points, or of `span` (n, 3) [m] if other priors
-    share the errors. The slope is ignored at points in the mask `level` (Q,). Points without a DEM height are left out.
+    `sigma` [m] is the standard deviation of single heights. `common_sigma` [m] is that of the common offset and, at the
+    edges of the scene, of the common tilts. The scene is the points, or `span` (n, 3) [m], ECEF, if other priors
+    share the errors. Planes are level at points in the mask `level` (Q,). Points without DEM height get no prior.
     """
     ground = ground_from_ecef(points[index])
     alt = terrain(ground[:, 0], ground[:, 1])
@@ -103,7 +101,7 @@ def terrain_heights(
 def _weighted_heights(ground: Array, index: IntArray, weighted: RegularisedDem, common_sigma: Array) -> PointPrior:
     """Return priors that constrain points `index` (Q,), at ground points (Q, 3), to a DEM of estimated accuracy.
 
-    `common_sigma` (`NUM_BENDS`,) [m] are the sigmas of its offset, tilts and bends, at the edges of the scene.
+    `common_sigma` (`NUM_BENDS`,) [m] are the sigmas of the DEM's offset, tilts and bends at the edges of the scene.
     """
     normal, sigma = np.column_stack([-weighted.slopes, np.ones(len(ground))]), weighted.effective_sigma
     prior = _heights(np.column_stack([ground[:, :2], weighted.alt]), index, normal, sigma, 0.0)
@@ -113,14 +111,14 @@ def _weighted_heights(ground: Array, index: IntArray, weighted: RegularisedDem, 
 
 
 def flat_heights(points: Array, index: IntArray, alt: float, sigma: float, common_sigma: float) -> PointPrior:
-    """Return priors that constrain points to one altitude [m], with sigmas of single and of common errors [m]."""
+    """Return priors that constrain points to the altitude `alt` [m], with sigmas of single and of common errors [m]."""
     ground = ground_from_ecef(points[index])
     ground[:, 2] = alt
     return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), sigma, common_sigma)
 
 
 def staying(points: Array, index: IntArray) -> PointPrior:
-    """Return priors that constrain points `index` (Q,) of (P, 3), ECEF [m], each to its present altitude."""
+    """Return priors that constrain points `index` (Q,) of (P, 3), ECEF [m], to their current altitudes."""
     ground = ground_from_ecef(points[index])
     return _heights(ground, index, np.tile([0.0, 0.0, 1.0], (len(index), 1)), _ALTITUDE_SIGMA, 0.0)
 
@@ -128,6 +126,7 @@ def staying(points: Array, index: IntArray) -> PointPrior:
 def _heights(
     foot: Array, index: IntArray, normal: Array, sigma: float, common_sigma: float, span: Array | None = None
 ) -> PointPrior:
+    """Return priors that constrain points to planes through ground points `foot` (Q, 3), with normals (Q, 3) (ENU)."""
     known = np.isfinite(foot[:, 2])
     foot = foot[known]
     rows, common = np.zeros((len(foot), 3, 3)), np.zeros((len(foot), 3, 3))
@@ -173,18 +172,18 @@ class TerrainTest:
     known: int  # tie points with a DEM height
     total: int  # tie points in use
     offset: float  # median of adjusted altitudes minus the DEM [m]; NaN: no DEM height
-    spread: float  # 1.4826 times the median absolute deviation of these [m]
-    bias: float  # standard deviation of its common error [m]
-    sigma: float = np.nan  # standard deviation of single heights, estimated from the tie points [m]; NaN: as stated
-    alike: float = 1.0  # number of correlated heights that weigh as one independent height
+    spread: float  # 1.4826 times their median absolute deviation (NMAD) [m]
+    bias: float  # standard deviation of the DEM's common error [m]
+    sigma: float = np.nan  # standard deviation of single DEM heights, from the tie points [m]; NaN: as stated
+    alike: float = 1.0  # number of (correlated) DEM heights per independent one
     gains: tuple[float, ...] = ()  # weight (0 to 1) of the relief of the DEM at each scale, the finest first
-    relief: float = np.nan  # relief of the DEM over that of the tie points
-    shows: bool = True  # whether this ratio is consistent with 1; else the DEM is of another terrain, and not used
-    agrees: bool = True  # whether the ratio is consistent with 1 for the adjusted tie points
+    relief: float = np.nan  # ratio of the relief of the DEM to that of the tie points
+    shows: bool = True  # whether this ratio can be 1; False: the DEM shows another terrain and is not used
+    agrees: bool = True  # whether it can be 1 after the adjustment, too
     is_known: bool = True  # whether the vertical datum of the DEM is known
     # (3,) offset, and tilts east and north, of the tie points above the DEM before the adjustment [m]
     delivered: tuple[float, ...] = (np.nan,) * 3
-    beyond: tuple[float, ...] = (np.nan,) * 3  # `delivered` over the standard deviations of DEM and cameras
+    beyond: tuple[float, ...] = (np.nan,) * 3  # |`delivered`| over its sigma, by DEM and camera errors
 
 
 @dataclass(frozen=True)
@@ -192,32 +191,32 @@ class PointConstraints:
     """All priors on points: GCPs, reference, DEM, and heights of weak tracks."""
 
     control: tuple[PointPrior, ...]  # GCPs, then a reference if there is one
-    weak: BoolArray  # (P,) points with too small a convergence angle
+    weak: BoolArray  # (P,) points whose convergence angle is too small
     tracks: IntArray  # (T,) points that are tracks
-    alt_range: tuple[float, float]  # altitudes [m] to expect if no other track determines them
+    alt_range: tuple[float, float]  # altitudes [m] of weak tracks if there are few others
     options: AdjustOptions  # `dem_sigma`, `dem_bias_sigma`
     dem: Terrain | None  # None: weak tracks are constrained to the median altitude of the others
-    reference: Reference | None = None  # with heights of the DEM
-    has_control: bool = False  # whether GCPs constrain the position of the scene
-    relief: Relief | None = None  # comparison of the DEM with heights from rays alone
-    placed: PointPrior | None = None  # height priors of tracks from altimetry; these have no other prior
-    # (D + 1,) largest factors on the priors of drifts and turns, estimated from tie points alone; None: no limit
-    widest: tuple[float, ...] | None = None
+    reference: Reference | None = None  # its points have heights of the DEM
+    has_control: bool = False  # whether GCPs are used
+    relief: Relief | None = None  # comparison of the DEM with triangulated heights
+    placed: PointPrior | None = None  # height priors from altimetry; these tracks get no other prior
+    # (D + 1,) upper limits of the factors on the prior sigmas of D drifts and of rotations about the lines of sight
+    widest: tuple[float, ...] | None = None  # estimated without control; None: no limit
 
     def loose(self, sigma: float) -> PointConstraints:
-        """Return the priors with the GCPs loosened to `sigma` [m]."""
+        """Return the priors with a sigma of the GCPs of `sigma` [m]."""
         first = self.control[0]
         rows = enu_basis(ground_from_ecef(first.mean)) / sigma
         return replace(self, control=(replace(first, rows=rows), *self.control[1:]), has_control=False)
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of control beside the tie points: `dem`, `gcps`, `reference`."""
+        """The kinds of control in use: `dem`, `gcps`, `reference`."""
         given = {"dem": self.dem is not None, "gcps": self.has_control, "reference": self.reference is not None}
         return tuple(kind for kind, there in given.items() if there)
 
     def without_control(self, sigma: float) -> PointConstraints:
-        """Return the priors without a DEM, and with GCPs and reference points loosened to `sigma` [m]."""
+        """Return the priors without a DEM, and with `sigma` [m] for GCPs and reference points."""
         control = [
             replace(one, rows=enu_basis(ground_from_ecef(one.mean)) / sigma, common=one.common[..., :0])
             for one in self.control
@@ -234,7 +233,7 @@ class PointConstraints:
         return replace(problem, point_prior=_join_priors([*self.control, self._height_priors(points), self.placed]))
 
     def _weighted_dem(self, points: Array) -> RegularisedDem | None:
-        """Return the DEM weighted by its comparison with the tie points; None without such a comparison."""
+        """Return the DEM weighted by its comparison with the tie points; None: no comparison."""
         if self.relief is None:
             return None
         return believe(self.relief, self.tracks, ground_from_ecef(points[self.tracks]), self.options.dem_sigma)
@@ -244,26 +243,26 @@ class PointConstraints:
 
         The tracks that get a prior depend on the DEM:
 
-        - Accuracy estimated from tie points: all tracks. A DEM of another terrain is ignored, as without a DEM.
+        - Accuracy estimated from tie points: all tracks. (A DEM of another terrain is treated as no DEM.)
         - Accuracy as given: all tracks. With a reference or a comparison, sigma is enlarged for correlated errors.
-        - Not compared with tie points yet: weak tracks.
-        - No DEM: weak tracks. They are constrained to the median altitude of the other tracks, or to the middle of the
-          altitude range.
+        - Still to be compared with the tie points: weak tracks.
+        - No DEM: weak tracks, constrained to the median altitude of the other tracks or, with fewer than ten of
+          these, to the middle of the altitude range.
         """
         weak, weighted = self.weak[self.tracks], self._weighted_dem(points)
-        free = np.ones(len(weak), dtype=bool)
+        without_altimetry = np.ones(len(weak), dtype=bool)
         if self.placed is not None:
-            free = ~np.isin(self.tracks, self.placed.index)
+            without_altimetry = ~np.isin(self.tracks, self.placed.index)
         if weighted is not None and weighted.shows:
             ground = ground_from_ecef(points[self.tracks])
             assert self.relief is not None
             common = self.relief.common_sigma(self._bias)
             prior = _weighted_heights(ground, self.tracks, weighted, common)
-            return prior.select(np.isin(prior.index, self.tracks[free]))
+            return prior.select(np.isin(prior.index, self.tracks[without_altimetry]))
         dem = self.dem if weighted is None else None
         judged_later = self.is_judged and self.relief is None
-        is_whole = dem is not None and not judged_later
-        chosen = free if is_whole else free & weak
+        use_all = dem is not None and not judged_later
+        chosen = without_altimetry if use_all else without_altimetry & weak
         index = self.tracks[chosen]
         if not len(index):
             return None
@@ -281,8 +280,8 @@ class PointConstraints:
         if len(others) >= 10:
             low, middle, high = np.percentile(ground_from_ecef(points[others])[:, 2], [5, 50, 95])
             sigma = high - low
-        # the common sigma is wide, so that the cameras determine the common altitude: the other tracks may be biased,
-        # and the altitude range of an RPC is only a limit
+        # the common sigma is wide: the cameras determine the common altitude, as the altitudes of other tracks may be
+        # biased, and the altitude range of an RPC is only a limit
         return flat_heights(points, index, float(middle), max(float(sigma), _FLAT_SIGMA), highest - lowest)
 
     @property

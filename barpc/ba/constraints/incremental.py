@@ -1,9 +1,9 @@
 """The reduced normal matrix of an adjusted block, as a prior on its views in a later run.
 
-It contains the information of the old tie points, which are not needed again. A run that adds images contains only
-those old views that overlap the new images: `BlockPrior.marginal` eliminates the others. `BlockPrior.joined` updates
-the matrix of all views with the result of the run, new views last. A block that grows image by image thus ends with the
-matrix of one joint adjustment, except for the points of linearisation.
+It contains the information of the old tie points, which are not needed again. A run that adds images has only those
+old views that overlap the new images: `BlockPrior.marginal` eliminates the others. `BlockPrior.joined` updates the
+matrix of all views with the result of the run, and appends the new views. A block that grows image by image thus gets
+the matrix of one joint adjustment, except that parts of it are linearised at earlier states.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from barpc.scene import IntArray
 
 PRIOR_KIND = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
-_LEARNT = ("told", "shown", "written")
-_SCENE = ("by_unknown", "own", "radius")
+_OPTIONAL = ("told", "shown", "written")
+_SCENE_FIELDS = ("by_unknown", "own", "radius")
 _FACTOR_BYTES = 1e8  # bytes of the factor of a whole block to keep in memory; the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """The whole block of a marginal prior, and how to solve with it."""
+    """The whole block from which a marginal prior was derived, and a function that solves with its matrix."""
 
-    block: BlockPrior  # with all views
+    block: BlockPrior  # prior with all views
     index: IntArray  # (m q,) the unknowns of the views that were not eliminated
     solve: Callable[[Array], Array]  # (n q,) or (n q, k) right-hand sides -> solutions with the whole matrix
 
@@ -51,27 +51,28 @@ class BlockPrior:
     names : tuple of str
         The n views of the block that were not fixed.
     model, drift : str, int
-        The unknowns (see `AdjustOptions`).
+        Camera model and degree of the drift (see `AdjustOptions`).
     params : (n, q)
-        Their values.
+        Values of the unknowns.
     information : (n q, n q), array or Blocks
-        Their joint information (reduced normal matrix), priors included.
+        Joint information on the unknowns (reduced normal matrix), priors included.
     center : (n, 3)
         Camera centres [m], ECEF.
     less : (m, n q)
-        B^T B is to be subtracted from a sparse `information`: it is that of common errors of heights.
+        B, only with a sparse `information`: the joint information is `information` - B^T B. B stems from common errors
+        of heights.
     layout : AdditionalParameters or None
         Layout of the additional parameters in the images; None: there are none.
     scene : EarlierScene or None
-        Motions of the scene by the camera unknowns; None: they are not known.
+        Dependence of the scene's motions on the camera unknowns; None: unknown.
     told : (n,) or None
-        Information of tie points on each view, without the limit by errors common to a view [1/px^2].
+        Information of the tie points of each view [1/px^2], not limited by the common error of the view.
     shown : (4 + drift, 2) or None
-        Sums of corrections that estimate the camera priors (`barpc.ba.robust.variances.Variances.shown`).
+        Sums over corrections, to estimate the camera priors (`barpc.ba.robust.variances.Variances.shown`).
     rest : Rest or None
-        The whole block, of which this is a `marginal`.
+        The whole block, if this prior is a `marginal`.
     written : (n, q) or None
-        Values that the written cameras have; None: `params`.
+        Values of the unknowns in the written camera files; None: `params`.
     """
 
     names: tuple[str, ...]
@@ -90,11 +91,11 @@ class BlockPrior:
 
     @property
     def as_written(self) -> Array:
-        """Values (n, q) that the written cameras have."""
+        """Values (n, q) of the unknowns in the written camera files."""
         return self.params if self.written is None else self.written
 
     def waves(self, names: tuple[str, ...]) -> AdditionalParameters | None:
-        """Return the additional parameters for views of a later run; a new view has splines alone."""
+        """Return the additional parameters for the views `names` of a later run; a new view has only splines."""
         if not self._layout.size:
             return None
         place = {name: i for i, name in enumerate(self.names)}
@@ -113,8 +114,8 @@ class BlockPrior:
             arrays |= {name: getattr(self.information, name) for name in _SPARSE_ARRAYS}
             arrays["less"] = np.zeros((0, self.params.size)) if self.less is None else self.less
         if self.scene is not None:
-            arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE}
-        arrays |= {name: array for name in _LEARNT if (array := getattr(self, name)) is not None}
+            arrays |= {f"scene_{name}": np.asarray(getattr(self.scene, name)) for name in _SCENE_FIELDS}
+        arrays |= {name: array for name in _OPTIONAL if (array := getattr(self, name)) is not None}
         with Path(path).open("wb") as file:
             np.savez(  # uncompressed: compression saves a tenth
                 file,
@@ -132,7 +133,7 @@ class BlockPrior:
         Raises
         ------
         InputError
-            The file is missing or holds something else.
+            The file is missing or is not such a prior.
         """
         file = load_npz(path, PRIOR_KIND)
         try:
@@ -145,18 +146,18 @@ class BlockPrior:
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             scene = None
             if "scene_radius" in file:
-                by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE)
+                by_unknown, own, radius = (file[f"scene_{name}"] for name in _SCENE_FIELDS)
                 scene = EarlierScene(by_unknown, own, float(radius))
             learnt = file.get("told"), file.get("shown")
             prior = cls(names, *known, layout, scene, *learnt, written=file.get("written"))
         except (KeyError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError) as error:
             raise InputError(f"{path}: not the prior of an adjusted block ({plain(error)})") from error
-        if not prior._is_whole():
+        if not prior._is_valid():
             raise InputError(f"{path}: not the prior of an adjusted block (its arrays do not go together)")
         return prior
 
-    def _is_whole(self) -> bool:
-        """Return whether all arrays have consistent shapes, and valid values."""
+    def _is_valid(self) -> bool:
+        """Return whether all arrays have consistent shapes and valid values."""
         n, q = len(self.names), self.params.shape[-1] if self.params.ndim else 0
         shapes: dict[str, tuple[int, ...]] = {"params": (n, q), "information": (n * q, n * q), "center": (n, 3)}
         arrays = {name: getattr(self, name) for name in shapes}
@@ -172,30 +173,30 @@ class BlockPrior:
             and len(set(self.names)) == n
             and all(arrays[name].shape == shape for name, shape in shapes.items())
             and all(array.dtype == np.float64 for array in arrays.values())
-            and all(_is_square_finite(array) for array in arrays.values())
+            and all(_is_bounded(array) for array in arrays.values())
             and bool((diagonal > 0).all())
             and self._layout.is_whole(n, q)
             and (self.written is None or (self.written.shape == (n, q) and bool(np.isfinite(self.written).all())))
             and (self.scene is None or _is_scene(self.scene, n * q))
-            and (self.told is None or (self.told.shape == (n,) and _is_counted(self.told)))
-            and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_counted(self.shown)))
-            and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_square_finite(self.less)))
+            and (self.told is None or (self.told.shape == (n,) and _is_nonnegative(self.told)))
+            and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_nonnegative(self.shown)))
+            and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_bounded(self.less)))
         )
 
     def dense(self) -> Array:
-        """Return the information matrix (n q, n q) as an array."""
+        """Return the information matrix (n q, n q) as a dense array."""
         if isinstance(self.information, np.ndarray):
             return self.information
         matrix = self.information.plain()
         return matrix if self.less is None else np.asarray(matrix - self.less.T @ self.less)
 
     def marginal(self, names: Collection[str]) -> BlockPrior:
-        """Return the marginal prior on some of its views, in its order: the others are eliminated.
+        """Return the marginal prior on the views among `names`, in the order of this prior: the others are eliminated.
 
         Raises
         ------
         InputError
-            None of the views is among the names, or the matrix is damaged.
+            None of the views is in the block, or the matrix is damaged.
         """
         wanted = set(names)
         views = np.array([i for i, name in enumerate(self.names) if name in wanted], dtype=np.int64)
@@ -205,7 +206,7 @@ class BlockPrior:
             rest, information = self._eliminated(views)
         except la.LinAlgError as error:
             raise InputError(f"the earlier block's information is damaged ({plain(error)})") from error
-        left, scene = [self.names[i] for i in views], self.scene
+        kept, scene = [self.names[i] for i in views], self.scene
         if scene is not None:
             moves = rest.solve(scene.by_unknown.T)
             by_unknown = moves[rest.index].T @ information
@@ -213,7 +214,7 @@ class BlockPrior:
             scene = EarlierScene(by_unknown, own, scene.radius)
         return replace(
             self,
-            names=tuple(left),
+            names=tuple(kept),
             params=self.params[views],
             information=information,
             center=self.center[views],
@@ -226,7 +227,7 @@ class BlockPrior:
         )
 
     def _eliminated(self, views: IntArray) -> tuple[Rest, Array]:
-        """Return the whole block, and the marginal information (m q, m q) on views (m,)."""
+        """Eliminate all but the views (m,); return the whole block, and the marginal information (m q, m q) on them."""
         n, q = self.params.shape
         blocks = self.information if isinstance(self.information, Blocks) else Blocks.of(self.information, q)
         order = dissect(blocks.pair_view, self.center[:, :2], np.ones(n, dtype=bool), views)
@@ -236,19 +237,19 @@ class BlockPrior:
         if self.less is None or not len(self.less):
             return Rest(self, index, cholesky.solve), information
         root, _ = woodbury(cholesky.solve, self.less)
-        held = information @ root[index]
-        information -= held @ np.linalg.solve(np.eye(held.shape[1]) + root[index].T @ held, held.T)
+        product = information @ root[index]
+        information -= product @ np.linalg.solve(np.eye(product.shape[1]) + root[index].T @ product, product.T)
         return Rest(self, index, lambda b: cholesky.solve(b) + root @ (root.T @ b)), information
 
     def joined(self, later: BlockPrior) -> BlockPrior:
-        """Return the prior of the whole block, updated by a later run with some of its views and new ones.
+        """Return the prior of the whole block, updated by a later run with some of its views and with new ones.
 
-        Old views without new tie points move with their neighbours, as their covariance says.
+        Old views outside the later run change with their neighbours, by their covariance with these.
 
         Parameters
         ----------
         later : BlockPrior
-            Prior of the later run, which contains the information of this one, a `marginal`.
+            Prior of the later run. It contains the information of this prior, which is a `marginal`.
         """
         assert self.rest is not None
         whole, q = self.rest.block, self.params.shape[1]
@@ -256,21 +257,21 @@ class BlockPrior:
         at = np.array([own.get(name, -1) for name in later.names])
         known, new = np.flatnonzero(at >= 0), np.flatnonzero(at < 0)
         # information of the later run beyond its prior
-        more = later.dense().copy()
+        added = later.dense().copy()
         there, here = unknowns_of(known, q), unknowns_of(at[known], q)
-        more[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
-        moved = np.zeros_like(self.params)
-        moved[at[known]] = later.params[known] - self.params[at[known]]
+        added[np.ix_(there, there)] -= self.dense()[np.ix_(here, here)]
+        change = np.zeros_like(self.params)
+        change[at[known]] = later.params[known] - self.params[at[known]]
         pull = np.zeros(whole.params.size)
-        pull[self.rest.index] = self.dense() @ moved.ravel()
+        pull[self.rest.index] = self.dense() @ change.ravel()
         params = whole.params + self.rest.solve(pull).reshape(whole.params.shape)
         old, count = self.rest.index[::q] // q, len(whole.names)
         params[old[at[known]]] = later.params[known]
         place = np.empty(len(later.names), dtype=np.int64)
         place[known], place[new] = old[at[known]], count + np.arange(len(new))
-        scene, wider = whole.scene, len(new) * q
+        scene, num_new = whole.scene, len(new) * q
         if scene is not None:
-            scene = replace(scene, by_unknown=np.pad(scene.by_unknown, ((0, 0), (0, wider))))
+            scene = replace(scene, by_unknown=np.pad(scene.by_unknown, ((0, 0), (0, num_new))))
         names, told = tuple(later.names[i] for i in new), None
         if whole.told is not None and later.told is not None:
             told = np.concatenate([whole.told, later.told[new]])
@@ -278,9 +279,9 @@ class BlockPrior:
             whole,
             names=(*whole.names, *names),
             params=np.concatenate([params, later.params[new]]),
-            information=_extended(whole, more, place, len(new)),
+            information=_extended(whole, added, place, len(new)),
             center=np.concatenate([whole.center, later.center[new]]),
-            less=np.pad(np.zeros((0, whole.params.size)) if whole.less is None else whole.less, ((0, 0), (0, wider))),
+            less=np.pad(np.zeros((0, whole.params.size)) if whole.less is None else whole.less, ((0, 0), (0, num_new))),
             layout=whole._layout.joined(later._layout.select(new)),
             scene=scene,
             told=told,
@@ -290,7 +291,7 @@ class BlockPrior:
 
 
 def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Blocks:
-    """Return the information with `new` views appended, and `more` (m q, m q) on the views `place` (m,) added."""
+    """Return the information with `new` views appended, plus `more` (m q, m q) for the views `place` (m,)."""
     q, count = whole.params.shape[1], len(whole.names) + new
     blocks = whole.information if isinstance(whole.information, Blocks) else Blocks.of(whole.information, q)
     of_views = more.reshape(len(place), q, len(place), q)
@@ -310,23 +311,23 @@ def _is_scene(scene: EarlierScene, size: int) -> bool:
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (
         tuple(array.shape for array in arrays) == ((count, size), (count, count))
-        and all(array.dtype == np.float64 and _is_square_finite(array) for array in arrays)
+        and all(array.dtype == np.float64 and _is_bounded(array) for array in arrays)
         and 0.0 < scene.radius <= MAX_NUMBER
     )
 
 
-def _is_square_finite(array: Array) -> bool:
-    """Return whether the squares of all numbers are finite."""
+def _is_bounded(array: Array) -> bool:
+    """Return whether all numbers are at most `MAX_NUMBER`, so that their squares are finite."""
     return bool(not array.size or (array.min() >= -MAX_NUMBER and array.max() <= MAX_NUMBER))
 
 
-def _is_counted(array: Array) -> bool:
-    """Return whether all numbers are finite, and none is negative."""
-    return array.dtype == np.float64 and _is_square_finite(array) and bool((array >= 0.0).all())
+def _is_nonnegative(array: Array) -> bool:
+    """Return whether all numbers are finite and none is negative."""
+    return array.dtype == np.float64 and _is_bounded(array) and bool((array >= 0.0).all())
 
 
 def _read_blocks(file: Mapping[str, Array], n: int) -> Blocks:
-    """Return the blocks of a file of `save`."""
+    """Return the sparse matrix of n views in a file that `save` wrote."""
     pairs: IntArray = np.asarray(file["pair_view"])
     blocks = Blocks(file["diagonal"], file["pairs"], pairs)
     if not (pairs.ndim == 2 and pairs.shape[1] == 2 and pairs.dtype == np.int64):
@@ -338,7 +339,7 @@ def _read_blocks(file: Mapping[str, Array], n: int) -> Blocks:
 
 
 def _are_indices(numbers: Array | IntArray, most: int) -> bool:
-    """Return whether all are integers from 0 to `most`."""
+    """Return whether all numbers are integers from 0 to `most`."""
     return bool(numbers.ndim == 1 and numbers.dtype.kind in "iu" and ((numbers >= 0) & (numbers <= most)).all())
 
 
@@ -349,7 +350,7 @@ def apply_prior(
     drift: int,
     cameras: CameraPrior,
 ) -> tuple[CameraPrior, JointPrior]:
-    """Return the priors of a run that continues an earlier block: a joint prior replaces those of the old views.
+    """Return the priors of a run that continues an earlier block: a joint prior replaces the priors of the old views.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Registration of the surface of the tie points to given heights (altimetry).
 
-A quadratic patch is fitted to the neighbours of each tie point, with its covariance and the scatter of the ground about
-it. The patch of the nearest tie point predicts a given height, and its slopes give the derivative of the prediction by
-motions of the surface. Slopes are uncertain: the information of their errors is subtracted from the normal matrix
+A quadratic patch is fitted to the neighbours of each tie point, with its covariance and its residual scatter. The patch
+of the nearest tie point predicts a given height. The slopes of the patch give the derivatives of the prediction by
+motions of the surface. Slopes have errors, whose expected contribution is subtracted from the normal matrix
 (errors-in-variables regression: Fuller, "Measurement error models", 1987).
 """
 
@@ -32,25 +32,25 @@ from barpc.base.statistics import (
 from barpc.scene import BoolArray, IntArray
 
 PATCH_POINTS = 15  # tie points of a patch: six unknowns, nine redundant
-_MIN_RELIEF = 0.01  # m: least scatter of the ground; smaller motions end the iteration
+_MIN_RELIEF = 0.01  # m: least scatter about a patch; also, a smaller change of the motion ends the iteration
 _SIDE = 25  # trial shifts along each axis of the search
-_MIN_SLOPE_SHARE = 0.2  # of the information by slopes, without that of their errors: below, a motion is not determined
+_MIN_SLOPE_SHARE = 0.2  # least share of the information on a motion that is not due to errors of slopes
 
 
 @dataclass(frozen=True)
 class TieSurface:
-    """Quadratic patches around tie points, in a local frame (east, north, up) about their middle.
+    """Quadratic patches around P tie points, in a local frame (east, north, up) about their middle.
 
-    Coefficients of a patch multiply 1, u, v, u^2, u v, v^2, with east and north u, v in units of its reach.
+    Coefficients multiply 1, u, v, u^2, u v, v^2: u and v are east and north of the tie point, in units of `reach`.
     """
 
     points: Array  # (P, 3) [m]
-    patch: Array  # (P, 6) [m]
-    covariance: Array  # (P, 6, 6) [m^2]
+    patch: Array  # (P, 6) coefficients [m]
+    covariance: Array  # (P, 6, 6) covariance of the coefficients [m^2]
     scatter: Array  # (P,) standard deviation of the ground about the patch [m]
     reach: Array  # (P,) distance of the farthest neighbour of the patch [m]
-    whole: BoolArray  # (P,) whether the scatter of the patch is usual: not at edges of houses and cliffs
-    tree: Any  # of the horizontal positions
+    whole: BoolArray  # (P,) whether the scatter is not unusually large (as at edges of houses and cliffs)
+    tree: Any  # k-d tree of the horizontal positions
 
     @classmethod
     def of(cls, points: Array) -> TieSurface:
@@ -59,7 +59,7 @@ class TieSurface:
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=PATCH_POINTS))
         reach = np.maximum(distance[:, -1], 1e-3)
         delta = points[near] - points[:, None]
-        design = _powers(delta[..., :2] / reach[:, None, None])
+        design = _monomials(delta[..., :2] / reach[:, None, None])
         normal, terms = np.swapaxes(design, 1, 2) @ design, design.shape[-1]
         freedom = PATCH_POINTS - terms
         inverse = np.linalg.inv(normal + RIDGE * np.eye(terms))
@@ -79,45 +79,45 @@ class TieSurface:
         )
 
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
-        """Return the height (n,) at positions (n, 2), the tie point (n,) of the patch, and its validity (n,) there."""
+        """Return heights (n,) at positions (n, 2), the nearest tie points (n,), and if their patches are valid."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
-        design = _powers(self._from(place, nearest))
+        design = _monomials(self._relative(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
         return (design * self.patch[nearest]).sum(axis=1), nearest, near
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
-        """Return the variance (n,) [m^2] of ground heights predicted by the patches at positions (n, 2)."""
-        design = _powers(self._from(place, nearest))
+        """Return the variance (n,) [m^2] of ground heights predicted by patches at positions (n, 2)."""
+        design = _monomials(self._relative(place, nearest))
         of_patch = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
         return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
     def slope(self, place: Array, nearest: IntArray) -> tuple[Array, Array]:
         """Return the slopes (n, 2) to the east and north at positions (n, 2), and their covariance (n, 2, 2)."""
-        u, v = self._from(place, nearest).T
+        u, v = self._relative(place, nearest).T
         zero, one = np.zeros_like(u), np.ones_like(u)
         rates = np.array([[zero, one, zero, 2.0 * u, v, zero], [zero, zero, one, zero, u, 2.0 * v]])
         rates = rates.transpose(2, 0, 1) / self.reach[nearest, None, None]
         covariance = rates @ self.covariance[nearest] @ np.swapaxes(rates, 1, 2)
         return np.einsum("nci,ni->nc", rates, self.patch[nearest]), covariance
 
-    def _from(self, place: Array, nearest: IntArray) -> Array:
-        """Return the positions relative to the tie points, in units of the reach of their patches."""
+    def _relative(self, place: Array, nearest: IntArray) -> Array:
+        """Return the positions relative to the tie points `nearest`, in units of their reach, within +-1."""
         away = (place - self.points[nearest, :2]) / self.reach[nearest, None]
         return np.asarray(np.clip(away, -1.0, 1.0))
 
 
-def _powers(away: Array) -> Array:
+def _monomials(away: Array) -> Array:
     u, v = away[..., 0], away[..., 1]
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
 @dataclass(frozen=True)
 class GivenHeights:
-    """Given heights, in the frame of a surface."""
+    """Given heights, in the frame of a `TieSurface`."""
 
     place: Array  # (n, 3) east, north, up [m]
-    sigma: Array  # (n,) of the height [m]
-    sigma_flat: Array  # (n,) of the horizontal position, along each axis [m]
+    sigma: Array  # (n,) standard deviation of the height [m]
+    sigma_flat: Array  # (n,) standard deviation of the horizontal position along each axis [m]
 
     def select(self, keep: BoolArray) -> GivenHeights:
         """Return the heights of a mask (n,)."""
@@ -126,26 +126,26 @@ class GivenHeights:
 
 @dataclass(frozen=True)
 class Registration:
-    """The motion that registers a surface to given heights, and their agreement with it."""
+    """The motion that registers a surface to n given heights, and the agreement of these."""
 
     motion: Array  # (7,) east, north, up, tilts, turn, scale [m], as `barpc.ba.constraints.gauge.MOTIONS`
-    covariance: Array  # (7, 7) of it, with a prior wider by `TIMES` than `before` of `register`
-    near: BoolArray  # (n,) heights on valid patches of the surface
-    agree: BoolArray  # (n,) inliers among these
-    residual: Array  # (n,) given minus moved surface [m]; NaN: no surface
-    sigma: Array  # (n,) its standard deviation as stated [m]
-    rivals: int  # largest number of outliers that agree on another level
+    covariance: Array  # (7, 7) of the motion, with a prior `TIMES` wider than `before` in `register` [m^2]
+    near: BoolArray  # (n,) heights at valid patches of the surface
+    agree: BoolArray  # (n,) inliers among them
+    residual: Array  # (n,) given height minus moved surface [m]; NaN: no valid patch
+    sigma: Array  # (n,) a-priori standard deviation of the residual [m]
+    rivals: int  # largest number of outliers with about the same residual
 
     @property
     def share(self) -> float:
-        """Share of inliers among the heights on the surface, 0 to 1."""
+        """Fraction of inliers among the heights at valid patches, 0 to 1."""
         return float(self.agree.sum() / max(self.near.sum(), 1))
 
     @property
     def is_most(self) -> bool:
-        """Whether the inliers may be the majority, and outnumber `rivals` by two standard deviations of a count.
+        """Whether the inliers can be the majority and are significantly more than `rivals` (two standard deviations).
 
-        With half of n heights right, the number of inliers may fall sqrt(n) below one half.
+        The number of inliers may be sqrt(n) below n / 2 by chance: two standard deviations of a count.
         """
         agree, count = int(self.agree.sum()), int(self.near.sum())
         clearly = agree - self.rivals > 2.0 * np.sqrt(agree + self.rivals)
@@ -164,10 +164,10 @@ def displacement(local: Array) -> Array:
 
 
 def register(surface: TieSurface, given: GivenHeights, radius: float, before: Array) -> Registration:
-    """Register a surface to heights of which the majority is right.
+    """Register a surface, of a scene of `radius` [m], to given heights, most of which are right.
 
     `before` (7,) [m] are the standard deviations of the motions without these heights. They limit the search, and
-    motions that the heights do not determine keep a covariance of that size.
+    `TIMES` wider they are a prior for motions that the heights do not determine.
     """
     free = np.diag((TIMES * before) ** -2)
     motion, noise = _converged_motion(surface, given, search_shift(surface, given, before), radius, free)
@@ -179,7 +179,7 @@ def register(surface: TieSurface, given: GivenHeights, radius: float, before: Ar
 def _converged_motion(
     surface: TieSurface, given: GivenHeights, motion: Array, radius: float, free: Array, noise: float | None = None
 ) -> tuple[Array, float]:
-    """Return the motion (7,) by reweighted least squares, and the noise over the stated one (estimated if None)."""
+    """Return the motion (7,) by reweighted least squares, and the ratio of observed to stated noise (`noise`)."""
     is_known, noise = noise is not None, SURELY if noise is None else noise
     for step in range(ITERATIONS):
         seen = _SurfaceMisfit.of(surface, given, motion, radius)
@@ -203,12 +203,12 @@ def _converged_motion(
 def _jackknife(
     surface: TieSurface, given: GivenHeights, found: Registration, radius: float, noise: float, free: Array
 ) -> Array:
-    """Return factors (7,) on the standard deviations by the delete-a-group jackknife.
+    """Return factors (7,) on the standard deviations, from the delete-a-group jackknife.
 
-    Near roofs and trees the nearest patch changes with the motion, which the linearised covariance does not contain
+    Near roofs and trees the nearest patch changes with the motion; the linearised covariance neglects this
     (Shao and Tu, "The Jackknife and Bootstrap", 1995).
     """
-    group, wider = _scene_parts(given.place[:, :2], found.near), np.ones(len(free))
+    group, wider = _grid_cells(given.place[:, :2], found.near), np.ones(len(free))
     count = int(group.max(initial=-1)) + 1
     if count < FEWEST:
         return wider
@@ -225,12 +225,12 @@ def _jackknife(
     return wider
 
 
-def _scene_parts(place: Array, near: BoolArray) -> IntArray:
-    """Return the index (n,) of the square, of about twenty of a scene, of each position (n, 2); -1: not `near`."""
+def _grid_cells(place: Array, near: BoolArray) -> IntArray:
+    """Return the index (n,) of the grid cell (of at least `FEWEST` in use) of each position (n, 2); -1: not `near`."""
     group, number = np.full(len(place), -1), np.zeros(0, dtype=np.int64)
     at = place[near]
     size = float(np.ptp(at, axis=0).max()) if len(at) else 0.0
-    while size > 0.0 and number.max(initial=0) + 1 < min(FEWEST, len(at)):  # of tracks most are empty
+    while size > 0.0 and number.max(initial=0) + 1 < min(FEWEST, len(at)):  # altimetry tracks leave most cells empty
         size /= np.sqrt(2.0)
         cell = np.floor((at - at.min(axis=0)) / size).astype(np.int64)
         number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
@@ -243,12 +243,12 @@ class _SurfaceMisfit:
     """Residuals of given heights against a moved surface, with derivatives."""
 
     residual: Array  # (n,) given minus predicted [m]
-    sigma: Array  # (n,) [m]
-    rows: Array  # (n, 7) derivative of the prediction by the motions
-    near: BoolArray  # (n,) heights on valid patches
+    sigma: Array  # (n,) standard deviation of the residual [m]
+    rows: Array  # (n, 7) derivatives of the prediction by the motions
+    near: BoolArray  # (n,) heights at valid patches
     nearest: IntArray  # (n,) tie points of the patches
-    moves: Array  # (n, 3, 7) of `displacement`
-    doubt: Array  # (n, 2, 2) covariance of the slopes
+    moves: Array  # (n, 3, 7) result of `displacement`
+    slope_covariance: Array  # (n, 2, 2)
 
     @classmethod
     def of(cls, surface: TieSurface, given: GivenHeights, motion: Array, radius: float) -> _SurfaceMisfit:
@@ -256,18 +256,19 @@ class _SurfaceMisfit:
         moved = moves @ motion
         place = given.place[:, :2] - moved[:, :2]
         height, nearest, near = surface.at(place)
-        slope, doubt = surface.slope(place, nearest)
+        slope, slope_covariance = surface.slope(place, nearest)
         variance = surface.variance(place, nearest) + given.sigma**2
         variance += (slope**2).sum(axis=1) * given.sigma_flat**2
         normal = np.column_stack([-slope, np.ones(len(slope))])
         rows = np.einsum("nc,ncm->nm", normal, moves)
-        return cls(given.place[:, 2] - height - moved[:, 2], np.sqrt(variance), rows, near, nearest, moves, doubt)
+        residual = given.place[:, 2] - height - moved[:, 2]
+        return cls(residual, np.sqrt(variance), rows, near, nearest, moves, slope_covariance)
 
 
 def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Array:
-    """Return the shift (7,) [m] with most inliers, by a grid search within four of `before` (7,) [m] east and north.
+    """Return the shift with most inliers as a motion (7,) [m]; a grid search within `CRITICAL` times `before`.
 
-    Its tilts, turn and scale are 0; all are 0 if no height is on the surface.
+    Its tilts, turn and scale are 0. All is 0 if no height is at a valid patch.
     """
     few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
     first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
@@ -298,47 +299,47 @@ def registration_at(
 ) -> Registration:
     """Return the registration at a motion (7,) [m], with the covariance of an M-estimate and the inliers.
 
-    `radius` [m] is that of the scene, `noise` the observed over the stated standard deviation, `free` (7, 7) [1/m^2]
-    the prior information on the motion; LinAlgError where that is not positive definite.
+    `radius` [m] is that of the scene, `noise` the ratio of observed to stated noise, `free` (7, 7) [1/m^2] the prior
+    information on the motion. Raises LinAlgError if that is not positive definite.
     """
     seen = _SurfaceMisfit.of(surface, given, motion, radius)
     scale = min(max(noise, 1.0), SURELY)
     agree = seen.near & (np.abs(seen.residual) < SURELY * scale * seen.sigma)
     residual = np.where(seen.near, seen.residual, np.nan)
-    # M-estimate (Huber, "Robust statistics", 1981, 7.6), with the loss of efficiency by wrong heights
+    # M-estimate (Huber, "Robust statistics", 1981, 7.6): `rate`, the mean derivative of psi, is the efficiency
     part = np.where(seen.near, seen.residual / (BIWEIGHT * scale * seen.sigma), 1.0) ** 2
     inside = part < 1.0
     rate = np.where(inside, (1.0 - part) * (1.0 - 5.0 * part), 0.0)[inside].mean() if inside.any() else 0.0
     rows, inverse = seen.rows[inside], max(float(rate), _MIN_SLOPE_SHARE) / (scale * seen.sigma[inside]) ** 2
-    pull = (1.0 - part[inside]) ** 2 * seen.residual[inside] / (scale * seen.sigma[inside])
-    forms = rows * (pull / (scale * seen.sigma[inside]))[:, None]
+    psi = (1.0 - part[inside]) ** 2 * seen.residual[inside] / (scale * seen.sigma[inside])
+    gradients = rows * (psi / (scale * seen.sigma[inside]))[:, None]
     normal = (rows * inverse[:, None]).T @ rows
     slopes = np.zeros((len(rows), 3, 3))
-    slopes[:, :2, :2] = seen.doubt[inside]
+    slopes[:, :2, :2] = seen.slope_covariance[inside]
     moves = seen.moves[inside]
-    doubt = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
-    alone = forms.T @ forms
-    group = _inflation(given.place[inside], forms, np.diag(alone), surface)
-    # eigenvectors of the corrected information in units of the uncorrected one, with eigenvalues `ratio`
+    by_slope_errors = np.einsum("n,ncm,ncd,ndk->mk", inverse, moves, slopes, moves)
+    independent = gradients.T @ gradients
+    inflation = _inflation(given.place[inside], gradients, np.diag(independent), surface)
+    # generalised eigenvectors and eigenvalues of the corrected information relative to the uncorrected one
     root = np.linalg.cholesky(normal + free)
     half = np.linalg.inv(root)
-    ratio, axes = np.linalg.eigh(half @ (normal - doubt + free) @ half.T)
+    ratio, axes = np.linalg.eigh(half @ (normal - by_slope_errors + free) @ half.T)
     ratio = np.maximum(ratio, 0.0)
     axes = half.T @ axes
-    meat = axes.T @ (group[:, None] * alone * group[None, :] + free) @ axes
+    meat = axes.T @ (inflation[:, None] * independent * inflation[None, :] + free) @ axes
     known = np.where(ratio > _MIN_SLOPE_SHARE, 1.0 / np.maximum(ratio, _MIN_SLOPE_SHARE), 0.0)
     covariance = axes @ (known[:, None] * meat * known) @ axes.T
-    lost = axes[:, ratio <= _MIN_SLOPE_SHARE]
-    covariance += lost @ lost.T / _MIN_SLOPE_SHARE**2 if lost.size else 0.0
-    open_ = np.linalg.inv(free)
-    covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * open_) + free)
+    undetermined = axes[:, ratio <= _MIN_SLOPE_SHARE]
+    covariance += undetermined @ undetermined.T / _MIN_SLOPE_SHARE**2 if undetermined.size else 0.0
+    prior_covariance = np.linalg.inv(free)
+    covariance = np.linalg.inv(np.linalg.inv(covariance + 1e-12 * prior_covariance) + free)
     covariance = np.asarray(covariance, dtype=np.float64)
-    rivals = _disagreeing_count(seen, agree, scale)
+    rivals = _largest_rival(seen, agree, scale)
     return Registration(motion, covariance, seen.near, agree, residual, seen.sigma, rivals)
 
 
-def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> int:
-    """Return the largest number of outliers with equal residuals, within the noise."""
+def _largest_rival(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> int:
+    """Return the largest number of outliers whose residuals are equal within the noise."""
     others = seen.near & ~agree
     off = np.sort(seen.residual[others])
     if not len(off):
@@ -347,22 +348,22 @@ def _disagreeing_count(seen: _SurfaceMisfit, agree: BoolArray, scale: float) -> 
     return int((np.searchsorted(off, off + width) - np.arange(len(off))).max())
 
 
-def _inflation(place: Array, forms: Array, alone: Array, surface: TieSurface) -> Array:
+def _inflation(place: Array, gradients: Array, independent: Array, surface: TieSurface) -> Array:
     """Return factors (7,) on the standard deviations for correlated errors: a sandwich estimate over growing cells.
 
-    `forms` (n, 7) are the gradients of the heights by the motions, `alone` (7,) the variances of their sums if
-    independent.
+    `gradients` (n, 7) are those of the cost, one per height. `independent` (7,) are the variances of their sums if they
+    are independent.
     """
-    size, most = 2.0 * float(np.median(surface.reach)), np.ones(7)
+    size, factors = 2.0 * float(np.median(surface.reach)), np.ones(7)
     while True:
         cell = np.floor(place[:, :2] / size).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         count = int(group.max(initial=-1)) + 1
         if count < FEWEST:
-            return most
-        sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in forms.T], axis=1)
-        ratio = (sums**2).sum(axis=0) / np.maximum(alone, 1e-300) * count / (count - 7.0)  # seven are fitted
+            return factors
+        sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in gradients.T], axis=1)
+        ratio = (sums**2).sum(axis=0) / np.maximum(independent, 1e-300) * count / (count - 7.0)  # seven are fitted
         up, flat = [2, 3, 4], [0, 1, 5, 6]
         for part in (up, flat):
-            most[part] = np.maximum(most[part], np.sqrt(ratio[part].mean()))
+            factors[part] = np.maximum(factors[part], np.sqrt(ratio[part].mean()))
         size *= 2.0

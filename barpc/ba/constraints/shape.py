@@ -1,8 +1,8 @@
-"""Deformations of images by corrections: displacements of the corners of an image against each other.
+"""Deformations of images by corrections: displacements of the corners of an image relative to each other.
 
-The place of a camera is known to metres, its shape to centimetres. A deformation of many standard deviations of its
-prior is real where tie points show it. Control alone (a DEM of another terrain) causes it where tie points do not
-determine it, as a drift of two images about their base.
+The position of an image on the ground is given to metres, its shape to centimetres. A deformation of many prior
+standard deviations is real if the tie points determine it. They do not always: a drift of two images about their base
+is free. Wrong control (a DEM of another terrain) may then cause it.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.scene import View
 from barpc.sensor.rpc import localize_stack
 
-MOST_SIGMAS = 5.0  # standard deviations of its prior by which control alone may change an image's shape
+MOST_SIGMAS = 5.0  # largest deformation of an image by control alone, in prior standard deviations
 _CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Deformation:
-    """A deformation of an image by control, which tie points do not show."""
+    """A deformation of an image that control causes and the tie points do not confirm."""
 
     view: int
-    sigmas: float  # largest displacement of a corner against the others, over its prior's standard deviation
+    sigmas: float  # largest displacement of a corner relative to the mean of all, over its prior sigma
     px: float  # the same displacement [px]
     control: tuple[str, ...]  # kinds of control of the block
 
 
 def shape_change(problem: Problem, params: Array, views: Sequence[View]) -> tuple[Array, Array]:
-    """Return the deformation of each image by its unknowns, in standard deviations of its prior and in pixels.
+    """Return the deformation of each image by its unknowns, in prior standard deviations and in pixels.
 
     Parameters
     ----------
     problem : Problem
-        With the priors as they were given.
+        With the priors as given, not widened.
     params : (N, q)
     views : sequence of N views
 
     Returns
     -------
     sigmas, px : (N,)
-        Largest displacement of a corner of an image less the mean of all four. Additional parameters, which tie points
-        determine, are left out.
+        Largest displacement of a corner of an image minus the mean of all four. Additional parameters are excluded:
+        tie points determine them.
     """
     unknowns, count = problem.cameras.unknowns, len(views)
     corners = unknowns.middle.T[:, None] + unknowns.half.T[:, None] * _CORNERS

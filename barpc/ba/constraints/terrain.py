@@ -1,8 +1,8 @@
-"""The weight of a DEM as a constraint: scale by scale, as far as the heights of the tie points confirm its relief.
+"""The weight of a DEM as a constraint, for each spatial scale: as far as tie-point heights confirm its relief.
 
-A DEM is h = t + e, terrain and errors. If errors at fine scales were taken for terrain, least squares would shift the
-scene to where they happen to fit. Therefore points are constrained to the best linear estimate of the terrain: the sum
-of gain x band over bands of spatial scales, gain = var t / (var t + var e). The gains are estimated by a regression of
+A DEM is h = t + e, terrain plus errors. If its errors at fine scales counted as terrain, least squares would shift the
+scene until they fit by chance. Therefore points are constrained to the best linear estimate of the terrain: the sum of
+gain x band over bands of spatial scales, gain = var t / (var t + var e). The gains are estimated by a regression of
 the heights of the tie points on the bands (regression calibration: Carroll, Ruppert, Stefanski, Crainiceanu,
 Measurement Error in Nonlinear Models, 2006, chapter 4). Its residuals give the standard deviation of single heights,
 and their correlation.
@@ -28,19 +28,19 @@ from barpc.base.statistics import (
 from barpc.scene import BoolArray, IntArray
 from barpc.scene import Terrain as Terrain
 
-SLOPE_STEP = 15.0  # m: slopes of the DEM are differences over twice this distance
-SURFACE_DEGREE = 3  # degree of the polynomial surface of common errors; this part of the DEM is used with a gain of 1
-_SURFACE_POWERS = [(n - j, j) for n in range(SURFACE_DEGREE + 1) for j in range(n + 1)]  # powers: level, x, y, x^2, ...
+SLOPE_STEP = 15.0  # m: slopes of the DEM are height differences over twice this distance
+SURFACE_DEGREE = 3  # degree of the polynomial of common errors; the DEM's own polynomial has gain 1
+_SURFACE_POWERS = [(n - j, j) for n in range(SURFACE_DEGREE + 1) for j in range(n + 1)]  # 1, x, y, x^2, ...
 NUM_BENDS = len(_SURFACE_POWERS)
-_DEM_NODES = 300  # of the grid for smoothing, along the longer side of the scene: 30 m apart for 10 km
-_DEM_MARGIN = 300.0  # m: least margin around the scene, and tolerance of altitudes, for errors of the cameras
-# cells along the longer side of the scene; sums over 6 x 6 cells determine a variance to a quarter of its size
+_DEM_NODES = 300  # nodes along the longer side of the scene, of the grid for smoothing: 33 m apart for 10 km
+_DEM_MARGIN = 300.0  # m: least margin around the scene, horizontally and in altitude, for errors of the cameras
+# cells along the longer side of the scene; 6 x 6 of them determine a variance with a relative error of a quarter
 _VARIANCE_CELLS = (6, 10, 16)
-_WIDEST = _VARIANCE_CELLS[-1]  # longer side of the scene over the largest width of smoothing
-_HILLS = 45.0  # least number of independent slopes; scenes with valid gains have 49 to 133, and 250 m of SRTM have 33
-# about the largest distance of the edges of a scene from its centre, over the RMS distance of its points
+_MIN_SIDE_TO_WIDTH = _VARIANCE_CELLS[-1]  # least ratio of the longer side of the scene to a smoothing width
+_MIN_INDEPENDENT_SLOPES = 45.0  # scenes with valid gains have 49 to 133, 250 m of SRTM have 33
+# typical ratio of the distance of the edges of a scene from its centre to the RMS distance of its points
 _EDGE_TO_RMS_DISTANCE = 2.0
-# largest difference from 1 of the relief of a DEM over that of the tie points; beyond it the DEM is of another terrain
+# largest deviation from 1 of the ratio of the DEM's relief to that of the tie points; else it shows another terrain
 _MAX_RELIEF_DIFFERENCE = 0.5
 
 
@@ -52,19 +52,19 @@ class Bands:
     origin: Array  # (2,) lon, lat of the first node [deg]
     unit: Array  # (2,) metres per degree
     step: float  # m between nodes
-    smoothed: tuple[Array, ...]  # DEMs, each smoothed with twice the width of the one before
+    smoothed: tuple[Array, ...]  # DEMs, each smoothed with twice the width of the previous one
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array) -> Bands:
-        """Split a DEM into bands of scales over ground points (n, 3)."""
-        from scipy.ndimage import gaussian_filter  # imported here: it takes a tenth of a second
+        """Split a DEM into bands of spatial scales over ground points (n, 3)."""
+        from scipy.ndimage import gaussian_filter  # slow to import (0.1 s)
 
         lon = wrap_longitude(ground[:, 0], ground[0, 0])
-        low, high = np.percentile(np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0)  # wrong matches lie far out
+        low, high = np.percentile(np.column_stack([lon, ground[:, 1]]), [1, 99], axis=0)  # without wrong matches
         unit = metres_per_unit(np.append((low + high) / 2.0, np.median(ground[:, 2])))[:2]
         side = (high - low) * unit
         extent = float(side.max())
-        margin = max(extent / _WIDEST, _DEM_MARGIN)
+        margin = max(extent / _MIN_SIDE_TO_WIDTH, _DEM_MARGIN)
         step = max((extent + 2.0 * margin) / _DEM_NODES, SLOPE_STEP)
         origin = low - margin / unit
         cols, rows = (np.arange(int((s + 2.0 * margin) / step) + 2) * step for s in side)
@@ -72,10 +72,10 @@ class Bands:
         heights = np.asarray(terrain(lon.ravel(), lat.ravel()), dtype=np.float64).reshape(lon.shape)
         least, most = np.percentile(ground[:, 2], [1, 99])
         room = most - least + _DEM_MARGIN
-        known = (heights > least - room) & (heights < most + room)  # holes may have any value
+        known = (heights > least - room) & (heights < most + room)  # holes may have any fill value
         middle = float(np.median(heights[known])) if known.any() else 0.0
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
-        while width * _WIDEST <= max(extent, _WIDEST * step):
+        while width * _MIN_SIDE_TO_WIDTH <= max(extent, _MIN_SIDE_TO_WIDTH * step):
             total, weight = (
                 gaussian_filter(a, width / step, mode="nearest", truncate=3.0)
                 for a in (filled, known.astype(np.float64))
@@ -85,12 +85,12 @@ class Bands:
         return cls(terrain, origin, unit, step, tuple(smoothed))
 
     def local(self, ground: Array) -> Array:
-        """Return the positions (n, 2) [m] east and north of the first node, of ground points (n, 3)."""
+        """Return the positions (n, 2) [m] of ground points (n, 3), east and north of the first node."""
         lon = wrap_longitude(ground[:, 0], self.origin[0])
         return np.asarray((np.column_stack([lon, ground[:, 1]]) - self.origin) * self.unit)
 
     def at(self, ground: Array) -> tuple[Array, Array]:
-        """Return heights (K, n) [m] of the bands at points (n, 3), which sum up to the DEM; and slopes (K, n, 2)."""
+        """Return heights (K, n) [m] and slopes (K, n, 2) of the bands at points (n, 3); all heights sum to the DEM."""
         heights = [np.asarray(self.terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)]
         slopes = [np.nan_to_num(terrain_slopes(self.terrain, ground))]
         at = self.local(ground).T[::-1] / self.step
@@ -142,34 +142,34 @@ def _bend_slopes(at: Array) -> Array:
 class RegularisedDem:
     """A DEM weighted by its gains, at n points."""
 
-    alt: Array  # (n,) altitudes of the constraint [m]; NaN: no DEM height, or an outlier
-    slopes: Array  # (n, 2) of the surface of the constraint, east and north
-    bends: Array  # (n, `NUM_BENDS`) shapes of common errors, about 1 at the edges of the scene
+    alt: Array  # (n,) altitudes to which points are constrained [m]; NaN: no DEM height, or an outlier
+    slopes: Array  # (n, 2) slopes of that surface, east and north
+    bends: Array  # (n, `NUM_BENDS`) common errors per unit: monomials, about 1 at the edges of the scene
     gains: Array  # (K,) weight of each band, the finest first
     sigma: float  # standard deviation of single altitudes [m]
-    alike: float  # number of correlated heights that weigh as one independent height
-    relief: float  # relief of the DEM over that of the tie points
-    shows: bool  # whether this ratio is consistent with 1; else the DEM is of another terrain
+    alike: float  # number of (correlated) heights per independent one
+    relief: float  # ratio of the relief of the DEM to that of the tie points
+    shows: bool  # whether this ratio can be 1; False: the DEM shows another terrain
 
     @property
     def effective_sigma(self) -> float:
-        """Standard deviation of single altitudes [m], enlarged so that their errors count as independent."""
+        """Standard deviation of single altitudes [m], enlarged to treat correlated ones as independent."""
         return float(self.sigma * self.alike**0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """Comparison of a DEM with heights of tie points from rays alone."""
+    """Comparison of a DEM with triangulated heights of P tie points."""
 
     bands: Bands | None  # None: too few points
-    tell: BoolArray  # (P,) points with heights from rays that are more accurate than the DEM
-    delivered: Array  # (3,) offset and tilts, east and north, of points above the DEM, delivered cameras [m]
+    tell: BoolArray  # (P,) points whose triangulated heights are more accurate than the DEM
+    delivered: Array  # (3,) offset, and tilts east and north, of the points above the DEM, with delivered cameras [m]
     fit: Array  # (3, P) derivatives of `delivered` by the heights of the points
     cameras: Array  # (3,) standard deviation of `delivered` by the camera priors [m]; NaN: unknown
     posts: Array | None = None  # (P, 4) indices of the grid posts of the DEM around each point, if it is a grid
 
     def beyond(self, bias: float) -> Array:
-        """Return the absolute values (3,) of `delivered` over their standard deviations.
+        """Return the absolute values (3,) of `delivered` divided by their standard deviations.
 
         `bias` [m] is the standard deviation of the common error of the DEM.
         """
@@ -184,15 +184,15 @@ class Relief:
 
     @classmethod
     def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
-        """Compare a DEM with ground points (P, 3) from rays alone.
+        """Compare a DEM with triangulated ground points (P, 3).
 
         Rays determine the heights of the points in the mask `strong` (P,), with standard deviations `sharp` (P,) [m].
-        Points are used if `sharp` is below the standard deviation of DEM heights: the larger of `stated` [m] and the
-        observed one. Tilts are stated as heights at the RMS distance of the points from their centre.
+        The regression uses points whose `sharp` is below the standard deviation of DEM heights: the larger of `stated`
+        [m] and the observed one. Tilts are heights at the RMS distance of the points from their centre.
         """
         index = np.flatnonzero(strong)
-        off = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
-        index, off = index[np.isfinite(off)], off[np.isfinite(off)]
+        above = ground[index, 2] - np.asarray(terrain(ground[index, 0], ground[index, 1]))
+        index, above = index[np.isfinite(above)], above[np.isfinite(above)]
         tell, fit, unknown = np.zeros(len(strong), dtype=bool), np.zeros((3, len(strong))), np.full(3, np.nan)
         posts_of = getattr(terrain, "posts", None)
         posts = None if posts_of is None else posts_of(ground[:, 0], ground[:, 1])
@@ -201,20 +201,20 @@ class Relief:
         bands = Bands.of(terrain, ground[index])
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
-        flat = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
-        near = _middling(off)
+        plane = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
+        near = _without_outliers(above)
         for _ in range(BACKFITTING):
-            delivered = _least_squares_fit(flat[near], off[near])
-            left = np.abs(off - flat @ delivered)
-            near = left <= OUTLIER * robust_spread(left)
-        tell[index[sharp[index] < max(robust_spread(left), stated)]] = True
-        fit[:, index] = np.linalg.pinv(flat)
+            delivered = _least_squares_fit(plane[near], above[near])
+            residual = np.abs(above - plane @ delivered)
+            near = residual <= OUTLIER * robust_spread(residual)
+        tell[index[sharp[index] < max(robust_spread(residual), stated)]] = True
+        fit[:, index] = np.linalg.pinv(plane)
         return cls(bands, tell, delivered, fit, unknown, posts)
 
     def independent(self, points: IntArray) -> float:
-        """Return an upper limit of the number of independent DEM heights at points (n,).
+        """Return an upper limit of the number of independent DEM heights at the points with these indices (n,).
 
-        The limit is the number of grid posts around the points, or infinity if the DEM is not a grid.
+        It is the number of grid posts around the points, or infinity if the DEM is not a grid.
         """
         return np.inf if self.posts is None else float(len(np.unique(self.posts[points])))
 
@@ -222,10 +222,10 @@ class Relief:
 def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> RegularisedDem | None:
     """Estimate the accuracy of a DEM at the points `index` (n,), with ground coordinates (n, 3).
 
-    `stated` [m] is the standard deviation of single DEM heights. Part of the difference between the height of a point
-    and the weighted DEM is explained by a motion or a bend of the scene. A point with an accurate height is constrained
-    to its own height minus this part. The rest of the difference is an error of the DEM, and does not move the point.
-    The result is None if too few points have heights from rays.
+    `stated` [m] is the a-priori standard deviation of single DEM heights. The regression attributes part of the height
+    difference between a point and the weighted DEM to a motion or bend of the scene. A point with an accurate height is
+    constrained to its own height minus this part. The residual is an error of the DEM and must not move the point.
+    Other points are constrained to the weighted DEM. Returns None if too few points have accurate heights.
     """
     if relief.bands is None:
         return None
@@ -233,7 +233,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
     known = np.isfinite(heights[0])
     tell = relief.tell[index] & known
     if tell.any():
-        tell[tell] = _middling((ground[:, 2] - heights.sum(axis=0))[tell])
+        tell[tell] = _without_outliers((ground[:, 2] - heights.sum(axis=0))[tell])
     if tell.sum() < MANY:
         return None
     at = relief.bands.local(ground)
@@ -241,73 +241,73 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
     half = max(float(np.abs(at[tell]).max()), 1.0)
     smooth, by_place = quadratic_basis(at / half), _bend_slopes(at / half) / half
     trend = _least_squares_fit(smooth[tell], heights[:, tell].T)
-    kept, bent = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
-    bent_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
-    above = ground[:, 2] - kept
-    found = _compared(at, above, bent, bent_slopes, smooth, tell, relief.independent(index[tell]))
-    fits, left, rising = found.fits, found.left, found.rising
+    polynomial, detrended = (smooth @ trend).sum(axis=1), heights.T - smooth @ trend
+    detrended_slopes = slopes - np.einsum("nmx,mk->knx", by_place, trend)
+    above = ground[:, 2] - polynomial
+    found = _regress_on_bands(at, above, detrended, detrended_slopes, smooth, tell, relief.independent(index[tell]))
+    fits, residual, weighted_slopes = found.fits, found.residual, found.weighted_slopes
     freedom = max(int(fits.sum()) - found.unknowns, 1)
-    pull = rising[fits] - smooth[fits] @ _least_squares_fit(smooth[fits], rising[fits])
-    alt = np.where(tell, ground[:, 2] - found.part, kept + bent @ found.gains)
+    pull = weighted_slopes[fits] - smooth[fits] @ _least_squares_fit(smooth[fits], weighted_slopes[fits])
+    alt = np.where(tell, ground[:, 2] - found.part, polynomial + detrended @ found.gains)
     is_held = known & (fits | ~relief.tell[index])
-    times, shows = _relief_ratio(bent[fits].sum(axis=1), above[fits], smooth[fits], stated)
+    ratio, shows = _relief_ratio(detrended[fits].sum(axis=1), above[fits], smooth[fits], stated)
     return RegularisedDem(
         np.where(is_held, alt, np.nan),
-        rising + np.einsum("nmx,mk->nx", by_place, trend),
+        weighted_slopes + np.einsum("nmx,mk->nx", by_place, trend),
         smooth,
         found.gains,
-        float(np.sqrt((STATED_FREEDOM * stated**2 + (left[fits] ** 2).sum()) / (STATED_FREEDOM + freedom))),
-        max(variance_inflation(at[fits], pull * left[fits, None]), fits.sum() / relief.independent(index[fits])),
-        times,
+        float(np.sqrt((STATED_FREEDOM * stated**2 + (residual[fits] ** 2).sum()) / (STATED_FREEDOM + freedom))),
+        max(variance_inflation(at[fits], pull * residual[fits, None]), fits.sum() / relief.independent(index[fits])),
+        ratio,
         shows,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class _BandRegression:
     """Regression of the heights of n points on the bands of a DEM."""
 
     gains: Array  # (K,) of the bands
-    rising: Array  # (n, 2) slopes of the weighted sum of the bands
-    part: Array  # (n,) part of the heights that a motion and a bend of the scene explain [m]
-    left: Array  # (n,) residuals [m]
+    weighted_slopes: Array  # (n, 2) slopes of the weighted sum of the bands
+    part: Array  # (n,) part of the heights due to a motion or bend of the scene [m]
+    residual: Array  # (n,) [m]
     fits: BoolArray  # (n,) inliers among the points used
-    unknowns: int
+    unknowns: int  # number of estimated coefficients
 
 
-def _compared(
-    at: Array, above: Array, bent: Array, slopes: Array, smooth: Array, tell: BoolArray, independent: float
-) -> _Compared:
+def _regress_on_bands(
+    at: Array, above: Array, bands: Array, slopes: Array, smooth: Array, tell: BoolArray, independent: float
+) -> _BandRegression:
     """Regress the heights `above` (n,) [m] of points at (n, 2) on the bands of a DEM, with a motion and a bend.
 
-    `bent` (n, K) are the heights of the bands, and `slopes` (K, n, 2) their slopes. `smooth` (n, m) are the shapes of
-    the bend. Only the points in the mask `tell` (n,) are used. The number of independent slopes is at most
+    `bands` (n, K) are the heights of the bands, and `slopes` (K, n, 2) their slopes. `smooth` (n, m) are the monomials
+    of the bend. Only the points in the mask `tell` (n,) are used. The number of independent slopes is at most
     `independent`. If it is too small to distinguish hills from errors of the DEM, the gains of all bands are zero.
     """
-    from scipy.optimize import lsq_linear  # imported here: it takes a fifth of a second
+    from scipy.optimize import lsq_linear  # slow to import (0.2 s)
 
-    gains, fits, both, use_bands = np.ones(bent.shape[1]), tell, np.column_stack([above, bent]), True
+    gains, fits, both, use_bands = np.ones(bands.shape[1]), tell, np.column_stack([above, bands]), True
     for _ in range(BACKFITTING):
         rising = np.einsum("k,knx->nx", gains, slopes)
-        hills = fits.sum() / variance_inflation(at[fits], rising[fits] - rising[fits].mean(axis=0))
-        use_bands = use_bands and min(hills, independent) > _HILLS
-        moved = smooth
+        count = fits.sum() / variance_inflation(at[fits], rising[fits] - rising[fits].mean(axis=0))
+        use_bands = use_bands and min(count, independent) > _MIN_INDEPENDENT_SLOPES
+        motion_and_bend = smooth
         if use_bands:  # motion: shift, rotation, scale
-            moved = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
-            free = both[fits] - moved[fits] @ _least_squares_fit(moved[fits], both[fits])
+            motion_and_bend = np.column_stack([smooth, *(rising * smooth[:, k, None] for k in range(3))])
+            free = both[fits] - motion_and_bend[fits] @ _least_squares_fit(motion_and_bend[fits], both[fits])
             gains = lsq_linear(free[:, 1:], free[:, 0], (0.0, 1.0)).x
         else:
-            gains, rising = np.zeros(bent.shape[1]), np.zeros_like(rising)
-        rest = above - bent @ gains
-        part = moved @ _least_squares_fit(moved[fits], rest[fits])
-        left = rest - part
-        spread = robust_spread(left[fits])
-        fits = tell & (np.abs(left) <= max(OUTLIER * spread, 1e-6))
-    return _Compared(gains, rising, part, left, fits, moved.shape[1] + len(gains))
+            gains, rising = np.zeros(bands.shape[1]), np.zeros_like(rising)
+        rest = above - bands @ gains
+        part = motion_and_bend @ _least_squares_fit(motion_and_bend[fits], rest[fits])
+        residual = rest - part
+        spread = robust_spread(residual[fits])
+        fits = tell & (np.abs(residual) <= max(OUTLIER * spread, 1e-6))
+    return _BandRegression(gains, rising, part, residual, fits, motion_and_bend.shape[1] + len(gains))
 
 
-def _middling(values: Array) -> BoolArray:
-    """Return the mask (n,) of the values (n,) that are not outliers about their median."""
+def _without_outliers(values: Array) -> BoolArray:
+    """Return the mask (n,) of values (n,) that are not outliers relative to their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= OUTLIER * robust_spread(off))
 
@@ -317,9 +317,9 @@ def _least_squares_fit(design: Array, values: Array) -> Array:
 
 
 def variance_inflation(at: Array, pull: Array) -> float:
-    """Return the number of correlated points at (n, 2) that weigh as one, from their gradients `pull` (n, 2).
+    """Return the number of (correlated) points at (n, 2) per independent one, from their gradients `pull` (n, 2).
 
-    The gradients are summed over the cells of a grid. The sum of the squared sums is divided by its expectation for
+    Gradients are summed over the cells of a grid. The sum of the squared sums is divided by its expectation for
     independent gradients: the sum of their squares. The largest ratio of several grids is returned, at least 1.
     """
     size, of_single, found = max(float(np.ptp(at, axis=0).max()), 1.0), (pull**2).sum(axis=0), 1.0
@@ -332,13 +332,13 @@ def variance_inflation(at: Array, pull: Array) -> float:
 
 
 def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]:
-    """Return the ratio of the relief of a DEM (n,) to that of ground points (n, 3), and whether it can be 1.
+    """Return the ratio of the relief of a DEM (n,) to that of adjusted ground points (n, 3), and whether it can be 1.
 
-    The points are adjusted, so only an offset and tilts are removed. `stated` [m] is the sigma of single DEM heights.
+    Offset and tilts are removed from both. `stated` [m] is the sigma of single DEM heights.
     """
     if len(dem) < MANY:
         return float("nan"), True
-    near = _middling(ground[:, 2] - dem)
+    near = _without_outliers(ground[:, 2] - dem)
     at = (ground - ground[near].mean(axis=0))[near, :2] * metres_per_unit(ground[near].mean(axis=0))[:2]
     plane = np.column_stack([np.ones(len(at)), at / max(float(np.abs(at).max()), 1.0)])
     relief = dem[near] - plane @ _least_squares_fit(plane, dem[near])
@@ -348,18 +348,18 @@ def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]
 def _relief_ratio(relief: Array, above: Array, smooth: Array, stated: float) -> tuple[float, bool]:
     """Return the ratio of a DEM relief (n,) to that of tie points (n,) [m], and whether it can be 1.
 
-    The ratio cannot be 1 if its difference from 1 is large and significant, and the difference of the heights is much
-    larger than `stated` [m].
+    It cannot be 1 if its difference from 1 is large and significant, and the heights differ by much more than `stated`
+    [m]. Combinations of the columns of `smooth` (n, m) are removed from the heights of the tie points.
     """
     seen = above - smooth @ _least_squares_fit(smooth, above)
     size = max(float(seen @ seen), 1e-12)
-    times = float(relief @ seen) / size
-    off, rest = relief - seen, relief - times * seen
+    ratio = float(relief @ seen) / size
+    off, rest = relief - seen, relief - ratio * seen
     sigma = float(np.sqrt(rest @ rest / size / len(seen)) if len(seen) else np.inf)
-    far = abs(times - 1.0)
+    deviation = abs(ratio - 1.0)
     wrong = (
-        far > _MAX_RELIEF_DIFFERENCE
-        and far > CRITICAL * sigma
+        deviation > _MAX_RELIEF_DIFFERENCE
+        and deviation > CRITICAL * sigma
         and float(off @ off) > len(off) * (MUCH_NOISE * stated) ** 2
     )
-    return times, not wrong
+    return ratio, not wrong

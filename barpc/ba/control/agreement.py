@@ -1,11 +1,11 @@
 """Find the set of ground control points that agree with each other, before any of them constrains the cameras.
 
 The block is adjusted by its tie points alone; control points are triangulated in it, without a prior on their position.
-The triangulated minus the given position of a point is d = U a + n. Here a are the free motions of the block (standard
-normal; shifts of any size are among them), and n is the error of the point itself, whitened to unit variance: of its
-stated position and of its rays. The evidence of a set of points is the density of their d with the motions integrated
-out. Points outside the set are wrong, with errors uniform in the logarithm of their size. The standard deviations of n
-may be understated by a factor, and those of the motions by another; the data choose both among a few (MacKay 1992).
+The triangulated minus the given position of a point is d = U a + n. Here a are the free motions of the block, including
+shifts of any size; they are standard normal. n is the error of the point itself (given position and rays), whitened to
+unit variance. The evidence of a set of points is the density of their d, with the motions integrated out. Points
+outside the set are wrong, and their errors have a uniform distribution in the logarithm of their size. The standard
+deviations of n, and those of the motions, may be understated: a factor on each is chosen by the data (MacKay 1992).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from barpc.base.geodesy import Array, enu_basis, parts
 from barpc.base.statistics import CRITICAL, GROSS, LEVEL, SURE, TRIALS
 from barpc.scene import BoolArray, IntArray
 
-# m: prior standard deviation of a point without control. It constrains no camera, and bounds a point with one ray.
+# m: prior standard deviation of an unconstrained point; wide for the cameras, it keeps a point with one ray finite
 UNCONSTRAINED_SIGMA = 1e4
 _MAX_SET_POINTS = 50_000  # points in one batch, summed over its sets; about 25 MB
 _SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # candidate factors by which standard deviations are understated
-# Probability that all samples of three points contain an outlier, if half of the points are outliers. Sampling ends
-# where this probability is reached with the largest share of agreeing points found.
+# Sampling ends when the probability that all samples of three points had an outlier is this small, at the best inlier
+# share found. It is the probability after TRIALS / 2 samples if half of the points are outliers.
 _ENOUGH = (1.0 - 0.5**3) ** (TRIALS // 2)
 ODDS = float(-np.log(LEVEL))
 """Log of the prior odds against a wrong point [nats].
@@ -49,14 +49,14 @@ class Agreement:
     used : (G,)
         Mask of the points used: those that agree with each other, and those that cannot be compared.
     sets : tuple of (G,)
-        Two contradicting sets of equal evidence, neither of which is used; empty where one set is used.
+        Two contradicting sets of equal evidence, neither of which is used; empty if one set is used.
     scale : float
         Factor by which the standard deviations of the points used are understated; 1: they are not.
     alike : bool
-        Whether two or more unused points agree with each other: they may have another datum.
+        Whether two or more unused points agree with each other; they may refer to another datum.
     torn : (2,)
-        RMS of check tie points without and with control [px], if the control points agree with each other but raise
-        this RMS. No point is used then. Empty otherwise.
+        RMS of check tie points without and with control [px], if control that agrees raises it; then no point is used.
+        Empty otherwise.
     """
 
     used: BoolArray
@@ -68,27 +68,27 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """Triangulated minus given positions of G control points, whitened by the errors of each point itself.
+    """Triangulated minus given positions of G control points, whitened by the error of each point itself.
 
     Parameters
     ----------
     own : (G, 3)
         Offsets.
     motions : (G, 3, r)
-        Derivatives of the offsets by r free motions of the block, each in units of its standard deviation. The last
-        three are shifts of any size.
+        Derivatives of the offsets by r free motions of the block, per standard deviation of each motion. The last
+        three motions are shifts of any size.
     """
 
     own: Array
     motions: Array
 
     def select(self, keep: BoolArray) -> Offsets:
-        """Return the offsets of some of the points."""
+        """Return the offsets of the points in a mask (G,)."""
         return Offsets(self.own[keep], self.motions[keep])
 
     @cached_property
     def products(self) -> Array:
-        """Normal matrix (G, r + 1, r + 1) of each point: of its motions and, in the last row and column, its offset."""
+        """Products A^T A (G, r + 1, r + 1) of each point, where A (3, r + 1) are its motions and, last, its offset."""
         both = np.concatenate([self.motions, self.own[..., None]], axis=2)
         return np.asarray(np.swapaxes(both, 1, 2) @ both)
 
@@ -109,7 +109,7 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
     points : (P, 3)
         Adjusted points, ECEF [m].
     faint : (P,)
-        Factors by which that solution multiplied the standard deviations of the observations of each point.
+        Factors by which the solution enlarged the standard deviations of the observations of each point.
     """
     gcps, first, structure = block.gcps, block.num_tracks, covariance.reduced.structure
     count, q = len(gcps.names), covariance.num_unknowns
@@ -120,13 +120,13 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
     rows = [structure.by_point[bounds[p] : bounds[p + 1]] for p in index]
     views = np.unique(structure.view[np.concatenate(rows)])
     of_cameras = np.zeros((count, 3, len(views) * q))
-    for g, mine in enumerate(rows):
-        for k in mine:
+    for g, rows_of_point in enumerate(rows):
+        for k in rows_of_point:
             at = int(np.searchsorted(views, structure.view[k])) * q
             of_cameras[g, :, at : at + q] -= enu[g] @ rays[g] @ covariance.reduced.cross[k]
-    turned = enu @ rays / faint[index, None, None]
-    own = turned @ np.swapaxes(turned, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
-    whitening = np.linalg.inv(np.linalg.cholesky(own))
+    by_rays = enu @ rays / faint[index, None, None]
+    noise = by_rays @ np.swapaxes(by_rays, 1, 2) + gcps.sigma[:, :, None] ** 2 * np.eye(3)
+    whitening = np.linalg.inv(np.linalg.cholesky(noise))
     flat = (whitening @ of_cameras).reshape(3 * count, -1)
     size, root = np.linalg.eigh(covariance.joint(views))
     modes, size, _ = np.linalg.svd(flat @ (root * np.sqrt(np.maximum(size, 0.0))), full_matrices=False)
@@ -139,19 +139,19 @@ def offsets_of(covariance: Covariance, block: Block, points: Array, faint: Array
 def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
     """Find the control points to use.
 
-    All sets are compared if there are up to twelve points. With more points, the sets compared are those that agree
-    with three points drawn at random.
+    With up to twelve points, all sets are compared. With more, the candidate sets are those that agree with three
+    points drawn at random.
 
     Parameters
     ----------
     offsets : Offsets
         Of G control points.
     told : (G,)
-        Mask of the points with two or more rays. The other points cannot be compared. They are used too, unless two
-        sets contradict each other.
+        Mask of the points with two or more rays. Other points cannot be tested; they are used, unless two sets
+        contradict each other.
     """
-    given = np.flatnonzero(told)
-    if len(given) < 2:
+    index = np.flatnonzero(told)
+    if len(index) < 2:
         return Agreement(np.ones(len(told), dtype=bool))
     if _fits_as_stated(offsets.select(told)):
         return Agreement(np.ones(len(told), dtype=bool))
@@ -159,34 +159,34 @@ def agreement(offsets: Offsets, told: BoolArray) -> Agreement:
     best, score, scale = found.best()
     others = found.against(best, score)
 
-    def whole(mask: BoolArray) -> BoolArray:
+    def expanded(mask: BoolArray) -> BoolArray:
         out = np.zeros(len(told), dtype=bool)
-        out[given[mask]] = True
+        out[index[mask]] = True
         return out
 
     if others is not None:
-        one, other = sorted((whole(best), whole(others)), key=lambda mask: int(mask.argmax()))
+        one, other = sorted((expanded(best), expanded(others)), key=lambda mask: int(mask.argmax()))
         return Agreement(np.zeros(len(told), dtype=bool), (one, other))
     alike = int(np.count_nonzero(~best)) > 1 and _fits_as_stated(found.offsets.select(~best))
-    return Agreement(whole(best) | ~told, scale=scale, alike=alike)
+    return Agreement(expanded(best) | ~told, scale=scale, alike=alike)
 
 
 def _fits_as_stated(offsets: Offsets) -> bool:
-    """Return whether the offsets of all points pass a chi-square test, and removing any point loses evidence."""
+    """Return whether the offsets pass a chi-square test together, and removing any point lowers the evidence."""
     count = len(offsets.own)
     every = SetEvidence(offsets, np.ones((1, count), dtype=bool))
-    freedom = 3.0 * (count - 1)  # a shift is free
+    freedom = 3.0 * (count - 1)  # less a free shift
     fits = every.squares[0] < chdtri(freedom, LEVEL)
     return bool(fits and every.gains(np.arange(count)).max() <= 0.0)
 
 
 class _SubsetSearch:
-    """The search of the set of points with the largest evidence."""
+    """Search for the set of points with the largest evidence."""
 
     def __init__(self, offsets: Offsets) -> None:
         self.offsets, self.count = offsets, len(offsets.own)
         self.masks, self.score = np.zeros((0, self.count), dtype=bool), np.zeros(0)
-        self.factors = np.zeros((0, 2))  # of standard deviations and of motions, at the largest evidence
+        self.factors = np.zeros((0, 2))  # of each set, on standard deviations and motions
         every = self.count * 2**self.count <= _MAX_SET_POINTS
         if every:
             numbers = np.arange(1, 2**self.count)
@@ -204,14 +204,14 @@ class _SubsetSearch:
         return self.masks[n], float(self.score[n]), float(self.factors[n, 0])
 
     def against(self, best: BoolArray, score: float) -> BoolArray | None:
-        """Return the set that contradicts the best with as much evidence, or the other points if they are a majority.
+        """Return a set that contradicts the best one with similar evidence, or else the other points if a majority.
 
         None if there is neither.
         """
         size, common = self.masks.sum(axis=1), (self.masks & best).sum(axis=1)
         other = np.flatnonzero((size > common) & (2 * common <= best.sum()))
         if len(other):
-            # the fit of a set of the same size may be better by chance
+            # a set of the same size may fit better by chance
             least = np.where(size[other] >= best.sum(), 2.0 * SURE, ODDS)
             rival = np.where(self.score[other] > score - least, self.score[other], -np.inf)
             if np.isfinite(rival).any():
@@ -219,7 +219,7 @@ class _SubsetSearch:
         return None if 2 * best.sum() >= self.count else ~best
 
     def _drawn(self, among: BoolArray) -> BoolArray:
-        """Return the sets (B, G) of points that agree with three points drawn from `among`; the seed is fixed."""
+        """Return sets (B, G): points that agree with three drawn from the mask `among` (G,), with a fixed seed."""
         some = self.offsets.select(among)
         rng, count = np.random.default_rng(0), len(some.own)
         every = np.arange(count)
@@ -242,21 +242,20 @@ class _SubsetSearch:
         return out
 
     def _refine(self, n: int) -> None:
-        """Move points into or out of set `n` while this raises its evidence.
+        """Move points into or out of set `n` while this raises the evidence.
 
-        In each iteration all points with a positive gain are moved, or only that with the largest gain, whichever is
-        better.
+        Each iteration tries two moves: all points with a positive gain, and only the point with the largest gain.
         """
         for _ in range(self.count):
             mask, before = self.masks[n], self.score[n]
-            there = SetEvidence(self.offsets, mask[None], *self.factors[n])
-            squared = there.deviations(np.arange(self.count))[0][0]
-            doubtful = np.flatnonzero((squared < 2.0 * CRITICAL**2) & (~mask | (squared > 0.5 * CRITICAL**2)))
-            gains = there.gains(doubtful)
+            evidence = SetEvidence(self.offsets, mask[None], *self.factors[n])
+            squared = evidence.deviations(np.arange(self.count))[0][0]
+            candidates = np.flatnonzero((squared < 2.0 * CRITICAL**2) & (~mask | (squared > 0.5 * CRITICAL**2)))
+            gains = evidence.gains(candidates)
             if not (gains > 0.0).any():
                 break
             moved = np.zeros((2, self.count), dtype=bool)
-            moved[0, doubtful[gains > 0.0]] = moved[1, doubtful[gains.argmax()]] = True
+            moved[0, candidates[gains > 0.0]] = moved[1, candidates[gains.argmax()]] = True
             self._add(mask ^ moved)
             n = int(self.score.argmax())
             if self.score[n] <= before:
@@ -269,31 +268,31 @@ class _SubsetSearch:
         self.score, self.factors = np.append(self.score, score), np.concatenate([self.factors, factors])
 
     def _scored(self, masks: BoolArray) -> tuple[Array, Array]:
-        """Return the evidence (B,) of sets (B, G), and the factors (B, 2) of standard deviations and motions.
+        """Return the evidence (B,) of sets (B, G), and their best factors (B, 2) on standard deviations and motions.
 
-        The evidence is minus infinity for a set whose upper limit is 2 SURE or more below the largest evidence. Such a
-        set cannot contradict the best.
+        A set whose upper limit of the evidence is 2 SURE or more below the largest one cannot contradict the best set:
+        its evidence is not computed and is minus infinity.
         """
         best = self.score.max(initial=-np.inf)
         score, factors = np.full(len(masks), -np.inf), np.ones((len(masks), 2))
-        room, sums = max(_MAX_SET_POINTS // self.count, 1), self.offsets.sums(masks)
+        batch, sums = max(_MAX_SET_POINTS // self.count, 1), self.offsets.sums(masks)
         for motions, times in product(_SIGMA_FACTORS, _SIGMA_FACTORS):
-            told = SetEvidence(self.offsets, masks, times, motions, sums)
-            at_most = told.at_most()
-            order = np.argsort(-at_most, kind="stable")
-            for start in range(0, len(masks), room):
-                part = order[start : start + room]
-                part = part[at_most[part] > max(best, score.max()) - 2.0 * SURE]
+            sets = SetEvidence(self.offsets, masks, times, motions, sums)
+            limit = sets.at_most()
+            order = np.argsort(-limit, kind="stable")
+            for start in range(0, len(masks), batch):
+                part = order[start : start + batch]
+                part = part[limit[part] > max(best, score.max()) - 2.0 * SURE]
                 if not len(part):
                     break
-                found = told.evidence(part)
+                found = sets.evidence(part)
                 better = found > score[part]
                 score[part[better]], factors[part[better]] = found[better], (times, motions)
         return score, factors
 
 
 class SetEvidence:
-    """Evidence that the points of sets agree, and the predictions of all points by each set.
+    """Evidence that the points of each set agree, and predictions of all points by each set.
 
     Parameters
     ----------
@@ -319,7 +318,7 @@ class SetEvidence:
         information = np.eye(r) + sums[:, :r, :r] * np.outer(factor, factor) / self.variance
         lower = np.linalg.cholesky(information)
         inverse = np.linalg.inv(lower)
-        self._root = factor[:, None] * np.swapaxes(inverse, 1, 2)  # (B, r, r) of their covariance given the set
+        self._root = factor[:, None] * np.swapaxes(inverse, 1, 2)  # (B, r, r) root of their covariance given the set
         self._mean = (inverse @ (sums[:, :r, r] * factor / self.variance)[..., None])[..., 0]
         self.squares = sums[:, r, r] / self.variance - (self._mean**2).sum(axis=1)
         volume = 2.0 * np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
@@ -329,82 +328,83 @@ class SetEvidence:
     def deviations(self, points: IntArray) -> tuple[Array, Array]:
         """Return the squared Mahalanobis distances (B, n) of points from their predictions by each set.
 
-        Also returned are the log determinants (B, n) of the covariances of these predictions.
+        The second result are the log determinants (B, n) of the covariances of these deviations.
         """
-        left, turned = self._seen(points)
-        return _deviation(left, self._spread(turned))
+        left, root = self._misfit(points)
+        return _mahalanobis(left, self._predicted_covariance(root))
 
     def evidence(self, part: IntArray) -> Array:
-        """Return the log evidence (n,) of some of the sets."""
+        """Return the log evidence (n,) of the sets `part` (n,)."""
         out = ~self.masks[part]
         some = np.flatnonzero(out.any(axis=0))
-        left, turned = self._seen(some, part)
-        wrong = _anywhere(*_deviation(left, self._spread(turned)))
+        left, root = self._misfit(some, part)
+        wrong = _outlier_cost(*_mahalanobis(left, self._predicted_covariance(root)))
         return np.asarray(self._inside[part] - (wrong * out[:, some]).sum(axis=1))
 
     def at_most(self) -> Array:
-        """Return upper limits (B,) of the log evidence of the sets, computed from their own points alone."""
-        least = _anywhere(np.zeros(1), 3.0 * np.log(self.variance))
+        """Return upper limits (B,) of the log evidence of the sets, without predictions of the points outside them."""
+        least = _outlier_cost(np.zeros(1), 3.0 * np.log(self.variance))
         return np.asarray(self._inside - least * (~self.masks).sum(axis=1))
 
     def gains(self, points: IntArray) -> Array:
-        """Return the gains (n,) of log evidence by moving each point into the set, or out of it.
+        """Return the gains (n,) of log evidence if each point alone moves into the set, or out of it.
 
-        There must be only one set. Each move is an update of rank three of the predictions (Woodbury).
+        There must be only one set. Each move is an update of rank three of the predictions (Woodbury identity).
         """
         inside, out = self.masks[0, points], np.flatnonzero(~self.masks[0])
-        left, turned = self._seen(points)
+        left, root = self._misfit(points)
         sign = np.where(inside, -1.0, 1.0)
-        own = self._spread(turned, sign)
-        squared, volume = (part[0] for part in _deviation(left, own))
+        covariance = self._predicted_covariance(root, sign)
+        squared, volume = (part[0] for part in _mahalanobis(left, covariance))
         unit = 3.0 * np.log(self.variance)
-        beside = np.where(inside, 2.0 * unit - volume, volume)  # of the prediction by the set's other points
-        gain = sign * (_anywhere(squared, beside) - 0.5 * squared - 1.5 * np.log(2.0 * np.pi))
+        by_others = np.where(inside, 2.0 * unit - volume, volume)  # predicted by the set's other points
+        gain = sign * (_outlier_cost(squared, by_others) - 0.5 * squared - 1.5 * np.log(2.0 * np.pi))
         gain += inside * unit - 0.5 * volume
         if not len(out):
             return np.asarray(gain)
-        their_left, theirs = self._seen(out)
-        spread = self._spread(theirs)
-        before = _anywhere(*_deviation(their_left, spread))[0]
-        lower = cholesky3(own)
+        left_outside, root_outside = self._misfit(out)
+        outside = self._predicted_covariance(root_outside)
+        before = _outlier_cost(*_mahalanobis(left_outside, outside))[0]
+        lower = cholesky3(covariance)
         pull = solve_lower(lower, np.moveaxis(left, 2, 0))
         for part in parts(len(points), max(_MAX_SET_POINTS // len(out), 1)):
-            shared = np.einsum("hir,gjr->ijhg", theirs[0], turned[0, part], optimize=True)
+            shared = np.einsum("hir,gjr->ijhg", root_outside[0], root[0, part], optimize=True)
             moves = np.stack([solve_lower(lower[..., part], row) for row in shared])  # (3, 3, m, n)
-            less = np.stack([(moves[i] * moves[j]).sum(axis=0) for i, j in TRIANGLE])
-            rest = their_left[0].T[..., None] - sign[part] * (moves * pull[:, :, part]).sum(axis=1)
-            after = _anywhere(*_deviation(np.moveaxis(rest, 0, 2), spread[:, 0, :, None] - sign[part] * less))
+            reduction = np.stack([(moves[i] * moves[j]).sum(axis=0) for i, j in TRIANGLE])
+            rest = left_outside[0].T[..., None] - sign[part] * (moves * pull[:, :, part]).sum(axis=1)
+            updated = outside[:, 0, :, None] - sign[part] * reduction
+            after = _outlier_cost(*_mahalanobis(np.moveaxis(rest, 0, 2), updated))
             change = np.where(out[:, None] == points[part], 0.0, after - before[:, None])
             gain[part] -= change.sum(axis=0)
         return np.asarray(gain)
 
-    def _seen(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
+    def _misfit(self, points: IntArray, part: IntArray | slice = slice(None)) -> tuple[Array, Array]:
         """Return the deviations (B, n, 3) of points from their predictions by each set.
 
-        Also returned are the products (B, n, 3, r) of their motions and the root of the motions' covariance.
+        The second result are roots R (B, n, 3, r) of the covariances R R^T of the predictions.
         """
-        motions, root = self.offsets.motions[points], self._root[part]
-        turned = (motions.reshape(-1, motions.shape[2]) @ root).reshape(len(root), *motions.shape)
-        return self.offsets.own[points] - (turned @ self._mean[part, None, :, None])[..., 0], turned
+        motions, motion_root = self.offsets.motions[points], self._root[part]
+        root = (motions.reshape(-1, motions.shape[2]) @ motion_root).reshape(len(motion_root), *motions.shape)
+        return self.offsets.own[points] - (root @ self._mean[part, None, :, None])[..., 0], root
 
-    def _spread(self, turned: Array, sign: Array | float = 1.0) -> Array:
-        """Return the covariances (6, B, n) of points, lower triangles, with motions added (sign 1) or removed (-1)."""
-        rows = [sign * np.einsum("bnr,bnr->bn", turned[:, :, i], turned[:, :, j]) for i, j in TRIANGLE]
+    def _predicted_covariance(self, root: Array, sign: Array | float = 1.0) -> Array:
+        """Return the covariances (6, B, n) of deviations (lower triangles): noise + `sign` x prediction."""
+        rows = [sign * np.einsum("bnr,bnr->bn", root[:, :, i], root[:, :, j]) for i, j in TRIANGLE]
         return np.stack([row + self.variance * (i == j) for row, (i, j) in zip(rows, TRIANGLE, strict=True)])
 
 
-def _deviation(left: Array, spread: Array) -> tuple[Array, Array]:
-    """Return the squared Mahalanobis lengths of vectors (..., 3), and the log determinants of covariances (6, ...)."""
-    lower = cholesky3(spread)
+def _mahalanobis(left: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return squared Mahalanobis lengths of vectors (..., 3), and log determinants of their covariances (6, ...)."""
+    lower = cholesky3(covariance)
     squared = (solve_lower(lower, np.moveaxis(left, -1, 0)) ** 2).sum(axis=0)
     return squared, 2.0 * np.log(lower[[0, 3, 5]]).sum(axis=0)
 
 
-def _anywhere(squared: Array, volume: Array | float) -> Array:
-    """Return minus the log density of wrong points, plus their log prior odds `ODDS`.
+def _outlier_cost(squared: Array, volume: Array | float) -> Array:
+    """Return minus the log density of wrong points, plus the log prior odds `ODDS` against a wrong point.
 
     The density is uniform in the logarithm of the deviation, from one to 10,000 standard deviations. The arguments are
-    the squared Mahalanobis distances from the predictions, and the log determinants of the predictions' covariances.
+    the squared Mahalanobis distances from the predictions, and the log determinants of their covariances.
     """
     ball = np.log(4.0 * np.pi * (1.0 / 3.0 + np.log(GROSS**2)))
     return np.asarray(1.5 * np.log(np.maximum(squared, 1.0)) + ball + 0.5 * volume + ODDS)

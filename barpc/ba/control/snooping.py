@@ -1,9 +1,9 @@
 """Tests of ground control points against each other and the cameras: data snooping (Baarda 1968).
 
-A control point that is used reduces its own residual. With Q_l the covariance of its given position and Q_x that of the
-adjusted point, the residual v = adjusted - given has the covariance Q_v = Q_l - Q_x, and the leave-one-out residual is
-Q_l Q_v^-1 v. The global test compares the sum of v^T Q_l^-1 v over the points with its expectation. The image test
-divides each image residual by its own standard deviation (Baarda's w).
+A control point that is used pulls the block to itself, which reduces its residual v = adjusted - given. With Q_l the
+covariance of the given position and Q_x that of the adjusted point, v has the covariance Q_v = Q_l - Q_x, and the
+leave-one-out residual is Q_l Q_v^-1 v. The global test compares the sum of v^T Q_l^-1 v over the points with its
+expectation. The image test divides each image residual by its standard deviation (Baarda's w).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from barpc.base.geodesy import Array, enu_basis
 from barpc.base.statistics import CHANCE, CRITICAL, KEPT, RIDGE
 from barpc.scene import BoolArray, GroundPoints, IntArray
 
-CHECKED = 0.1  # least redundancy of a checked point; the priors on the cameras alone give less
+CHECKED = 0.1  # least redundancy of a checked point; camera priors alone give less
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +36,18 @@ class ControlTest:
     used : (G,)
         Mask of the points that were used; the others were rejected.
     residual : (G, 3)
-        Leave-one-out residual: position by all other observations minus the given one, east, north, up [m]. Directions
-        without redundancy are left out; NaN if all are.
+        Leave-one-out residual: position from all other observations minus given position, east, north, up [m].
+        It has no component in directions without redundancy; NaN if no direction has redundancy.
     w : (G,)
-        Largest component of the residual over its standard deviation.
+        Largest component of adjusted minus given position, divided by its standard deviation.
     redundancy : (G,)
-        Mean redundancy number of a point: 0 if nothing else determines it, 1 if its own weight is negligible.
+        Mean redundancy number of a point: 0 if only its given position determines it, 1 if others alone do.
     scatter : float
-        RMS residual of the points used over its expectation; NaN below one degree of freedom.
+        RMS residual of the points used, divided by its expectation; NaN below one degree of freedom.
     fits : bool
         Whether `scatter` passes the chi-square test.
     agreed : Agreement or None
-        How the points used were found.
+        How the points to use were found.
     """
 
     used: BoolArray
@@ -65,7 +65,7 @@ class ControlTest:
 
     @property
     def agrees(self) -> bool:
-        """Whether every point used passes its test, all points pass the global test, and no sets contradict."""
+        """Whether every point used passes its test, the global test is passed, and no sets contradict each other."""
         status = [self.status(g) for g in range(len(self.used))]
         return self.fits and not self.torn and not {"contradicts", "undecided"} & set(status)
 
@@ -102,9 +102,9 @@ def control_test(
     gcps : GroundPoints
         As given.
     agreed : Agreement
-        Which points were used, and with which factor on their standard deviations.
+        The points used, and the factor on their standard deviations.
     faint : (G,)
-        Factors by which that solution multiplied the standard deviations of the observations of each control point.
+        Factors by which the solution enlarged the standard deviations of the observations of each control point.
     """
     count, used, sigmas = len(gcps.names), agreed.used, gcps.sigma * agreed.scale
     seen = np.bincount(gcps.point, minlength=count)
@@ -121,13 +121,13 @@ def control_test(
             continue
         left = stated - adjusted[g] if used[g] else stated + adjusted[g]
         redundancy[g] = min(float((np.diag(left) / np.diag(stated)).mean()), 1.0)
-        told, axes = np.linalg.eigh(left / np.outer(sigmas[g], sigmas[g]))
-        if told[-1] < RIDGE:
+        eigenvalues, axes = np.linalg.eigh(left / np.outer(sigmas[g], sigmas[g]))
+        if eigenvalues[-1] < RIDGE:
             continue
-        axes = axes[:, told > RIDGE]
+        axes = axes[:, eigenvalues > RIDGE]
         whitened = offset[g] / sigmas[g] @ axes
-        shown = axes @ (whitened / told[told > RIDGE]) if used[g] else axes @ whitened
-        residual[g] = sigmas[g] * shown
+        leave_one_out = axes @ (whitened / eigenvalues[eigenvalues > RIDGE]) if used[g] else axes @ whitened
+        residual[g] = sigmas[g] * leave_one_out
         spread = np.sqrt(np.maximum(np.diag(left) / sigmas[g] ** 2, RIDGE))
         w[g] = (np.abs(offset[g] / sigmas[g]) / spread).max()
     scatter, fits = global_test(offset / sigmas, redundancy, used)
@@ -136,11 +136,11 @@ def control_test(
 
 
 def global_test(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[float, bool]:
-    """Return the RMS residual of the points used (G,) over its expectation, and whether it passes a chi-square test.
+    """Return the ratio of the RMS residual of the points used (G,) to its expectation, and a chi-square test of it.
 
-    `whitened` (G, 3) are residuals over the standard deviations of the given positions; `redundancy` (G,) their mean
-    redundancy numbers. The expectation of the sum of squares is the sum R of the redundancy numbers; its variance is at
-    most 2 R, that of a chi-square. Below one degree of freedom: NaN and True.
+    `whitened` (G, 3) are residuals divided by the standard deviations of the given positions, `redundancy` (G,) mean
+    redundancy numbers. The sum of squares is expected to be the sum R of the redundancy numbers of all components. Its
+    variance is at most that of a chi-square, 2 R. The result is NaN, True below one degree of freedom.
     """
     freedom = 3.0 * float(redundancy[used].sum())
     if freedom < 1.0:
@@ -152,10 +152,10 @@ def global_test(whitened: Array, redundancy: Array, used: BoolArray) -> tuple[fl
 def image_test(
     covariance: Covariance, problem: Problem, state: State, residual: Array, weight: Array, rows: IntArray
 ) -> Array:
-    """Return Baarda's w (n,) of image observations: the larger of |col| and |row| over its standard deviation.
+    """Return Baarda's w (n,) of image observations: the larger of |col| and |row|, each over its standard deviation.
 
-    A whitened residual has the covariance I - J C J^T. C is the joint covariance of the cameras and the point. w is
-    NaN if both variances are zero.
+    A whitened residual has the covariance I - J C J^T, with C the joint covariance of the cameras and the point, and J
+    the derivatives of the observation. w is NaN if both variances are zero.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def image_test(
     residual : (2, K)
         Projected - observed [px].
     rows : (n,)
-        Observations to test, ascending: inliers of control points.
+        Indices of the observations to test, ascending: inliers of control points.
     """
     structure, reduced, q = problem.structure, covariance.reduced, covariance.num_unknowns
     bounds = np.searchsorted(structure.view[rows], np.arange(structure.num_views + 1))
@@ -176,39 +176,39 @@ def image_test(
     lower = reduced.lower[:, structure.point[rows]]
     inverse = solve_transposed(lower, np.eye(3)[..., None]).transpose(2, 0, 1)  # L^-T
     place = {} if reduced.common is None else {int(p): n for n, p in enumerate(reduced.common.index)}
-    left = np.empty((len(rows), 2))
+    variance = np.empty((len(rows), 2))
     waiting: list[tuple[int, Array]] = []  # observation, its derivatives (2, N q) by all cameras
     for n, k in enumerate(rows.tolist()):
         p = int(structure.point[k])
-        together = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
+        of_point = structure.by_point[structure.point_bounds[p] : structure.point_bounds[p + 1]]
         own = weight[k] * by_point[n] @ inverse[n]
-        moves = -own @ reduced.cross[together]
-        moves[together == k] += weight[k] * by_unknown[n]
-        left[n] = 1.0 - (own**2).sum(axis=1)
+        moves = -own @ reduced.cross[of_point]
+        moves[of_point == k] += weight[k] * by_unknown[n]
+        variance[n] = 1.0 - (own**2).sum(axis=1)
         if p not in place:
             flat = moves.transpose(1, 0, 2).reshape(2, -1)
-            left[n] -= np.diag(flat @ covariance.joint(structure.view[together]) @ flat.T)
+            variance[n] -= np.diag(flat @ covariance.joint(structure.view[of_point]) @ flat.T)
             continue
         assert reduced.common is not None
         shared = own @ la.solve_triangular(reduced.common.upper, reduced.common.cross[place[p]].T, trans="T").T
         whole = shared @ reduced.common.by_camera
-        for view, move in zip(structure.view[together].tolist(), moves, strict=True):
+        for view, move in zip(structure.view[of_point].tolist(), moves, strict=True):
             whole[:, view * q : (view + 1) * q] += move
-        left[n] -= (shared**2).sum(axis=1)
+        variance[n] -= (shared**2).sum(axis=1)
         waiting.append((n, whole))
         if len(waiting) * whole.size > KEPT:
-            _take_off(left, waiting, covariance)
-    _take_off(left, waiting, covariance)
+            _subtract_camera_part(variance, waiting, covariance)
+    _subtract_camera_part(variance, waiting, covariance)
     with np.errstate(invalid="ignore", divide="ignore"):
-        w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(left > RIDGE, left, np.nan))
+        w = np.abs(residual[:, rows].T * weight[rows, None]) / np.sqrt(np.where(variance > RIDGE, variance, np.nan))
     return np.asarray(np.fmax(*w.T))
 
 
-def _take_off(left: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
-    """Subtract the variances due to the cameras from `left`, for the observations in `waiting`, and clear the list."""
+def _subtract_camera_part(variance: Array, waiting: list[tuple[int, Array]], covariance: Covariance) -> None:
+    """Subtract the part due to the cameras from `variance`, for the observations in `waiting`, and clear the list."""
     if not waiting:
         return
     index, parts = zip(*waiting, strict=True)
     waiting.clear()
     whole = np.concatenate(parts)
-    left[list(index)] -= np.einsum("ij,ji->i", whole, covariance.solve(whole.T)).reshape(-1, 2)
+    variance[list(index)] -= np.einsum("ij,ji->i", whole, covariance.solve(whole.T)).reshape(-1, 2)

@@ -1,9 +1,9 @@
 """Additional parameters in the images: splines over the rows, steps between detectors, displaced parts, sinusoids.
 
-All are displacements of image points, linear unknowns of a view beside those of its camera. Splines are orthogonal to
-the polynomials of the drift in the row, and steps to a shift and a scale of the columns, so that their priors do not
-loosen those of the camera. A displaced part is an interval of rows or columns. A sinusoid displaces all rows with a
-known period. The prior variances of all of them are estimated (`barpc.ba.robust.variances`).
+All displace image points, by linear unknowns of a view beside those of its camera. Splines are orthogonal to the drift
+polynomials in the row, and steps to a shift and a scale of the columns: what a camera can model stays subject to the
+camera's prior. A displaced part is an interval of rows or columns. A sinusoid displaces all rows with a given period.
+The prior variances of all of them are estimated (`barpc.ba.robust.variances`).
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_an
 
 MIN_SPLINES = 7  # fewest splines of an image
 FIRST_SIGMA = 1.0  # px: prior standard deviation before variances are estimated
-OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row for each view: shapes of empty rows
-DRIFTS = 3  # polynomials of the row of the drift (constant, slope, bend), to which splines are orthogonal
+OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row per view -> shape of an empty row
+DRIFTS = 3  # polynomials in the row (constant, linear, quadratic) to which splines are orthogonal
 
 
 @dataclass(frozen=True, eq=False)
 class AdditionalParameters:
-    """Layout of the unknowns of a view [px]: for splines, then steps, parts, sinusoids, those of col, then of row."""
+    """Layout of a view's additional unknowns [px]: splines, steps, parts, sinusoids; each for col, then for row."""
 
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) first columns of further detectors [px], ascending; infinite where a view has fewer
@@ -45,29 +45,29 @@ class AdditionalParameters:
 
     @property
     def of_views(self) -> dict[str, Array]:
-        """Name -> array (N, ...) with a row for each view."""
+        """Name -> array (N, ...) with a row per view."""
         return {name: getattr(self, name) for name in OF_VIEWS}
 
     @property
     def alike(self) -> IntArray:
-        """Indices of displaced parts with the same columns in all images: they share one displacement."""
+        """Indices of displaced parts that are the same columns in all images: they share one displacement."""
         places = self.strips
         same = np.isfinite(places).all(axis=(0, 2)) & (places == places[:1]).all(axis=(0, 2)) & (len(places) > 1)
         return np.flatnonzero(same & (places[:1, :, 0] == 0.0).all(axis=0))
 
     def select(self, views: IntArray) -> AdditionalParameters:
-        """Return the layout of some views (n,); -1: a new view, with splines alone."""
+        """Return the layout of the given views (n,); -1: a new view, which has only splines."""
         rows = {name: np.concatenate([x, np.full((1, *x.shape[1:]), np.inf)]) for name, x in self.of_views.items()}
         return AdditionalParameters(self.count, **{name: one[views] for name, one in rows.items()})
 
     def joined(self, others: AdditionalParameters) -> AdditionalParameters:
-        """Return the layout of these views followed by others."""
+        """Return the layout of these views followed by those of `others`."""
         both = self.of_views.items(), others.of_views.values()
         rows = {name: np.concatenate([x, y]) for (name, x), y in zip(*both, strict=True)}
         return AdditionalParameters(self.count, **rows)
 
     def is_whole(self, views: int, size: int) -> bool:
-        """Return whether its arrays are valid, for a number of views of `size` unknowns each."""
+        """Return whether the arrays are valid for `views` views of `size` unknowns each."""
         own = self.of_views.values()
         return (
             [one.ndim for one in own] == [2, 3, 2]
@@ -78,82 +78,82 @@ class AdditionalParameters:
         )
 
     @cached_property
-    def _of_splines(self) -> Array:
-        """B-spline coefficients (M, m), orthonormal and in the complement of the polynomials, the smoothest first."""
+    def _spline_basis(self) -> Array:
+        """Orthonormal combinations (M, m) of the M B-splines, orthogonal to the polynomials, the smoothest first."""
         if not self.count:
             return np.zeros((0, 0))
         u = np.linspace(-1.0, 1.0, SAMPLE, dtype=np.float64)
-        free = _complement(bsplines(u, self.count) @ np.vander(u, DRIFTS))
-        rough = np.diff(free, axis=0)
-        vectors: Array = free @ la.eigh(rough.T @ rough)[1]
+        complement = _complement(bsplines(u, self.count) @ np.vander(u, DRIFTS))
+        rough = np.diff(complement, axis=0)
+        vectors: Array = complement @ la.eigh(rough.T @ rough)[1]
         return vectors * np.where(vectors[-1] < 0, -1.0, 1.0)
 
     def splines(self, row: Array) -> Array:
-        """Return the displacement (m, n) at normalised rows (n,) by one unit of each spline unknown of a coordinate."""
-        found: Array = self._of_splines.T @ bsplines(row, self.count)
+        """Return the displacements (m, n) at normalised rows (n,) per unit of each spline unknown of one coordinate."""
+        found: Array = self._spline_basis.T @ bsplines(row, self.count)
         return found
 
     @cached_property
-    def _of_steps(self) -> Array:
-        """Orthonormal displacements (C + 1, s) of detectors, without a shift and, from three on, a scale."""
+    def _step_basis(self) -> Array:
+        """Orthonormal displacements (C + 1, s) of detectors, orthogonal to a shift and (from three on) a scale."""
         num = self.edges.shape[1] + 1
         return _complement(np.vander(np.linspace(-1, 1, num), min(num - 1, 2))) if num > 1 else np.zeros((0, 0))
 
     @property
     def parts(self) -> tuple[int, int, int, int]:
-        """Numbers of unknowns of one coordinate: splines, steps, parts, sinusoids (cosines, then sines)."""
+        """Numbers of unknowns of one coordinate: of splines, steps, parts and sinusoids (cosines, then sines)."""
         return (
-            self._of_splines.shape[1],
-            self._of_steps.shape[1],
+            self._spline_basis.shape[1],
+            self._step_basis.shape[1],
             self.strips.shape[1],
             2 * self.periods.shape[1],
         )
 
     @property
     def size(self) -> int:
-        """Number of unknowns of a view."""
+        """Number of additional unknowns of a view."""
         return 2 * sum(self.parts)
 
     @property
     def kinds(self) -> tuple[slice, ...]:
-        """The unknowns of splines, steps, parts and sinusoids: those of the columns, then those of the rows."""
+        """Slices of the unknowns of splines, steps, parts and sinusoids; each has those of col, then those of row."""
         stops = 2 * np.cumsum((0, *self.parts))
         return tuple(map(slice, stops[:-1].tolist(), stops[1:].tolist()))
 
     @property
-    def _filled(self) -> list[slice]:
+    def _nonempty(self) -> list[slice]:
         return [part for part in self.kinds if part.stop > part.start]
 
     @cached_property
     def bands(self) -> Array:
-        """Group (size,) of each unknown for a common variance: splines by half octaves, steps, parts, sinusoids."""
+        """Variance group (size,) of each unknown: splines by half octaves, then steps, parts and sinusoids."""
         m, *others = self.parts
         octave = 2.0 * np.log2(np.arange(m) + float(DRIFTS))
         rank = np.unique(np.floor(octave), return_inverse=True)[1]
-        found, further = [rank, rank], rank.max(initial=-1) + 1
+        groups, next_group = [rank, rank], rank.max(initial=-1) + 1
         for count in others:
-            found.append(np.full(2 * count, further))
-            further += bool(count)
-        return np.concatenate(found)
+            groups.append(np.full(2 * count, next_group))
+            next_group += bool(count)
+        return np.concatenate(groups)
 
     def stretches(self, rows: float) -> float:
-        """Return the number of parts of an image of `rows` rows over which these unknowns average correlated noise.
+        """Return the number of intervals of an image of `rows` rows whose common errors are independent of each other.
 
-        One for each unknown; for a sinusoid one for each half period and coordinate.
+        One per unknown, which follows the error; for a sinusoid, one per half period and coordinate.
         """
         known = np.isfinite(self.periods)
-        waves = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
+        periods_per_image = np.divide(rows, self.periods, where=known, out=np.zeros_like(self.periods)).sum(axis=1)
         of_sinusoids = 2 * self.parts[3]
-        return self.size - of_sinusoids + max(4.0 * float(waves.max(initial=0.0)), of_sinusoids)
+        return self.size - of_sinusoids + max(4.0 * float(periods_per_image.max(initial=0.0)), of_sinusoids)
 
     def basis(self, row: Array, seen: Array, index: IntArray) -> list[Array]:
-        """Return for each kind the displacement (m, n) of points seen at (2, n) [px] by a unit of each unknown.
+        """Return, for each kind in use, displacements (m, n) of points per unit of each unknown of one coordinate.
 
-        `row` (n,) are their normalised rows, `index` (n,) their views. Unknowns are those of one coordinate.
+        Points are at `seen` (2, n) [px], normalised rows `row` (n,), in the views `index` (n,).
         """
         found = [self.splines(row)] if self.count else []
         if self.edges.shape[1]:
-            steps = self._of_steps.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
+            steps = self._step_basis.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
             found.append(steps * np.isfinite(self.edges[index, 0]))
         if self.strips.shape[1]:
             axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
@@ -163,9 +163,9 @@ class AdditionalParameters:
         return found
 
     def displaced(self, params: Array, index: IntArray, basis: list[Array]) -> Array:
-        """Return the displacement (2, n) [px] of observations of views `index` (n,) by unknowns `params` (N, size)."""
+        """Return the displacements (2, n) [px] of observations in views `index` (n,) by unknowns `params` (N, size)."""
         out = np.zeros((2, len(index)))
-        for part, one in zip(self._filled, basis, strict=True):
+        for part, one in zip(self._nonempty, basis, strict=True):
             of_views = params[:, part].reshape(len(params), 2, -1)
             for v in np.unique(index):
                 rows = index == v
@@ -173,35 +173,35 @@ class AdditionalParameters:
         return out
 
     def stack(self, out: Array, basis: list[Array]) -> None:
-        """Write the derivatives of displacements by the unknowns into `out` (2, size, n)."""
+        """Write the derivatives of the displacements by the unknowns into `out` (2, size, n)."""
         out[...] = 0.0
-        for part, one in zip(self._filled, basis, strict=True):
+        for part, one in zip(self._nonempty, basis, strict=True):
             middle = (part.start + part.stop) // 2
             out[0, part.start : middle] = out[1, middle : part.stop] = one
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
-        """Return the image correction of a view by its unknowns (size,); rows are normalised by offset and scale."""
-        splines, steps, moved, amplitudes = (params[part].reshape(2, -1).T for part in self.kinds)
+        """Return the image correction of a view with unknowns (size,); rows are normalised by offset and scale."""
+        splines, steps, displacements, amplitudes = (params[part].reshape(2, -1).T for part in self.kinds)
         edges, strips, periods = (one[view] for one in self.of_views.values())
         in_edges, in_part, in_period = np.isfinite(edges), np.isfinite(strips[:, 1]), np.isfinite(periods)
         return RowSpline(
-            self._of_splines @ splines,
+            self._spline_basis @ splines,
             row_offset,
             row_scale,
             edges[in_edges],
-            (self._of_steps @ steps)[: in_edges.sum() + in_edges.any()],
+            (self._step_basis @ steps)[: in_edges.sum() + in_edges.any()],
             strips[in_part],
-            moved[in_part],
+            displacements[in_part],
             periods[in_period],
             amplitudes.reshape(2, -1, 2).swapaxes(0, 1)[in_period],  # sinusoid, cosine or sine, coordinate
         )
 
     def carried(self, params: Array, known: AdditionalParameters) -> Array:
-        """Return start values (N, size) from the unknowns (N, known.size) of another layout, where kinds agree."""
+        """Return start values (N, size) from unknowns (N, known.size) of another layout; 0 for kinds that differ."""
         out = np.zeros((len(params), self.size))
         same = self.count == known.count, False, bool(known.parts[2]), self.parts[3] == known.parts[3]
-        for agrees, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
-            if agrees:
+        for is_same, mine, theirs in zip(same, self.kinds, known.kinds, strict=True):
+            if is_same:
                 old = params[:, theirs].reshape(len(params), 2, -1)
                 new = np.zeros((len(params), 2, (mine.stop - mine.start) // 2))
                 new[..., : old.shape[2]] = old

@@ -1,6 +1,6 @@
-"""Priors on cameras and points, as residuals over standard deviations, linear in the unknowns.
+"""Priors on cameras and points: residuals divided by standard deviations, linear in the unknowns.
 
-Tie-point observations, which are not linear, are in `barpc.ba.solving.problem`.
+The residuals of tie-point observations, which are not linear, are in `barpc.ba.solving.problem`.
 """
 
 from __future__ import annotations
@@ -17,46 +17,46 @@ from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.radar import Radar
 from barpc.sensor.rpc import RPC
 
-DEFAULT_ACCURACY = 7.5  # m, of rotation and of translation, 10.6 m of both: the less accurate of delivered RPCs
-DRIFT_SIGMA = 0.2  # m, at the first and last row of a view: 0.3 microradian from 700 km, as of good platforms
-USABLE_ACCURACY = 0.1  # m: a smaller value is the error of an RPC fit (as of Airbus), not of geolocation
-ALIKE_SIGMA = 0.01  # px: sigma of the differences of an edge between images of a pass: 0.1 micrometres of a focal plane
-IMAGE_MODEL_SIGMA = 20.0  # px, at the edge of the image: prior of each coefficient of image models
+DEFAULT_ACCURACY = 7.5  # m, for rotation and translation each (10.6 m together): that of less accurate delivered RPCs
+DRIFT_SIGMA = 0.2  # m, at the first and last row of a view: 0.3 microradian at 700 km, typical of good platforms
+USABLE_ACCURACY = 0.1  # m: smaller values (as in Airbus RPCs) state the error of the RPC fit, not of geolocation
+ALIKE_SIGMA = 0.01  # px: sigma of the differences of a detector step between images of a pass (0.1 micrometres)
+IMAGE_MODEL_SIGMA = 20.0  # px at the edge of the image: prior sigma of each coefficient of image models
 
 NOISE_FLOOR = AdjustOptions().noise_floor
-"""Pixels: error that all tie points of a view share; no camera is known better, and smaller residuals are tolerated."""
+"""Error [px] common to all tie points of a view: no camera is more accurate, and smaller residuals are tolerated."""
 
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """Independent normal priors on camera unknowns, with a larger sigma for turns about the lines of sight.
+    """Independent normal priors on camera unknowns, with a larger sigma for rotations about the lines of sight.
 
-    A stated accuracy is that of the middle of the image, which such a turn does not move.
+    A stated accuracy is that of the middle of the image, and such a rotation does not move the middle.
     """
 
     mean: Array  # (N, q) of the unknowns of each view
     sigma: Array  # (N, q) standard deviations
-    sight: Array | None = None  # (N, q) unit vectors of a turn about the line of sight; zeros: none
-    wider: Array | float = 1.0  # (N, 1) factor on the standard deviation of that turn
+    sight: Array | None = None  # (N, q) unit vectors of rotations about the line of sight; zeros: no rotation
+    wider: Array | float = 1.0  # (N, 1) factor on the standard deviation of that rotation
 
     @property
     def turn(self) -> Array:
-        """The unit vectors (N, q) of turns about the lines of sight, zeros where there are none."""
+        """Unit vectors (N, q) of rotations about the lines of sight; zeros without rotations."""
         return np.zeros_like(self.sigma) if self.sight is None else self.sight
 
     def residual(self, params: Array) -> Array:
-        """Return the residuals (N, q) of unknowns (N, q), over their standard deviations."""
+        """Return the whitened residuals (N, q) of unknowns (N, q)."""
         return self.whitened(params - self.mean)
 
     def whitened(self, values: Array) -> Array:
-        """Return changes of unknowns (N, q) or (N, q, m) over their standard deviations."""
+        """Return changes of unknowns (N, q) or (N, q, m), whitened: divided by their standard deviations."""
         flat = values.reshape(*self.sigma.shape, -1) / self.sigma[..., None]
         if np.any(self.wider != 1.0):
             flat -= ((1.0 - 1.0 / self.wider) * self.turn)[..., None] * (self.turn[:, None] @ flat)
         return flat.reshape(values.shape)
 
     def loosest(self) -> Array:
-        """Return standard deviations (N, q) of a prior without correlations, in no direction tighter than this one."""
+        """Return the standard deviations (N, q) of an uncorrelated prior, at least as wide in every direction."""
         return np.where(self.turn != 0.0, self.wider, 1.0) * self.sigma
 
     def precision(self) -> Array:
@@ -67,34 +67,34 @@ class CameraPrior:
 
 @dataclass(frozen=True, eq=False)
 class EarlierScene:
-    """Motions (`barpc.ba.constraints.gauge.MOTIONS`) of the scene of an earlier block, linear in its cameras."""
+    """Dependence of the scene's motions (`barpc.ba.constraints.gauge.MOTIONS`) on the cameras of an earlier block."""
 
-    by_unknown: Array  # (10, n) their derivative by the camera unknowns
-    own: Array  # (10, 10) their covariance with the cameras fixed [m^2]
-    radius: float  # distance at which tilts, turn and scale are measured [m]
+    by_unknown: Array  # (10, n) derivatives of the motions by the camera unknowns
+    own: Array  # (10, 10) covariance of the motions with the cameras fixed [m^2]
+    radius: float  # distance at which tilts, rotation and scale are measured [m]
 
 
 @dataclass(frozen=True)
 class JointPrior:
-    """A joint prior on unknowns of several views, with correlations: d' information d + 2 slope d, d = p - mean.
+    """A correlated prior on unknowns p of several views, of cost d' information d + 2 slope d, where d = p - mean.
 
-    The information of observations that are adjusted again is subtracted, so it need not be positive definite.
+    The information of observations that are adjusted again is subtracted; the rest may not be positive definite.
     """
 
     index: IntArray  # (n,) indices of the unknowns in the raveled (N, q) array
     mean: Array  # (n,) their prior mean
     information: Array  # (n, n)
-    scene: EarlierScene | None = None  # of the earlier block; None: unknown
+    scene: EarlierScene | None = None  # motions of the scene of the earlier block
     told: Array | float = 0.0  # (N,) information of earlier tie points on each view [1/px^2]
-    shown: Array | None = None  # sums of earlier corrections that estimate the camera priors (`Variances.shown`)
+    shown: Array | None = None  # sums over earlier corrections, for the camera priors (`Variances.shown`)
     slope: Array | float = 0.0  # (n,) half the gradient of the cost at the mean
-    earlier: bool = True  # whether it is of an earlier block
+    earlier: bool = True  # whether it comes from an earlier block
 
     @classmethod
     def of_alike(cls, waves: AdditionalParameters, views: int, size: int) -> JointPrior | None:
-        """Return the prior that a displaced part common to all images differs by `ALIKE_SIGMA`; None without any.
+        """Return the prior, of `ALIKE_SIGMA`, that a part common to all images has one displacement; None: no part.
 
-        There are `views` views of `size` unknowns, of which those of `waves` are the last.
+        There are `views` views of `size` unknowns each; the last of these are those of `waves`.
         """
         if not len(waves.alike):
             return None
@@ -107,17 +107,17 @@ class JointPrior:
 
     @classmethod
     def of_values(cls, index: IntArray, values: Array, shape: tuple[int, ...]) -> JointPrior:
-        """Return the prior `values` (m,) of unknowns `index` (m,) of the raveled (N, q) array, sigma `ALIKE_SIGMA`."""
-        size, own = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
-        own[0, index], own[1, index] = values, ALIKE_SIGMA**-2.0
-        return cls(np.arange(size), own[0], np.diag(own[1]), earlier=False)
+        """Return the prior that unknowns `index` (m,) of the raveled `shape` are `values` (m,), sigma `ALIKE_SIGMA`."""
+        size, mean_and_information = int(np.prod(shape)), np.zeros((2, int(np.prod(shape))))
+        mean_and_information[0, index], mean_and_information[1, index] = values, ALIKE_SIGMA**-2.0
+        return cls(np.arange(size), mean_and_information[0], np.diag(mean_and_information[1]), earlier=False)
 
     def gradient(self, params: Array) -> Array:
         """Return half the gradient (n,) of the cost by the unknowns `index`, at unknowns (N, q)."""
         return self.information @ (params.ravel()[self.index] - self.mean) + self.slope
 
     def cost(self, params: Array) -> float:
-        """Return the cost of unknowns (N, q)."""
+        """Return the cost (see the class) of unknowns (N, q)."""
         return float((params.ravel()[self.index] - self.mean) @ (self.gradient(params) + self.slope))
 
     def without(self, information: Array, gradient: Array, params: Array) -> JointPrior:
@@ -128,23 +128,23 @@ class JointPrior:
 
 @dataclass(frozen=True)
 class PointPrior:
-    """Priors on points with common errors b: residuals rows (X - mean) - common b, with b standard normal.
+    """Priors on points X with common errors b: residuals rows (X - mean) - common b, with b standard normal.
 
-    b is no unknown of the adjustment: it is eliminated, its estimate is `offset`.
+    The errors b are eliminated, so they are no unknowns of the adjustment. Their estimate is `offset`.
     """
 
     index: IntArray  # (Q,) distinct points
     mean: Array  # (Q, 3) ECEF [m]
     rows: Array  # (Q, 3, 3) whitening matrices [1/m]; rows of zeros: no constraint
-    common: Array  # (Q, 3, m) effect of one standard deviation of each of m common errors on whitened residuals
+    common: Array  # (Q, 3, m) effect of one sigma of each common error on the whitened residuals
 
     def offset(self, points: Array) -> Array:
-        """Estimate the common errors (m,) of points (P, 3) [m], in their standard deviations."""
+        """Estimate the common errors (m,) from points (P, 3) [m], in units of their standard deviations."""
         whitened = self.apart(points)
         return np.linalg.solve(self.information(), np.einsum("qim,qi->m", self.common, whitened))
 
     def residual(self, points: Array) -> Array:
-        """Return the whitened residuals (Q, 3) of points (P, 3) [m], without the estimated common errors."""
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], after subtraction of the common errors."""
         return self.apart(points) - self.common @ self.offset(points)
 
     def cost(self, points: Array) -> float:
@@ -162,7 +162,7 @@ class PointPrior:
         return PointPrior(self.index[keep], self.mean[keep], self.rows[keep], self.common[keep])
 
     def apart(self, points: Array) -> Array:
-        """Return the whitened residuals (Q, 3) of points (P, 3) [m], common errors included."""
+        """Return the whitened residuals (Q, 3) of points (P, 3) [m], before subtraction of the common errors."""
         return (self.rows @ (points[self.index] - self.mean)[..., None])[..., 0]
 
     def jacobian(self) -> Array:
@@ -171,7 +171,7 @@ class PointPrior:
 
 
 def stated_accuracy(view: View) -> float:
-    """Return the horizontal accuracy of a view as delivered [m]: that stated in its RPC where usable, else 7.5 m."""
+    """Return the horizontal accuracy of a delivered view [m]: that stated in its RPC if usable, else 7.5 m."""
     stated = view.sensor.err_bias if isinstance(view.sensor, RPC) else None
     return stated if stated is not None and states_accuracy(view) else DEFAULT_ACCURACY
 
@@ -205,7 +205,8 @@ def prior_sigmas(
 ) -> Array:
     """Return the prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
 
-    `off` (N,) [m] are measured offsets of the views: where larger than the stated accuracy, they replace it.
+    `off` (N,) [m] are measured offsets of the views. Where larger than the stated accuracy, they replace it. `waves`
+    is the number of additional parameters of a view.
     """
     stated = np.array([_stated_accuracy(view) for view in views])
     if off is not None:
@@ -214,8 +215,8 @@ def prior_sigmas(
     given = (("rotation", options.sigma_attitude), ("translation", options.sigma_position))
     for (name, sigma), own in zip(given, stated.T, strict=True):
         if name in options.first_model:
-            one = own if sigma is None else np.full(count, sigma)
-            parts.append(np.tile(one[:, None], (1, 3)))
+            of_views = own if sigma is None else np.full(count, sigma)
+            parts.append(np.tile(of_views[:, None], (1, 3)))
     if not parts:
         size = {"shift": 2, "shift-drift": 4, "affine": 6}[options.first_model]
         return np.hstack([np.full((count, size), IMAGE_MODEL_SIGMA), np.full((count, waves), FIRST_SIGMA)])

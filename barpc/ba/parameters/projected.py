@@ -1,7 +1,7 @@
 """Projection of all observations of a block through their corrected cameras, with derivatives.
 
-Arrays are component-major, (..., K), with observations sorted by view: components are contiguous, and each view takes
-one small matrix product. The unknowns of a correction are scaled to metres (see `Unknowns`).
+Arrays are component-major, (..., K), with observations sorted by view. So components are contiguous, and each view
+needs one small matrix product. The unknowns of a correction are scaled to metres (see `Unknowns`).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Projected:
 
 
 class Cameras:
-    """The cameras of a block with corrections.
+    """The cameras of a block and the layout of their corrections.
 
-    `seen` (2, K) [px] are the observed image points, sorted by view: drift depends on their rows, and additional
-    parameters on both coordinates.
+    `seen` (2, K) [px] are the observed image points, sorted by view. Drift is evaluated at their rows, additional
+    parameters at both coordinates.
     """
 
     def __init__(self, views: Sequence[View], unknowns: Unknowns, seen: Array | None = None) -> None:
@@ -62,8 +62,8 @@ class Cameras:
         """Return the corrected image points of all observations with derivatives, written into `out` if given.
 
         `params` (N, q) are the unknowns, `ecef` (3, K) [m] the point of each observation; those of view v are
-        bounds[v] : bounds[v + 1]. `wanted`: no derivatives ("image"), those by "points", or also by "unknowns"; arrays
-        not wanted have no rows.
+        bounds[v] : bounds[v + 1]. `wanted`: no derivatives ("image"), those by points ("points"), or those by points
+        and unknowns ("unknowns"). Arrays of other derivatives are empty.
         """
         found = self.room(ecef.shape[1], wanted) if out is None else out
         image, by_point, by_unknown = found.image, found.by_point, found.by_unknown
@@ -76,7 +76,7 @@ class Cameras:
         return found
 
     def room(self, count: int, wanted: Wanted = "unknowns") -> Projected:
-        """Return empty arrays for the projections of `count` observations."""
+        """Return uninitialised arrays for the projections of `count` observations."""
         by_point = np.empty((2, 0 if wanted == "image" else 3, count))
         by_unknown = np.empty((2, self.unknowns.size if wanted == "unknowns" else 0, count))
         return Projected(np.empty((2, count)), by_point, by_unknown)
@@ -92,14 +92,14 @@ class Cameras:
             out.by_point[:] = found[1][:, : out.by_point.shape[1]]
             out.by_unknown[:] = found[2][:, : out.by_unknown.shape[1]]
         else:
-            self._moved(params[views], ecef, views, bounds, seen, out)
+            self._project_rigid(params[views], ecef, views, bounds, seen, out)
         if unknowns.waves is not None and seen is not None:
             unknowns.add_waves(out.image, out.by_unknown, params, index, seen)
 
-    def _moved(
+    def _project_rigid(
         self, params: Array, ecef: Array, views: slice, bounds: IntArray, seen: Array | None, out: Projected
     ) -> None:
-        """Project points through rotated and translated cameras."""
+        """Project points through rotated and translated cameras, into `out`."""
         unknowns, image_only, all_wanted = self.unknowns, not out.by_point.shape[1], bool(out.by_unknown.shape[1])
         as_delivered = not params.any()
         if as_delivered and not all_wanted:

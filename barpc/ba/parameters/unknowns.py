@@ -1,7 +1,7 @@
 """The unknowns of each view in metres (or pixels), and the camera correction that they parametrise.
 
-Geometric models scale rotations to metres on the ground (angle x distance to the scene), so that all unknowns have a
-similar effect. Image models have pixels at the edge of the image.
+Geometric models scale rotations to metres on the ground (angle x distance to the scene), so that all unknowns have
+similar effects. The unknowns of image models are displacements at the edge of the image [px].
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.rpc import localize_stack
 
 _IMAGE_TERMS = {"shift": (0,), "shift-drift": (0, 2), "affine": (0, 1, 2)}
-"""Image models -> which of the terms 1, col, row the correction of each coordinate has."""
+"""Image model -> indices of the terms (1, col, row) in the correction of each coordinate."""
 
 
 @dataclass(frozen=True)
@@ -29,44 +29,44 @@ class Unknowns:
     """Layout of the unknowns of N views."""
 
     model: str  # a name of `AdjustOptions.model`
-    drift: int  # degree of the polynomial of the rotation in the image row
+    drift: int  # degree of the rotation as a polynomial in the image row; 0: constant
     center: Array  # (N, 3) camera centres [m], ECEF
     distance: Array  # (N,) from the centre to the scene [m]: a rotation unknown is angle x distance
     middle: Array  # (2, N) middle of each image, col and row [px]
-    half: Array  # (2, N) its half width and height [px]
-    # (N, 2) position of its scene, east and north of the mean of all [m]
+    half: Array  # (2, N) half the width and height of each image [px]
+    # (N, 2) ground position of the middle of each image, east and north of their mean [m]
     place: Array = field(default_factory=lambda: np.zeros((0, 2)))
     waves: AdditionalParameters | None = None  # additional parameters in the images
     direction: Array | None = None  # (N, 3) line of sight of the middle of each image, ECEF
 
     @property
     def geometric(self) -> bool:
-        """Whether the correction is one of the camera in space; else it is in the image."""
+        """Whether the correction moves the camera in space; else it moves image points."""
         return self.model not in _IMAGE_TERMS
 
     @property
     def size(self) -> int:
         """Number of unknowns q of a view."""
-        return self._of_model + (0 if self.waves is None else self.waves.size)
+        return self._model_size + (0 if self.waves is None else self.waves.size)
 
     @property
-    def _of_model(self) -> int:
-        """Number of unknowns of a view without additional parameters, which follow them."""
+    def _model_size(self) -> int:
+        """Number of unknowns of a view before its additional parameters."""
         return self.constants + 3 * self.drift if self.geometric else 2 * len(_IMAGE_TERMS[self.model])
 
     @property
     def constants(self) -> int:
-        """Number of unknowns of rotation and translation of a view; those of the drift follow."""
+        """Number of unknowns of the constant rotation and translation of a view; the drift follows."""
         return 3 * (self.rotates + self.translates)
 
     @property
     def in_waves(self) -> slice:
         """Slice of the additional parameters among the unknowns of a view."""
-        return slice(self._of_model, self.size)
+        return slice(self._model_size, self.size)
 
     @property
     def sight(self) -> Array | None:
-        """Unit vectors (N, q) of a turn about the line of sight; None without rotations."""
+        """Unit changes (N, q) of the unknowns that rotate a view about its line of sight; None without rotations."""
         if self.direction is None or not self.geometric or not self.rotates:
             return None
         out = np.zeros((len(self.direction), self.size))
@@ -97,8 +97,8 @@ class Unknowns:
         return params[:, start : start + 3]
 
     def drift_vectors(self, params: Array, views: slice = slice(None)) -> Array:
-        """Return the rotation vectors (n, D, 3) [rad] that multiply the powers 1 to D of the normalised row."""
-        vectors = params[:, self.constants : self._of_model].reshape(len(params), self.drift, 3)
+        """Return the drift (n, D, 3) [rad]: rotation vectors that multiply the powers 1 to D of the normalised row."""
+        vectors = params[:, self.constants : self._model_size].reshape(len(params), self.drift, 3)
         return vectors / self.distance[views, None, None]
 
     def normalized(self, image: Array, index: IntArray) -> Array:
@@ -106,19 +106,19 @@ class Unknowns:
         return (image - self.middle[:, index]) / self.half[:, index]
 
     def drift_rotation(self, params: Array, views: slice, count: IntArray, row: Array) -> Array:
-        """Return the rotation (3, n) [rad] by the drift at normalised rows (n,), of which each view has `count`."""
+        """Return the rotations (3, n) [rad] of the drift at normalised rows (n,): `count` (V,) rows for each view."""
         vectors = np.repeat(self.drift_vectors(params, views).transpose(1, 2, 0), count, axis=2)  # (D, 3, n)
-        added: Array = vectors[-1] * row
+        rotation: Array = vectors[-1] * row
         for degree in range(self.drift - 2, -1, -1):
-            added = (added + vectors[degree]) * row
-        return added
+            rotation = (rotation + vectors[degree]) * row
+        return rotation
 
     def stack(
         self, by_rotation: Array, by_drift: Array, by_point: Array, inverse: Array, row: Array | None, out: Array
     ) -> None:
-        """Write derivatives by the unknowns into `out` (2, q, n), from those (2, 3, n) by rotation [px/rad] and point.
+        """Write derivatives by the unknowns into `out` (2, q, n), from those (2, 3, n) by rotation, drift and point.
 
-        `inverse` (n,) are the inverse distances of the views [1/m].
+        The first two are in px/rad. `inverse` (n,) is 1 / distance of each view [1/m], `row` (n,) the normalised row.
         """
         at = 0
         if self.rotates:
@@ -135,7 +135,7 @@ class Unknowns:
             at += 3
 
     def add_waves(self, image: Array, by_unknown: Array, params: Array, index: IntArray, seen: Array) -> None:
-        """Add the displacements by additional parameters at observed points `seen` (2, n) [px], with derivatives."""
+        """Add the displacements by additional parameters at observed points `seen` (2, n) [px], and derivatives."""
         assert self.waves is not None
         row = (seen[1] - self.middle[1, index]) / self.half[1, index]
         basis = self.waves.basis(row, seen, index)
@@ -144,7 +144,7 @@ class Unknowns:
             self.waves.stack(by_unknown[:, self.in_waves], basis)
 
     def in_image(self, params: Array, index: IntArray, image: Array, by_point: Array) -> tuple[Array, Array, Array]:
-        """Apply the image model: return corrected image points (2, n), and derivatives by point and by unknown."""
+        """Return image points (2, n) corrected by the image model, and their derivatives by point and by unknown."""
         basis = np.vstack([np.ones((1, image.shape[1])), self.normalized(image, index)])
         chosen = list(_IMAGE_TERMS[self.model])
         m = len(chosen)
@@ -159,14 +159,14 @@ class Unknowns:
 
     def corrected(self, params: Array, views: Sequence[View]) -> tuple[SensorModel, ...]:
         """Return the sensor of each view with its correction by the unknowns (N, q)."""
-        found = self._moved(params, views) if self.geometric else self._in_images(params, views)
+        found = self._in_space(params, views) if self.geometric else self._in_images(params, views)
         if self.waves is not None:
             for i, one in enumerate(params[:, self.in_waves]):
                 of_rows = float(self.middle[1, i]), float(self.half[1, i])
                 found[i] = Splined(found[i], self.waves.correction(one, i, *of_rows))
         return tuple(found)
 
-    def _moved(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
+    def _in_space(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
         """Return the sensor of each view with its correction in space."""
         vectors = self.rotation(params), self.translation(params), self.center, self.drift_vectors(params)
         rows = zip(self.middle[1].tolist(), self.half[1].tolist(), strict=True)
@@ -178,7 +178,7 @@ class Unknowns:
     def _in_images(self, params: Array, views: Sequence[View]) -> list[SensorModel]:
         """Return the sensor of each view with its correction in the image."""
         normalized = np.zeros((len(params), 2, 3))
-        normalized[..., list(_IMAGE_TERMS[self.model])] = params[:, : self._of_model].reshape(len(params), 2, -1)
+        normalized[..., list(_IMAGE_TERMS[self.model])] = params[:, : self._model_size].reshape(len(params), 2, -1)
         slope = normalized[..., 1:] / self.half.T[:, None]
         shift = normalized[..., 0] - np.einsum("nij,jn->ni", slope, self.middle)
         return [ImageCorrected(v.sensor, ImageAffine(*one)) for v, *one in zip(views, shift, slope, strict=True)]

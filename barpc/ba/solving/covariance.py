@@ -16,25 +16,25 @@ from barpc.base.geodesy import Array, parts
 from barpc.base.statistics import FEW, KEPT
 from barpc.scene import BoolArray, IntArray
 
-_DENSE_UNKNOWNS = 900  # unknowns up to which the whole matrix is kept, and known exactly
+_DENSE_UNKNOWNS = 900  # most unknowns for which the whole covariance matrix is computed
 
 
 @dataclass(frozen=True, eq=False)
 class SharedErrors:
-    """Response of an adjustment to k errors that images have in common, by one standard deviation of each."""
+    """Response of an adjustment to k errors shared by several images: changes per standard deviation of each error."""
 
-    by_unknown: Array  # (N q, k) moves of the unknowns
-    of_points: Callable[[IntArray], Array]  # of points (n,) their moves (n, 3, k) [m], ECEF, with the cameras held
+    by_unknown: Array  # (N q, k) changes of the unknowns
+    of_points: Callable[[IntArray], Array]  # displacements (n, 3, k) [m], ECEF, of points (n,), fixed cameras
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Posterior covariance of an adjustment; computed when asked, from the factorised normal matrix."""
+    """Posterior covariance of an adjustment, computed on request from the factorised normal matrix."""
 
     reduced: Reduced  # the problem linearised at its solution
-    factor: Factor  # of the reduced matrix, free unknowns only
+    factor: Factor  # of its reduced matrix S, free unknowns only
     free: BoolArray  # (N q,) unknowns that are not fixed
-    shared: SharedErrors | None = None
+    shared: SharedErrors | None = None  # errors shared by several images; None: there are none
 
     @property
     def num_unknowns(self) -> int:
@@ -49,12 +49,12 @@ class Covariance:
 
     @cached_property
     def of_noise(self) -> Covariance:
-        """The same without the errors that images have in common."""
+        """The covariance without the errors shared by images."""
         return self if self.shared is None else replace(self, shared=None)
 
     @property
     def is_large(self) -> bool:
-        """Whether exact variances take seconds: as long as two factorisations."""
+        """Whether exact variances are slow: they take as long as two factorisations."""
         return len(self.free) > _DENSE_UNKNOWNS
 
     def variances(self) -> Array:
@@ -66,28 +66,28 @@ class Covariance:
     def of_views(self) -> Array:
         """Return the covariances (N, q, q) of every view's unknowns."""
         if self.factor.inverse is not None:
-            return self._near.diagonal if self.shared is None else self._near.diagonal + self._of_shared()
+            return self._sparse.diagonal if self.shared is None else self._sparse.diagonal + self._shared_part()
         q, every = self.num_unknowns, np.arange(len(self.free) // self.num_unknowns)
         return np.asarray(self.full.reshape(-1, q, len(every), q)[every, :, every])
 
     def probed_views(self) -> Array:
-        """Estimate the covariances (N, q, q) of every view's unknowns by random probes (Hutchinson 1990) at the cost of
-        a few solutions: each variance within a quarter (RMS).
+        """Estimate the covariances (N, q, q) of every view's unknowns by random probes (Hutchinson 1990).
 
-        Unknowns count in units of their standard deviation where all other views stood still: a variance would
-        drown in those of others that are a hundred times as large.
+        This costs a few solutions; the relative error of a variance is a quarter (RMS). Each unknown is scaled by its
+        standard deviation with all other views fixed. Otherwise the noise of the probes, which grows with the largest
+        variances, would exceed the small ones.
         """
         q = self.num_unknowns
-        views, unit = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
-        unit[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
-        random = np.random.default_rng(unit.size).integers(0, 2, (unit.size, FEW))
+        views, scale = np.flatnonzero(self.free[::q]), np.ones((len(self.free) // q, q))
+        scale[views] = np.sqrt(np.linalg.inv(self.reduced.of_views()[views]).diagonal(axis1=1, axis2=2))
+        random = np.random.default_rng(scale.size).integers(0, 2, (scale.size, FEW))
         probes = np.where(random > 0, 1.0, -1.0)
-        solved = self.solve(probes / unit.reshape(-1, 1)).reshape(*unit.shape, FEW)
-        found = solved @ np.swapaxes(probes.reshape(*unit.shape, FEW), 1, 2) / FEW * unit[:, None]
-        return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
+        solved = self.solve(probes / scale.reshape(-1, 1)).reshape(*scale.shape, FEW)
+        estimate = solved @ np.swapaxes(probes.reshape(*scale.shape, FEW), 1, 2) / FEW * scale[:, None]
+        return np.asarray(0.5 * (estimate + np.swapaxes(estimate, 1, 2)))
 
     def view(self, i: int, j: int | None = None) -> Array:
-        """Return the covariance (q, q) of the unknowns of view i (with those of view j)."""
+        """Return the covariance (q, q) of the unknowns of view i, or between those of views i and j."""
         return self._of_pair(i, i if j is None else j, "full" in self.__dict__)
 
     def joint(self, views: IntArray) -> Array:
@@ -99,30 +99,30 @@ class Covariance:
         return np.block([[self._of_pair(int(i), int(j), False) for j in views] for i in views])
 
     def _of_pair(self, i: int, j: int, of_full: bool) -> Array:
-        """Return the covariance (q, q) of view i with view j: where they share points, all such are known at once."""
+        """Return the covariance (q, q) of views i and j; all pairs that share points are computed together."""
         if self.factor.inverse is not None and not of_full:
-            more = 0.0 if self.shared is None else self._of_shared(i) @ self._of_shared(j).T
+            more = 0.0 if self.shared is None else self._shared_part(i) @ self._shared_part(j).T
             if i == j:
-                return np.asarray(self._near.diagonal[i] + more)
-            if (at := self._near.pair(min(i, j), max(i, j))) is not None:
-                return np.asarray((self._near.pairs[at] if i < j else self._near.pairs[at].T) + more)
+                return np.asarray(self._sparse.diagonal[i] + more)
+            if (at := self._sparse.pair(min(i, j), max(i, j))) is not None:
+                return np.asarray((self._sparse.pairs[at] if i < j else self._sparse.pairs[at].T) + more)
         own, other = (unknowns_of(np.array([view]), self.num_unknowns) for view in (i, j))
         return self.columns(other, of_full)[own]
 
-    def _of_shared(self, view: int | None = None) -> Array:
-        """Return the rows (q, k) of a view in common errors; without a view the covariances (N, q, q) by these."""
+    def _shared_part(self, view: int | None = None) -> Array:
+        """Return the response (q, k) of a view to the shared errors; without a view, covariances (N, q, q)."""
         assert self.shared is not None
         rows = self.shared.by_unknown.reshape(-1, self.num_unknowns, self.shared.by_unknown.shape[1])
         return np.asarray(rows @ np.swapaxes(rows, 1, 2) if view is None else rows[view])
 
     @cached_property
-    def _near(self) -> Blocks:
-        """The covariance of every view, and of those that share points."""
+    def _sparse(self) -> Blocks:
+        """The covariance of every view and of every pair that shares points, without shared errors."""
         assert self.factor.inverse is not None
         return self.factor.inverse()
 
     def columns(self, place: IntArray, of_full: bool = False) -> Array:
-        """Return the covariance (N q, m) of all unknowns with those at `place` (m,)."""
+        """Return the covariance (N q, m) between all unknowns and those at the indices `place` (m,)."""
         if of_full:
             return self.full[:, place]
         unit = np.zeros((len(self.free), len(place)))
@@ -131,7 +131,7 @@ class Covariance:
 
     @cached_property
     def full(self) -> Array:
-        """Covariance (N q, N q) of all unknowns: N^2 numbers, meant for some hundred views."""
+        """Covariance (N q, N q) of all unknowns; its size limits it to some hundred views."""
         out = np.zeros((len(self.free), len(self.free)))
         if self.factor.whole_inverse is not None:
             out[np.ix_(self.free, self.free)] = self.factor.whole_inverse()
@@ -142,13 +142,13 @@ class Covariance:
         return 0.5 * (out + out.T)
 
     def shared_moves(self, index: IntArray) -> Array:
-        """Return the moves (n, 3, k) [m], ECEF, of the points `index` (n,) by errors that images have in common."""
+        """Return the displacements (n, 3, k) [m], ECEF, of points `index` (n,) by one sigma of each shared error."""
         assert self.shared is not None
         by_unknown = self.shared.by_unknown.reshape(-1, self.num_unknowns, self.shared.by_unknown.shape[1])
         return np.asarray(self.reduced.carried(by_unknown, index) + self.shared.of_points(index))
 
     def points(self, index: IntArray) -> Array:
-        """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,): their own noise and the cameras'."""
+        """Return the covariance (n, 3, 3) [m^2], ECEF, of the points `index` (n,), by noise and by the cameras."""
         if self.shared is not None:
             moves = self.shared_moves(index)
             return np.asarray(self.of_noise.points(index) + moves @ np.swapaxes(moves, 1, 2))
@@ -164,7 +164,7 @@ class Covariance:
         return out if self.reduced.common is None else self._with_common(index, inverse, out)
 
     def _with_common(self, index: IntArray, inverse: Array, out: Array) -> Array:
-        """Return `out` where points share errors, which move with every camera."""
+        """Return `out` (n, 3, 3), recomputed for points with errors in common, which depend on every camera."""
         structure, common, q = self.reduced.structure, self.reduced.common, self.num_unknowns
         assert common is not None
         place = {int(p): n for n, p in enumerate(common.index)}

@@ -1,9 +1,9 @@
-"""Solving with the reduced camera matrix: dense Cholesky, or front by front where it is sparse (multifrontal).
+"""Solving with the reduced camera matrix: dense Cholesky, or multifrontal Cholesky where it is sparse.
 
-A front (`barpc.ba.solving.structure`) is a small dense matrix of its pivots and its border: the matrix's own blocks and
-what the fronts below it leave. Its pivots are eliminated, what that leaves of the border goes to the parent (Duff and
-Reid 1983). The blocks of the inverse where the matrix has some follow from the last front to the first (Takahashi
-1973): that of a border is part of the parent's.
+A front (`barpc.ba.solving.structure`) is a small dense matrix of its pivots and its border. It sums blocks of the
+matrix itself and the update matrices of its child fronts. Eliminating its pivots leaves an update matrix of the border,
+for the parent (Duff and Reid 1983). The inverse is computed only at the nonzero blocks of the matrix, from the last
+front to the first (Takahashi 1973): the inverse of a border is part of the parent's.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-IN_MEMORY = 1.5e9  # bytes of a factor; the rest goes to a temporary file
+IN_MEMORY = 1.5e9  # bytes of a factor in memory; the rest goes to a temporary file
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """A symmetric matrix of blocks (q, q): N on the diagonal, and those of pairs of views."""
+    """A symmetric matrix of blocks (q, q): one for each of N views, one for each pair of views with a nonzero block."""
 
     diagonal: Array  # (N, q, q)
     pairs: Array  # (M, q, q) block i, j of pair i < j
     pair_view: IntArray  # (M, 2) sorted
 
     def plain(self) -> Array:
-        """Return the matrix (N q, N q) as an array."""
+        """Return the matrix (N q, N q) as a dense array."""
         n, q, _ = self.diagonal.shape
         i, j = self.pair_view.T
         dense = np.zeros((n, q, n, q))
@@ -48,14 +48,14 @@ class Blocks:
         return dense.reshape(n * q, n * q)
 
     def select(self, views: IntArray) -> Blocks:
-        """Return the matrix of some of its views (n,), ascending."""
+        """Return the submatrix of the views (n,), ascending."""
         place = np.full(len(self.diagonal), -1)
         place[views] = np.arange(len(views))
         kept = (place[self.pair_view] >= 0).all(axis=1)
         return Blocks(self.diagonal[views], self.pairs[kept], place[self.pair_view[kept]])
 
     def sparse(self) -> sp.csr_array:
-        """Return the matrix (N q, N q) as scipy has it."""
+        """Return the matrix (N q, N q) as a sparse array of scipy."""
         n, q, _ = self.diagonal.shape
         (i, j), every = self.pair_view.T, np.arange(n)
         row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
@@ -66,7 +66,7 @@ class Blocks:
 
     @classmethod
     def of(cls, matrix: Array | sp.csr_array, size: int) -> Blocks:
-        """Return a symmetric matrix (N q, N q) as blocks of q = `size` unknowns a view."""
+        """Return the blocks of a symmetric matrix (N q, N q) of q = `size` unknowns per view."""
         whole = sp.csr_array(matrix).tobsr((size, size))
         whole.sort_indices()
         n = len(whole.indptr) - 1
@@ -83,7 +83,7 @@ class Blocks:
 
 
 class ArrayStore:
-    """Arrays in the order they came; in a temporary file once they are more than so many bytes."""
+    """A list of arrays, to append to and read; those beyond `in_memory` bytes are in a temporary file."""
 
     def __init__(self, in_memory: float | None = None) -> None:
         self.in_memory = IN_MEMORY if in_memory is None else in_memory
@@ -92,7 +92,7 @@ class ArrayStore:
         self.file: IO[bytes] | None = None
 
     def append(self, array: Array) -> None:
-        """Keep one more."""
+        """Append an array."""
         self.size += array.nbytes
         if self.size <= self.in_memory or not array.size:
             self.kept.append(array)
@@ -117,11 +117,11 @@ class ArrayStore:
 
 @dataclass(frozen=True, eq=False)
 class Cholesky:
-    """The factor L of a matrix of blocks, of the views that are eliminated."""
+    """The Cholesky factor L of a block matrix, for the views in the elimination order."""
 
     blocks: Blocks
     order: Dissection
-    # of every front L of its pivots (p q, p q), above whose diagonal nothing is meant, then of its border (b q, p q)
+    # two per front: L of its pivots (p q, p q), lower triangle only, and L of its border (b q, p q)
     parts: ArrayStore = field(default_factory=ArrayStore)
 
     @property
@@ -129,8 +129,8 @@ class Cholesky:
         return int(self.blocks.diagonal.shape[1])
 
     @cached_property
-    def _owned(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Pairs by the front of their first view eliminated; that view and the other; bounds of each front's part."""
+    def _pairs_by_front(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+        """Pairs sorted by the front of their earlier view; the earlier views; the later ones; bounds of each front."""
         rank, owner = self.order.rank, self.order.owner
         pairs = np.flatnonzero((rank[self.blocks.pair_view] >= 0).all(axis=1))
         i, j = self.blocks.pair_view[pairs].T
@@ -140,8 +140,8 @@ class Cholesky:
         return pairs[by_front], early[by_front], late[by_front], bounds
 
     def _entries(self, number: int, front: Front) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-        """Return the pairs of a front's pivots: which, their rows and columns in it, and whether row, col is j, i."""
-        pairs, early, late, bounds = self._owned
+        """Return index, row and column of the pairs with a pivot in the front, and whether a block is transposed."""
+        pairs, early, late, bounds = self._pairs_by_front
         part = slice(*bounds[number : number + 2])
         return (
             pairs[part],
@@ -151,36 +151,36 @@ class Cholesky:
         )
 
     def _local(self, front: Front, views: IntArray) -> IntArray:
-        """Return the places of views in a front."""
+        """Return the positions of views in a front: its pivots, then its border."""
         rank = self.order.rank
         own = rank[views] - rank[front.pivots[0]]
         beyond = len(front.pivots) + np.searchsorted(rank[front.border], rank[views])
         return np.where(own < len(front.pivots), own, beyond)
 
     def factorize(self, damping: float) -> float:
-        """Factorise a matrix, its diagonal larger by a share `damping` of itself; the logarithm of its determinant."""
-        left: dict[int, list[tuple[IntArray, Array]]] = {}
-        volume = 0.0
+        """Factorise the matrix, its diagonal multiplied by 1 + `damping`; return the logarithm of the determinant."""
+        updates: dict[int, list[tuple[IntArray, Array]]] = {}
+        log_determinant = 0.0
         for number, front in enumerate(self.order.fronts):
             matrix, split = self._assembled(number, front, damping), len(front.pivots) * self._size
-            for views, rest in left.pop(number, ()):
-                _add(matrix, unknowns_of(self._local(front, views), self._size), rest)
+            for views, update in updates.pop(number, ()):
+                _add_update(matrix, unknowns_of(self._local(front, views), self._size), update)
             upper, failed = dpotrf(matrix[:split, :split], lower=1, clean=0)
             if failed:
                 raise np.linalg.LinAlgError(f"{failed}-th leading minor not positive definite")
-            volume += 2.0 * float(np.log(upper.diagonal()).sum())
+            log_determinant += 2.0 * float(np.log(upper.diagonal()).sum())
             lower = dtrsm(1.0, upper, matrix[split:, :split], side=1, lower=1, trans_a=1)
             self.parts.append(upper)
             self.parts.append(lower)
             if front.parent >= 0:
-                rest = dsyrk(-1.0, lower, beta=1.0, c=matrix[split:, split:], lower=1)
-                left.setdefault(front.parent, []).append((front.border, rest))
-        return volume
+                update = dsyrk(-1.0, lower, beta=1.0, c=matrix[split:, split:], lower=1)
+                updates.setdefault(front.parent, []).append((front.border, update))
+        return log_determinant
 
     def _assembled(self, number: int, front: Front, damping: float) -> Array:
-        """Return the matrix's own part of a front: the lower triangle of its pivots."""
+        """Return a front with only the blocks of the matrix itself (lower triangle, columns of the pivots)."""
         q, count = self._size, len(front.pivots) + len(front.border)
-        matrix = np.zeros((count, q, count, q))  # its transpose: as LAPACK has it
+        matrix = np.zeros((count, q, count, q))  # transposed at the end: LAPACK expects Fortran order
         diagonal = self.blocks.diagonal[front.pivots]
         if damping:
             diagonal = diagonal + damping * diagonal * np.eye(q)
@@ -192,44 +192,41 @@ class Cholesky:
         return matrix.reshape(count * q, count * q).T
 
     def last(self) -> Array:
-        """Return the reduced matrix (m, m) of the unknowns of the last front once all others are eliminated."""
-        lower = np.tril(self._of(len(self.order.fronts) - 1)[0])
+        """Return the reduced matrix (m, m) of the unknowns of the last front, all others being eliminated."""
+        lower = np.tril(self._front_factor(len(self.order.fronts) - 1)[0])
         return np.asarray(lower @ lower.T)
 
     def solve(self, b: Array) -> Array:
-        """Return the solutions of right-hand sides (n,) or (n, m), n unknowns of the views that are
-        eliminated, as given.
-        """
+        """Return the solutions of right-hand sides (n,) or (n, m): unknowns of the eliminated views, ascending."""
         q, rank = self._size, self.order.rank
-        chosen = unknowns_of(np.argsort(rank[rank >= 0], kind="stable"), q)
-        # rank of the m-th view in use -> place in b
-        y = np.ascontiguousarray(b.reshape(len(b), -1)[chosen])
+        by_rank = unknowns_of(np.argsort(rank[rank >= 0], kind="stable"), q)
+        y = np.ascontiguousarray(b.reshape(len(b), -1)[by_rank])  # in the order of elimination
         for number, front in enumerate(self.order.fronts):
             own, border = self._rows(front)
-            upper, lower = self._of(number)
+            upper, lower = self._front_factor(number)
             y[own] = dtrsm(1.0, upper, y[own].T, side=1, lower=1, trans_a=1).T
             y[border] -= lower @ y[own]
         for number in range(len(self.order.fronts) - 1, -1, -1):
             own, border = self._rows(self.order.fronts[number])
-            upper, lower = self._of(number)
+            upper, lower = self._front_factor(number)
             rest = y[own] - lower.T @ y[border]
             y[own] = dtrsm(1.0, upper, rest.T, side=1, lower=1).T
         out = np.empty_like(y)
-        out[chosen] = y
+        out[by_rank] = y
         return out.reshape(b.shape)
 
-    def _of(self, number: int) -> tuple[Array, Array]:
-        """Return L of a front: of its pivots and of its border."""
+    def _front_factor(self, number: int) -> tuple[Array, Array]:
+        """Return the two parts of L of a front: its pivots and its border."""
         return self.parts[2 * number], self.parts[2 * number + 1]
 
     def _rows(self, front: Front) -> tuple[slice, IntArray]:
-        """Return the unknowns of a front's pivots and its border, in the order of elimination."""
+        """Return the indices of the unknowns of a front's pivots and border, in the order of elimination."""
         first = int(self.order.rank[front.pivots[0]])
         q = self._size
         return slice(first * q, (first + len(front.pivots)) * q), unknowns_of(self.order.rank[front.border], q)
 
     def inverse(self) -> Blocks:
-        """Return the inverse's blocks where the matrix has some; zero for views that are not eliminated."""
+        """Return the inverse at the nonzero blocks of the matrix; zero for views that are not eliminated."""
         fronts = self.order.fronts
         out = Blocks(np.zeros_like(self.blocks.diagonal), np.zeros_like(self.blocks.pairs), self.blocks.pair_view)
         known: dict[int, Array] = {}
@@ -243,12 +240,12 @@ class Cholesky:
                 children[front.parent] -= 1
                 if not children[front.parent]:
                     del known[front.parent]
-            self._take(out, number, front, whole)
+            self._copy_blocks(out, number, front, whole)
         return out
 
     def _inverse_of(self, number: int, front: Front, known: dict[int, Array]) -> Array:
-        """Return the inverse's part (m q, m q) of a front, by that of its parent."""
-        (upper, lower), split = self._of(number), len(front.pivots) * self._size
+        """Return the inverse (m q, m q) for the views of a front; `known` has that of its parent."""
+        (upper, lower), split = self._front_factor(number), len(front.pivots) * self._size
         found, failed = dpotri(upper, lower=1)
         if failed:
             raise np.linalg.LinAlgError(f"{failed}-th pivot is zero")
@@ -265,8 +262,8 @@ class Cholesky:
         whole[:split, :split] = own + weights.T @ across
         return whole
 
-    def _take(self, out: Blocks, number: int, front: Front, whole: Array) -> None:
-        """Put the blocks of a front's pivots where they belong."""
+    def _copy_blocks(self, out: Blocks, number: int, front: Front, whole: Array) -> None:
+        """Copy the blocks of a front's pivots from its inverse `whole` into `out`."""
         count = len(front.pivots) + len(front.border)
         blocks = whole.reshape(count, self._size, count, self._size)
         own = np.arange(len(front.pivots))
@@ -276,14 +273,14 @@ class Cholesky:
         out.pairs[pairs] = np.where(flipped[:, None, None], found.transpose(0, 2, 1), found)
 
 
-def _add(matrix: Array, place: IntArray, rest: Array) -> None:
-    """Add the remainder of a front below, run by run of its places: they mostly follow each other."""
+def _add_update(matrix: Array, place: IntArray, update: Array) -> None:
+    """Add a child front's update matrix at indices `place`, by slices: most indices are consecutive."""
     starts = np.flatnonzero(np.diff(place, prepend=-2) != 1)
     stops = np.append(starts[1:], len(place))
     for a, b in zip(starts, stops, strict=True):
         for c, d in zip(starts, stops, strict=True):
             if d <= b:
-                matrix[place[a] : place[a] + b - a, place[c] : place[c] + d - c] += rest[a:b, c:d]
+                matrix[place[a] : place[a] + b - a, place[c] : place[c] + d - c] += update[a:b, c:d]
 
 
 Matrix = Array | Blocks
@@ -295,8 +292,8 @@ class Factor:
 
     solve: Callable[[Array], Array]  # (n,) or (n, m) right-hand sides -> solutions
     method: str  # "dense" or "multifrontal"
-    inverse: Callable[[], Blocks] | None = None  # the inverse's blocks where the matrix has some, if it has blocks
-    whole_inverse: Callable[[], Array] | None = None  # (n, n), of a dense one
+    inverse: Callable[[], Blocks] | None = None  # inverse at the nonzero blocks; None: dense
+    whole_inverse: Callable[[], Array] | None = None  # (n, n) inverse; None: not dense
     log_determinant: float = np.nan  # of the matrix
 
 
@@ -331,7 +328,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
 
 
 def factorize_blocks(matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None) -> Factor:
-    """Factorise S, of the views in an order of elimination, less B^T B of a few rows `less` (m, n)."""
+    """Factorise S - B^T B for the views in `order`; B is `less` (m, n), of few rows."""
     _require_finite(matrix.diagonal)
     cholesky = Cholesky(matrix, order)
     volume = cholesky.factorize(damping)
@@ -345,7 +342,7 @@ def _require_finite(diagonal: Array) -> None:
 
 
 def woodbury(solve: Callable[[Array], Array], less: Array) -> tuple[Array, Array]:
-    """Return R (n, m) of (S - B^T B)^-1 = S^-1 + R R^T by solutions with S and B = `less` (m, n); U of I - B S^-1 B^T.
+    """Return R (n, m) with (S - B^T B)^-1 = S^-1 + R R^T, and U (m, m) with U^T U = I - B S^-1 B^T; B is `less` (m, n).
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 With whitened derivatives A_k by the point and B_k by the view's unknowns, V_p = sum A^T A = L L^T and
 Y_k = L^-1 A_k^T B_k, the camera matrix is S = diag(sum B^T B) - sum_p Y^T Y and its gradient
-g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r. Errors that heights have in common are eliminated after the
-points: they couple all cameras, so that what they take off S stays apart from it where S is sparse.
+g = sum B^T r - sum Y^T h, where h_p = L^-1 sum A^T r. Errors common to several heights are eliminated
+after the points. They couple all cameras: where S is sparse, their (dense, low-rank) part of S is kept separately.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ TRIANGLE = tuple((i, j) for j in range(3) for i in range(j, 3))
 
 @dataclass(frozen=True)
 class Common:
-    """Errors that points have in common, eliminated after the points."""
+    """Errors common to several points, eliminated after the points."""
 
     index: IntArray  # (Q,) the points
-    cross: Array  # (Q, 3, m) L^-1 times the points' second derivative with the errors
-    upper: Array  # (m, m) U of their matrix U^T U once the points are eliminated
-    by_camera: Array  # (m, N q) U^-T times their second derivative with the cameras
+    cross: Array  # (Q, 3, m) L^-1 times the second derivatives by point and error
+    upper: Array  # (m, m) U, where U^T U is their normal matrix after the elimination of the points
+    by_camera: Array  # (m, N q) U^-T times the second derivatives by error and camera unknown
     half: Array  # (m,) U^-T times their gradient
 
     def step(self, step: Array) -> Array:
-        """Return the move of the errors (m, s) that goes with steps (N q, s) of the camera unknowns alone."""
+        """Return the changes (m, s) of the errors that follow from steps (N q, s) of the camera unknowns alone."""
         return -la.solve_triangular(self.upper, self.by_camera @ step)
 
 
@@ -44,25 +44,25 @@ class Reduced:
     """The linearised problem with its points eliminated."""
 
     structure: Structure
-    matrix: Matrix  # (N q, N q) S; where it is sparse, without what the common errors take off it
-    # (N q,) g: derivative of half the cost by the camera unknowns, points at their (linear) optimum
+    matrix: Matrix  # (N q, N q) S; if sparse, without the part of the common errors
+    # (N q,) g: derivative of half the cost by the camera unknowns, with each point at its optimum (linearised)
     gradient: Array
     cost: float  # sum of squared whitened residuals
-    gain: float  # what moving the points (and common errors) alone would take off the cost: sum |h|^2
+    gain: float  # decrease of the cost if only points (and common errors) moved: sum |h|^2
     lower: Array  # (6, P) L: its elements 00, 10, 20, 11, 21, 22
     half: Array  # (P, 3) h
     cross: Array  # (K, 3, q) Y
-    common: Common | None = None  # errors that the points have in common
+    common: Common | None = None  # None: points have no errors in common
 
     def plain(self, free: BoolArray) -> Array:
-        """Return S (n, n) as an array, of the unknowns that are free (N q,)."""
+        """Return S (n, n) as a dense array, of the `free` (N q,) unknowns only."""
         dense = self.matrix if isinstance(self.matrix, np.ndarray) else self.matrix.plain()
         if self.common is not None and dense is not self.matrix:
             dense -= self.common.by_camera.T @ self.common.by_camera
         return dense if free.all() else dense[np.ix_(free, free)]
 
     def of_views(self) -> Array:
-        """Return the blocks (N, q, q) on S's diagonal."""
+        """Return the diagonal blocks (N, q, q) of S."""
         if not isinstance(self.matrix, np.ndarray):
             if self.common is None:
                 return self.matrix.diagonal
@@ -72,7 +72,7 @@ class Reduced:
         return np.asarray(self.matrix.reshape(n, q, n, q)[every, :, every, :])
 
     def factor(self, free: BoolArray, damping: float = 0.0) -> Factor:
-        """Return the factorised S, of the unknowns that are free (N q,): those of whole views."""
+        """Return the factorised S of the `free` (N q,) unknowns; each view is free or fixed as a whole."""
         if isinstance(self.matrix, np.ndarray):
             return factorize(self.plain(free), damping)
         order = self.structure.order(free[:: self.cross.shape[2]])
@@ -80,13 +80,13 @@ class Reduced:
         return factorize_blocks(self.matrix, order, damping, less)
 
     def with_diagonal(self, more: Array) -> Reduced:
-        """Return the same with the information (N, q, q) of priors on single views added to S's diagonal blocks."""
+        """Return the problem with information (N, q, q) of priors on single views added to the diagonal of S."""
         if isinstance(self.matrix, np.ndarray):
             return replace(self, matrix=self.matrix + la.block_diag(*more))
         return replace(self, matrix=replace(self.matrix, diagonal=self.matrix.diagonal + more))
 
     def with_joint(self, index: IntArray, information: Array) -> Matrix:
-        """Return S and the information (n, n) of unknowns `index` (n,), which are those of views that are joined."""
+        """Return S plus the information (n, n) of a prior on `index` (n,): all unknowns of several views, in order."""
         if isinstance(self.matrix, np.ndarray):
             matrix = self.matrix.copy()
             matrix[np.ix_(index, index)] += information
@@ -103,7 +103,7 @@ class Reduced:
         return Blocks(diagonal, pairs, self.structure.pair_view)
 
     def point_step(self, step: Array) -> Array:
-        """Return the move of the points (P, 3) [m] that goes with a step (N, q) of the camera unknowns."""
+        """Return the step (P, 3) [m] of the points that belongs to a step (N, q) of the camera unknowns."""
         structure = self.structure
         moved = np.empty((3, len(self.cross)))
         for v, (start, stop) in enumerate(zip(structure.bounds[:-1], structure.bounds[1:], strict=True)):
@@ -116,7 +116,7 @@ class Reduced:
         return -solve_transposed(self.lower, half).T
 
     def carried(self, step: Array, index: IntArray) -> Array:
-        """Return the moves (n, 3, s) [m] of points `index` (n,) that go with steps (N, q, s) of the cameras alone."""
+        """Return the displacements (n, 3, s) [m] of points `index` (n,) by steps (N, q, s) of the cameras alone."""
         structure = self.structure
         place = np.full(structure.num_points, -1)
         place[index] = np.arange(len(index))
@@ -141,34 +141,34 @@ def reduce_normal(
     camera_gradient: Array,
     point_prior: PointPrior | None = None,
 ) -> Reduced:
-    """Eliminate the points of a linearised problem; the cost is without the priors' part.
+    """Eliminate the points of a linearised problem; its cost excludes the priors.
 
-    Of whitened residuals (2, K) and their derivatives (2, 3, K) and (2, q, K). Priors add `point_matrix` (6, P,
-    elements as in `Reduced.lower`) to V, `point_gradient` (3, P) to the points' gradient, `camera_matrix` (N, q, q) and
-    `camera_gradient` (N, q) to S's diagonal blocks and to g; the common errors of `point_prior` are eliminated too.
+    Residuals (2, K) are whitened, as are their derivatives `by_point` (2, 3, K) and `by_unknown` (2, q, K). Priors add
+    `point_matrix` (6, P; elements as in `Reduced.lower`) to V and `point_gradient` (3, P) to sum A^T r. They add
+    `camera_matrix` (N, q, q) to S and `camera_gradient` (N, q) to g. Common errors of `point_prior` are eliminated too.
     """
     sums = structure.sum_points(point_products(by_point, residual))
     lower = cholesky3(sums[:6] + point_matrix)
     half = solve_lower(lower, sums[6:] + point_gradient)
     cross = _eliminate(structure, by_point, by_unknown, lower)
-    diagonal, gradient = _of_views(structure, residual, by_unknown, cross, half)
+    diagonal, gradient = _view_terms(structure, residual, by_unknown, cross, half)
     gradient += camera_gradient
     diagonal += camera_matrix
-    matrix, slope_all = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
+    matrix, full_gradient = _assemble(structure, diagonal, _pair_blocks(structure, cross)), gradient.ravel()
     gain = float((half**2).sum())
     common = None
     if point_prior is not None and point_prior.common.shape[2]:
         common = _common_errors(structure, point_prior, lower, half, cross)
-        slope_all = slope_all - common.by_camera.T @ common.half
+        full_gradient = full_gradient - common.by_camera.T @ common.half
         gain += float(common.half @ common.half)
         if isinstance(matrix, np.ndarray):
             matrix = matrix - common.by_camera.T @ common.by_camera
-    return Reduced(structure, matrix, slope_all, float((residual**2).sum()), gain, lower, half.T, cross, common)
+    return Reduced(structure, matrix, full_gradient, float((residual**2).sum()), gain, lower, half.T, cross, common)
 
 
 def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
-    """Return the common errors of the points of a prior; their gradient vanishes before the points move, as
-    they are the best.
+    """Return the common errors of a point prior. They are at their optimum for the given points, so their gradient
+    comes only from the elimination of the points.
     """
     index, m = prior.index, prior.common.shape[2]
     by_point = np.swapaxes(prior.rows, 1, 2) @ -prior.common
@@ -187,9 +187,9 @@ def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: 
 
 
 def by_cameras(structure: Structure, cross: Array, index: IntArray, whitened: Array) -> Array:
-    """Return the derivatives (m, N q) by the cameras of functions of points `index` (Q,).
+    """Return the derivatives (m, N q) by the camera unknowns of m functions of the points `index` (Q,).
 
-    `whitened` (Q, 3, m) is L^-1 times their derivatives by the points, `cross` (K, 3, q) the coupling Y.
+    `whitened` (Q, 3, m) is L^-1 times the derivatives by the points, `cross` (K, 3, q) the coupling Y.
     """
     place = np.full(structure.num_points, -1)
     place[index] = np.arange(len(index))
@@ -204,7 +204,7 @@ def by_cameras(structure: Structure, cross: Array, index: IntArray, whitened: Ar
 def point_products(by_point: Array, residual: Array, weight: Array | None = None) -> Array:
     """Return the products (9, K): the six elements of A^T A (order of `TRIANGLE`) and the three of A^T r.
 
-    Of whitened derivatives and residuals, or of such that weights (K,) whiten.
+    Derivatives and residuals are whitened, or become so by weights (K,).
     """
     products = np.empty((9, residual.shape[1]))
     for part in parts(residual.shape[1]):
@@ -220,7 +220,7 @@ def point_products(by_point: Array, residual: Array, weight: Array | None = None
 def cholesky3(matrix: Array) -> Array:
     """Return the lower Cholesky factors (6, P) of symmetric 3x3 matrices, elements 00, 10, 20, 11, 21, 22.
 
-    A direction without information gets a factor of one metre's worth, so that it does not move.
+    A direction without information gets the factor 1: its gradient is zero, so it does not move.
     """
     a, b, c, d, e, f = matrix
     tiny = 1e-12 * np.maximum(a + d + f, 1e-12)
@@ -274,10 +274,10 @@ def whiten(by_point: Array, lower: Array) -> Array:
     return out
 
 
-def _of_views(
+def _view_terms(
     structure: Structure, residual: Array, by_unknown: Array, cross: Array, half: Array
 ) -> tuple[Array, Array]:
-    """Return the sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of every view."""
+    """Return sum B^T B - sum Y^T Y (N, q, q) and sum B^T r - sum Y^T h (N, q) of each view."""
     q = cross.shape[2]
     matrix, gradient = np.empty((structure.num_views, q, q)), np.empty((structure.num_views, q))
     of_points = np.ascontiguousarray(half.T)
@@ -291,7 +291,7 @@ def _of_views(
 
 
 def _pair_blocks(structure: Structure, cross: Array) -> Array:
-    """Return (M, q, q): -sum Y_i^T Y_j of every pair of views."""
+    """Return the blocks -sum Y_i^T Y_j (M, q, q) of all pairs of views."""
     q = cross.shape[2]
     bounds = structure.pair_bounds
     out = np.empty((len(bounds) - 1, q, q))
@@ -299,7 +299,7 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
     while m < len(out):  # as many whole view pairs as fit the chunk, at least one
         stop = max(m + 1, int(np.searchsorted(bounds, bounds[m] + CHUNK, side="right")) - 1)
         base = bounds[m]
-        rows = slice(base, bounds[stop])  # "clip": indices are right, and unchecked they are taken faster
+        rows = slice(base, bounds[stop])  # "clip" is faster: it does not check the indices
         first = cross.take(structure.first[rows], axis=0, mode="clip").reshape(-1, q)
         second = cross.take(structure.second[rows], axis=0, mode="clip").reshape(-1, q)
         for n, (a, b) in enumerate(pairwise((3 * (bounds[m : stop + 1] - base)).tolist()), m):
@@ -309,6 +309,6 @@ def _pair_blocks(structure: Structure, cross: Array) -> Array:
 
 
 def _assemble(structure: Structure, diagonal: Array, pairs: Array) -> Matrix:
-    """Return the reduced matrix: a plain array of so few views that they are one front anyway."""
+    """Return the reduced matrix: a dense array if all views fit one front."""
     blocks = Blocks(diagonal, pairs, structure.pair_view)
     return blocks.plain() if len(diagonal) <= LEAF else blocks

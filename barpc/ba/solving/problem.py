@@ -27,16 +27,16 @@ from barpc.scene import BoolArray
 
 @dataclass(frozen=True)
 class Problem:
-    """Observations sorted by view, cameras, priors."""
+    """Observations, cameras and priors of an adjustment; observations are sorted by view."""
 
     cameras: Cameras  # N views with q unknowns each
-    structure: Structure  # who sees what
+    structure: Structure  # which view sees which point
     xy: Array  # (2, K) observed col, row [px]
-    camera_prior: CameraPrior  # on every view's unknowns
+    camera_prior: CameraPrior  # on the unknowns of single views
     free: BoolArray  # (N q,) false for the unknowns of fixed views
     joint_prior: JointPrior | None = None  # on several views together
-    point_prior: PointPrior | None = None  # GCPs and heights
-    _room: list[Projected] = field(default_factory=list, repr=False)
+    point_prior: PointPrior | None = None  # GCPs and heights; may have errors in common
+    _room: list[Projected] = field(default_factory=list, repr=False)  # reused by `linearise`
 
     def residuals(self, params: Array, points: Array) -> Array:
         """Return the residuals, projected - observed (2, K) [px], sorted by view."""
@@ -52,12 +52,12 @@ class Problem:
         return cost if self.point_prior is None else cost + self.point_prior.cost(points)
 
     def cost(self, params: Array, points: Array, whitened: Array) -> float:
-        """Return the whole sum of squares, of whitened residuals (2, K) and the priors'."""
+        """Return the sum of squares of whitened residuals (2, K) and of the residuals of all priors."""
         flat = whitened.ravel()
         return float(flat @ flat) + self.prior_cost(params, points)
 
     def linearise(self, params: Array, points: Array) -> Projected:
-        """Project all points with derivatives, for `reduce`; the next call may write over them."""
+        """Project all points with derivatives, for `reduce`; the next call may overwrite the result."""
         structure, out = self.structure, None
         if self.xy.shape[1] <= KEPT:
             if not self._room:
@@ -66,7 +66,7 @@ class Problem:
         return self.cameras.project(params, structure.of_points(points), structure.bounds, out=out)
 
     def prepare(self, params: Array, points: Array) -> tuple[Array, Projected | None]:
-        """Return the residuals (2, K) [px], and the result of `linearise` unless it is too large for `reduce`."""
+        """Return the residuals (2, K) [px], and the result of `linearise` (None: more than `KEPT` observations)."""
         if self.xy.shape[1] > KEPT:
             return self.residuals(params, points), None
         projected = self.linearise(params, points)
@@ -75,8 +75,8 @@ class Problem:
     def reduce(self, params: Array, points: Array, weight: Array, projected: Projected | None = None) -> Reduced:
         """Linearise at a state and eliminate the points.
 
-        `weight` (K,) is 1 / sigma of every observation [1/px], 0 for one that does not count; `projected` is
-        `linearise` of this state, and is used up.
+        `weight` (K,) is 1 / sigma of every observation [1/px], 0 for a rejected one. `projected` is the result of
+        `linearise` at this state; it is overwritten.
         """
         structure = self.structure
         projected = self.linearise(params, points) if projected is None else projected
@@ -99,12 +99,12 @@ class Problem:
         return self._add_joint(reduced, params)
 
     def project_points(self, params: Array, points: Array) -> Projected:
-        """Return the image points and their derivative by the points, for `triangulate`."""
+        """Return the image points and their derivatives by the ground points, for `triangulate`."""
         structure = self.structure
         return self.cameras.project(params, structure.of_points(points), structure.bounds, "points")
 
     def triangulate(self, points: Array, projected: Projected, weight: Array) -> Array:
-        """Move all points (P, 3) [m] by one Gauss-Newton step with the cameras held."""
+        """Return all points (P, 3) [m] after one Gauss-Newton step with fixed cameras."""
         matrix, gradient = self.point_terms(points)
         sums = self.structure.sum_points(point_products(projected.by_point, projected.image - self.xy, weight))
         lower = cholesky3(sums[:6] + matrix)
@@ -112,21 +112,21 @@ class Problem:
         return points - step.T
 
     def projected_off_points(self, projected: Projected, weight: Array) -> Callable[[Array], Array]:
-        """Return a function that takes residuals (2, K) [px] to those after the points have settled, to first order."""
+        """Return a function of residuals (2, K) [px] that subtracts the part the points can absorb, to first order."""
         structure, by_point = self.structure, projected.by_point
         sums = structure.sum_points(point_products(by_point * weight, np.zeros_like(projected.image))[:6])
         whitened = whiten(by_point, cholesky3(sums).take(structure.point, axis=1))
         counted = whitened * weight**2
 
-        def settled(residual: Array) -> Array:
+        def off_points(residual: Array) -> Array:
             half = structure.sum_points(counted[0] * residual[0] + counted[1] * residual[1])
-            moved: Array = (whitened * half.take(structure.point, axis=1)).sum(axis=1)
-            return residual - moved
+            absorbed: Array = (whitened * half.take(structure.point, axis=1)).sum(axis=1)
+            return residual - absorbed
 
-        return settled
+        return off_points
 
     def point_terms(self, points: Array) -> tuple[Array, Array]:
-        """Return the priors' part of the points' normal matrices (6, P) and gradients (3, P)."""
+        """Return the point prior's part of the normal matrices (6, P) and gradients (3, P) of the points."""
         matrix, gradient = np.zeros((6, len(points))), np.zeros((3, len(points)))
         prior = self.point_prior
         if prior is not None:
@@ -146,14 +146,14 @@ class Problem:
         return replace(reduced, matrix=reduced.with_joint(prior.index, prior.information), gradient=gradient)
 
     def counted_once(self, params: Array, points: Array, weight: Array) -> Problem:
-        """Return the problem with the joint prior without observations that it knows already, of `weight` (K,) [1/px].
+        """Return the problem whose joint prior lacks the information of the observations with `weight` (K,) [1/px].
 
-        These keep the information of their tie points with others: the cost of the others given them. That holds
-        for observations that the prior was not learnt from, too.
+        The prior contains them already: they would count twice. Other observations of the same tie points still add
+        the information that they have given these. The same holds for observations that the prior does not contain.
         """
         prior = self.joint_prior
         assert prior is not None
-        nothing = CameraPrior(self.camera_prior.mean, np.full_like(self.camera_prior.sigma, np.inf))
-        known = replace(self, camera_prior=nothing, joint_prior=None, _room=[]).reduce(params, points, weight)
-        matrix = known.plain(np.ones(len(self.free), dtype=bool))[np.ix_(prior.index, prior.index)]
-        return replace(self, joint_prior=prior.without(matrix, known.gradient[prior.index], params))
+        no_prior = CameraPrior(self.camera_prior.mean, np.full_like(self.camera_prior.sigma, np.inf))
+        contained = replace(self, camera_prior=no_prior, joint_prior=None, _room=[]).reduce(params, points, weight)
+        matrix = contained.plain(np.ones(len(self.free), dtype=bool))[np.ix_(prior.index, prior.index)]
+        return replace(self, joint_prior=prior.without(matrix, contained.gradient[prior.index], params))

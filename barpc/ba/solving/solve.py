@@ -1,13 +1,13 @@
 """Least squares of a `Problem` at fixed weights: scipy's `least_squares`, or a sparse Levenberg-Marquardt method.
 
-By default up to `SCIPY_UNKNOWNS` camera unknowns are minimised by `scipy.optimize.least_squares`, more of them by
-Gauss-Newton steps of the sparse system that are damped where one fails; a minimum that is only a stage of the robust
-rounds (a tolerance above `TOLERANCE`) always by the latter.
+By default `scipy.optimize.least_squares` minimises problems of up to `SCIPY_UNKNOWNS` camera unknowns. Larger ones are
+solved by sparse Gauss-Newton steps, damped only where a step fails. So are intermediate minima of the robust rounds,
+whose tolerance is above `TOLERANCE`.
 
-Both solve the joint least-squares problem of cameras AND points, whose points are eliminated. scipy sees it compressed:
+Both solve the joint least-squares problem of cameras and points, with the points eliminated. scipy gets it compressed:
 with S = U^T U the reduced matrix and g its gradient, f = (U^-T g, sqrt(cost - gain - |U^-T g|^2)) and J = (U; 0) have
 the cost, the gradient and the Gauss-Newton step of the full problem, in N q + 1 residuals. scipy's own tolerances end
-its iteration; the last thing that it evaluates is the linearisation at the minimum, which the covariance comes from.
+its iteration. The last evaluation is the linearisation at the minimum, from which the covariance is computed.
 """
 
 from __future__ import annotations
@@ -34,12 +34,10 @@ from barpc.base.statistics import CONVERGED, ITERATIONS, ROUNDING
 from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
-_told: ContextVar[Callable[[], None]] = ContextVar("told", default=lambda: None)  # before each minimisation
+_on_start: ContextVar[Callable[[], None]] = ContextVar("on_start", default=lambda: None)  # of each minimisation
 
-TOLERANCE = 1e-6  # a solve ends when a step would lower the cost by less than this fraction
-SCIPY_UNKNOWNS = (
-    200  # 22 views of nine: beyond, the dense products of `WhitenedProblem` take over a tenth of an adjustment
-)
+TOLERANCE = 1e-6  # a step that would lower the cost by less than this fraction is the last
+SCIPY_UNKNOWNS = 200  # 22 views of 9; with more, dense products of `WhitenedProblem` take over 10 % of the time
 
 
 @dataclass(frozen=True)
@@ -49,28 +47,28 @@ class State:
     params: Array  # (N, q) unknowns of the views
     points: Array  # (P, 3) ECEF [m]
     cost: float = np.inf  # sum of squared whitened residuals
-    history: tuple[float, ...] = ()  # the cost at every linearisation, and at the end of every pass, so far
+    history: tuple[float, ...] = ()  # cost at every linearisation so far, and at the end of every pass
 
     def moved(self, step: Array, reduced: Reduced, cost: float) -> State:
-        """Return the state after a step (N, q) of the cameras and the points' step that goes with it."""
+        """Return the state after a step (N, q) of the cameras and the corresponding step of the points."""
         points = self.points + reduced.point_step(step)
         return replace(self, params=self.params + step, points=points, cost=cost)
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """End of a minimisation."""
+    """Result of a minimisation."""
 
     state: State  # the minimum
     reduced: Reduced  # the last linearisation: at the minimum (scipy), or one small step before it
-    factor: Factor | None = None  # of its matrix, free unknowns only, where it was factorised
+    factor: Factor | None = None  # of its matrix, free unknowns only; None: not factorised
     status: str = ""  # which solver ran, and why it stopped
-    ahead: tuple[Array, Projected | None] | None = None  # `Problem.prepare` of the state, where that was asked
-    settled: bool = True  # or the number of steps was used up
-    _known: list[Covariance] = field(default_factory=list, repr=False)
+    ahead: tuple[Array, Projected | None] | None = None  # `Problem.prepare` at the state, if evaluated
+    settled: bool = True  # False: stopped at the maximum number of steps
+    _known: list[Covariance] = field(default_factory=list, repr=False)  # the covariance, once computed
 
     def covariance(self, free: BoolArray) -> Covariance:
-        """Return the posterior covariance by the last linearisation, computed once."""
+        """Return the posterior covariance from the last linearisation, computed once."""
         if not self._known:
             self._known.append(self._covariance(free))
         return self._known[0]
@@ -90,13 +88,13 @@ class Minimum:
 
 @contextmanager
 def passes_told(tell: Callable[[int], None]) -> Iterator[None]:
-    """Call `tell(n)` at the start of the n-th minimisation; how many there will be depends on the residuals."""
+    """Call `tell(n)` at the start of the n-th minimisation; their number depends on the residuals."""
     number = count(1)
-    token = _told.set(lambda: tell(next(number)))
+    token = _on_start.set(lambda: tell(next(number)))
     try:
         yield
     finally:
-        _told.reset(token)
+        _on_start.reset(token)
 
 
 def minimise(
@@ -109,16 +107,16 @@ def minimise(
 ) -> Minimum:
     """Minimise at fixed weights (K,) [1/px] from a state near the minimum.
 
-    The step that is expected to gain less than `tolerance` of the cost is taken and is the last, and so is one
-    that is expected to leave a thousandth of it (see `has_converged`). `solver` is "auto" or "sparse" (see
-    the head of this module). `projected` is `Problem.linearise` of the state, and is used up.
+    The last step is one that is expected to lower the cost by less than `tolerance` times the cost, or after which
+    the next would lower it by less than a thousandth of that (see `has_converged`). `solver` is "auto" or "sparse"
+    (see the module docstring). `projected` is the result of `Problem.linearise` at the state; it is overwritten.
 
     Raises
     ------
     AdjustError
         The cost is not finite, or no step lowers it.
     """
-    _told.get()()
+    _on_start.get()()
     start = time.process_time()
     unknowns, result = int(problem.free.sum()), None
     if solver == "auto":
@@ -137,34 +135,33 @@ def minimise(
 
 
 def has_converged(gain: float, before: float, cost: float, tolerance: float) -> bool:
-    """Return whether a step that should lower the cost by `gain`, after one by `before`, is the last.
+    """Return whether a step that should lower the cost by `gain`, after a step with `before`, is the last.
 
-    `cost` is that before the step, `tolerance` the share of it that does not matter. The gains shrink at least in the
-    proportion of the last two: what the step leaves is gain^2 / before. Without noise the cost is rounding alone: the
-    tolerance is a thousandth of a standard deviation at least.
+    `cost` is the cost before the step, `tolerance` its negligible fraction. Gains shrink at least in the ratio of the
+    last two, so the next one is at most gain^2 / before. A cost below 1 counts as 1: without noise it is only rounding.
     """
     cost = max(cost, 1.0)
     return gain <= tolerance * cost or gain * gain <= 1e-3 * tolerance * cost * before < np.inf
 
 
-def _is_as_told(cost: float, told: float, tolerance: float) -> bool:
-    """Return whether a step that leaves `cost` is the last, after which `told` should be left.
+def _is_as_predicted(cost: float, predicted: float, tolerance: float) -> bool:
+    """Return whether the cost after a step is so close to the predicted one that the step is the last.
 
-    What the residuals bend beyond their linearisation is all that a next step could mend, and it gains no more than
-    about twice what that adds to the cost: a hundredth of the tolerance.
+    A further step could only correct the nonlinearity of the residuals. It would lower the cost by at most about twice
+    the difference of the two costs: here a hundredth of the tolerance.
     """
-    return abs(cost - told) <= 5e-3 * tolerance * told
+    return abs(cost - predicted) <= 5e-3 * tolerance * predicted
 
 
 def gauss_newton(problem: Problem, state: State, weight: Array, projected: Projected | None = None) -> State:
-    """Take one undamped Gauss-Newton step, for rounds whose weights change anyway; `projected` as in `minimise`."""
+    """Return the state after one undamped step, for rounds that change the weights; `projected`: see `minimise`."""
     reduced = problem.reduce(state.params, state.points, weight, projected)
     step, gain, _ = camera_step(problem, reduced)
     return state.moved(step, reduced, max(_finite_cost(reduced.cost) - gain, 0.0))
 
 
 def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tuple[Array, float, Factor]:
-    """Return the Gauss-Newton step (N, q) of the cameras, its gain with the points', and the factor."""
+    """Return the Gauss-Newton step (N, q) of the cameras, the decrease of the cost it predicts, and the factor."""
     free = problem.free
     step = np.zeros(len(free))
     gradient = reduced.gradient[free]
@@ -178,7 +175,7 @@ def camera_step(problem: Problem, reduced: Reduced, damping: float = 0.0) -> tup
 def _levenberg_marquardt(
     problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None
 ) -> Minimum:
-    """Return Gauss-Newton steps, damped only when one fails."""
+    """Minimise by Gauss-Newton steps, damped only after one fails."""
     damping, before = 0.0, np.inf
     reduced = problem.reduce(state.params, state.points, weight, projected)
     state = replace(state, cost=_finite_cost(reduced.cost), history=(*state.history, reduced.cost))
@@ -194,17 +191,17 @@ def _levenberg_marquardt(
             return Minimum(ahead, reduced, None if damping else factor, status)
         residual, projected = problem.prepare(ahead.params, ahead.points)
         cost = problem.cost(ahead.params, ahead.points, residual * weight)
-        if not damping and _is_as_told(cost, ahead.cost, tolerance):
+        if not damping and _is_as_predicted(cost, ahead.cost, tolerance):
             status = _status(state, "the last step gained what it should")
             return Minimum(replace(ahead, cost=cost), reduced, factor, status, (residual, projected))
         if cost <= state.cost * (1.0 + 1e-12):
-            del reduced, factor  # of a large block no two fit
+            del reduced, factor  # two of a large block do not fit into memory
             reduced = problem.reduce(ahead.params, ahead.points, weight, projected)
             state = replace(ahead, cost=reduced.cost, history=(*state.history, reduced.cost))
             before = gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
             continue
-        # a cost does not fall any more where so little is promised, or what is tolerated and no damping makes it fall
+        # rounding: the predicted decrease is far below the tolerance, or below it and no damping lowers the cost
         if gain <= TOLERANCE * (CONVERGED if damping < 1e8 else 1.0) * state.cost:
             return Minimum(state, reduced, status=_status(state, "what a step gains is lost in rounding"))
         if damping >= 1e8:
@@ -218,9 +215,9 @@ def _status(state: State, reason: str) -> str:
 
 
 class WhitenedProblem:
-    """The problem as scipy sees it, in unknowns x = U0 p whitened by the first linearisation.
+    """The compressed problem for scipy, in unknowns x = U0 (p - p0) whitened by the first linearisation at p0.
 
-    In them the matrix is nearly the identity: the gradient's size is what a step would gain.
+    Their normal matrix is nearly the identity, so the squared norm of the gradient is the gain of a step.
     """
 
     def __init__(self, problem: Problem, state: State, weight: Array, projected: Projected | None) -> None:
@@ -235,6 +232,7 @@ class WhitenedProblem:
         self.lowest = self.key, self.state, self.reduced
 
     def _compress(self, upper: Array) -> None:
+        """Set the compressed residuals `whitened` and `rest` and their derivative `slope`, from S = U^T U."""
         gradient = self.reduced.gradient[self.problem.free]
         self.whitened = la.solve_triangular(upper, gradient, trans="T", check_finite=False)
         rest = self.reduced.cost - self.reduced.gain - float(self.whitened @ self.whitened)
@@ -242,15 +240,15 @@ class WhitenedProblem:
         self.slope = la.solve_triangular(self.upper0, upper.T, trans="T", check_finite=False).T
 
     def at(self, x: Array) -> None:
-        """Linearise at whitened unknowns, unless that was the last thing done.
+        """Linearise at whitened unknowns x, unless it is linearised there already.
 
-        Points are moved from the lowest cost so far: those of a step that failed may be anywhere.
+        Points start from the state of lowest cost so far: after a failed step they may be anywhere.
         """
         key = x.tobytes()
         if key == self.key:
             return
-        self.key, (known, state, reduced) = key, self.lowest
-        if key != known:
+        self.key, (lowest_key, state, reduced) = key, self.lowest
+        if key != lowest_key:
             step = np.zeros(self.start.size)
             step[self.problem.free] = la.solve_triangular(self.upper0, x, check_finite=False)
             state = state.moved(self.start + step.reshape(self.start.shape) - state.params, reduced, np.inf)
@@ -264,7 +262,7 @@ class WhitenedProblem:
         except np.linalg.LinAlgError:
             if key == self.lowest[0]:
                 raise
-            # a step so far astray that its matrix is rounding is refused for its cost, whatever its derivative
+            # scipy rejects so bad a step by its cost, whatever the derivative
             self.whitened, self.rest = np.zeros(len(x)), np.sqrt(reduced.cost)
             return
         self._compress(upper)
@@ -281,7 +279,7 @@ class WhitenedProblem:
 
 
 def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, projected: Projected | None) -> Minimum:
-    from scipy.optimize import least_squares  # a twentieth of a second, which large blocks do not need
+    from scipy.optimize import least_squares  # slow to import (0.05 s); large blocks do not need it
 
     compressed = WhitenedProblem(problem, state, weight, projected)
     found = least_squares(
@@ -289,12 +287,12 @@ def _scipy(problem: Problem, state: State, weight: Array, tolerance: float, proj
         np.zeros(len(compressed.whitened)),
         compressed.jacobian,
         method="trf",
-        x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # no first step cut short
-        tr_solver="lsmr",  # nearly the identity takes few products; "exact" decomposes it at every step
+        x_scale=10.0 * (1.0 + float(np.linalg.norm(compressed.whitened))),  # the first step is not shortened
+        tr_solver="lsmr",  # few products, J being nearly the identity; "exact": an SVD a step
         tr_options={"regularize": False, "atol": ROUNDING, "btol": ROUNDING},
         ftol=tolerance,
-        xtol=ROUNDING,  # no step lowers the cost any more
-        gtol=np.sqrt(tolerance),  # of whitened unknowns: a thousandth of a standard deviation for a millionth
+        xtol=ROUNDING,  # steps below rounding
+        gtol=np.sqrt(tolerance),  # for whitened unknowns, whose squared gradient is the gain of a step
         max_nfev=ITERATIONS,
     )
     compressed.at(found.x)

@@ -1,9 +1,9 @@
-"""The structure of a block: views by points, and the order in which views are eliminated, for every linearisation.
+"""The structure of a block: which view sees which point, and the elimination order of the views.
 
-The order is nested dissection (George 1973), so that little fills in. Views are tied to those beside them on the
-ground, or to those next in time where all see one place. A block is cut in two by the fewest views that touch all ties
-across a cut, each side is cut again, and what cuts is eliminated after what it parts. The factor of a square of n views
-then has n log n numbers and costs n^1.5 products; that of a strip, n both.
+The order is nested dissection (George 1973), which keeps the fill-in low. The edges of its graph join views that share
+points. The fewest views that touch every edge across a cut separate the block in two. Each side is cut again, and a
+separator is eliminated after both of its sides. For n views in a square arrangement the factor has O(n log n) numbers
+and costs O(n^1.5) products; for n views in one row, O(n) of both.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import scipy.sparse as sp
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, IntArray
 
-LEAF = 32  # views that are not cut any further
+LEAF = 32  # largest number of views that is not cut further
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Views eliminated together, and the views that this ties to each other."""
+    """Views eliminated together, and the later views that their elimination couples."""
 
     pivots: IntArray  # views, in the order of elimination
-    border: IntArray  # later ones that are tied to them by then, in that order
-    parent: int  # the front that has the first of these among its pivots; -1: none
+    border: IntArray  # later views coupled to the pivots by then, in the order of elimination
+    parent: int  # the front that has the first view of the border among its pivots; -1: none
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,15 +34,15 @@ class Dissection:
     """The order of elimination, front by front: children before their parents."""
 
     fronts: tuple[Front, ...]
-    rank: IntArray  # (N,) which comes when; -1 for one that is not eliminated
-    owner: IntArray  # (N,) the front whose pivot it is, or -1
+    rank: IntArray  # (N,) position of each view in the order; -1: not eliminated
+    owner: IntArray  # (N,) the front that has the view among its pivots; -1: not eliminated
 
 
 def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None = None) -> Dissection:
-    """Return the nested-dissection order of the views in `use` (N,), tied in `pairs` (M, 2), at `place` (N, 2).
+    """Return the nested-dissection order of the views in `use` (N,), at `place` (N, 2), with `pairs` (M, 2) as edges.
 
-    Views that are to come `last` (n,) are the last front, in the order given: its matrix is the reduced one of theirs
-    once all others are eliminated.
+    The views `last` (n,) form the last front, in the order given. Its matrix is their reduced matrix once all other
+    views are eliminated.
     """
     n = len(place)
     (i, j), own = pairs[use[pairs].all(axis=1)].astype(np.int32).T, np.arange(n, dtype=np.int32)
@@ -60,79 +60,77 @@ def dissect(pairs: IntArray, place: Array, use: BoolArray, last: IntArray | None
 
 
 def _fronts(graph: sp.csr_array, pieces: list[IntArray], rank: IntArray, owner: IntArray) -> list[Front]:
-    """Return the fronts of pieces in their order: a border has the unknowns tied to pivots or to fronts below."""
+    """Return the fronts of the pieces, in order; a border joins later neighbours of the pivots and child borders."""
     fronts: list[Front] = []
-    below: list[list[IntArray]] = [[] for _ in pieces]
+    child_borders: list[list[IntArray]] = [[] for _ in pieces]
     for number, piece in enumerate(pieces):
-        touched = np.concatenate([graph.indices[slice(*graph.indptr[v : v + 2])] for v in piece])
-        later = [views[rank[views] > rank[piece[-1]]] for views in (touched, *below[number])]
+        neighbours = np.concatenate([graph.indices[slice(*graph.indptr[v : v + 2])] for v in piece])
+        later = [views[rank[views] > rank[piece[-1]]] for views in (neighbours, *child_borders[number])]
         border = np.unique(np.concatenate(later).astype(np.int64))
         border = border[np.argsort(rank[border])]
         parent = int(owner[border[0]]) if len(border) else -1
         if len(border):
-            below[parent].append(border)
+            child_borders[parent].append(border)
         fronts.append(Front(piece, border, parent))
     return fronts
 
 
 def _dissect(graph: sp.csr_array, place: Array, views: IntArray, pieces: list[IntArray]) -> None:
-    """Append the views (n,) piece by piece: one side, the other, and their separator."""
+    """Append the views (n,) to `pieces`: one side, the other side, then their separator."""
     waiting = [(views, False)]
     while waiting:
-        piece, whole = waiting.pop()
-        parted = None if whole or len(piece) <= LEAF else _separator(graph, place, piece)
-        if parted is not None:
-            near, far, between = parted
+        piece, is_separator = waiting.pop()
+        split = None if is_separator or len(piece) <= LEAF else _separator(graph, place, piece)
+        if split is not None:
+            near, far, between = split
             waiting += [(between, True), (far, False), (near, False)]
         elif len(piece):
             pieces.append(piece)
 
 
 def _separator(graph: sp.csr_array, place: Array, views: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Return two sides of the views and the fewest between them; None where every cut leaves a side empty."""
+    """Return two sides of the views and their separator; None where every cut leaves a side empty."""
     own = graph[views][:, views]
     at = place[views]
     order, cut = min((best_cut(own, order) for order in _orders(own, at)), key=lambda found: found[2])[:2]
     if not cut:
         return None
     near, far = np.sort(order[:cut]), np.sort(order[cut:])
-    between = _touching(own, near, far)
+    between = _vertex_cover(own, near, far)
     narrow = int(np.argmin(np.ptp(at, axis=0)))
-    between = between[np.argsort(at[between, narrow], kind="stable")]  # neighbours stay neighbours
+    between = between[np.argsort(at[between, narrow], kind="stable")]  # views close together stay adjacent
     near, far = np.setdiff1d(near, between), np.setdiff1d(far, between)
     return views[near], views[far], views[between]
 
 
 def _orders(graph: sp.csr_array, place: Array) -> Iterator[IntArray]:
-    """Yield the orders of n views that a cut may part in two: by their parts, or along the ground and along
-    the ties.
-    """
-    from scipy.sparse.csgraph import breadth_first_order, connected_components  # of blocks that are cut alone
+    """Yield orders of n views to cut: by connected component, or else along each ground axis and by graph distance."""
+    from scipy.sparse.csgraph import breadth_first_order, connected_components  # slow to import
 
-    count, part = connected_components(graph, connection="strong")  # ties go both ways
+    count, part = connected_components(graph, connection="strong")  # the graph is symmetric
     if count > 1:
         yield np.argsort(part, kind="stable")
         return
     for axis in range(2):
         yield np.argsort(place[:, axis], kind="stable")
-    last = 0  # of an order from anywhere: as far as ties reach, or nearly (George and Liu 1979)
+    last = 0  # the farthest view, from the farthest view, from any view (George and Liu 1979)
     for _ in range(2):
         last = breadth_first_order(graph, last, return_predecessors=False)[-1]
     yield breadth_first_order(graph, last, return_predecessors=False).astype(np.int64)
 
 
 def best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float]:
-    """Return an order, how many of it stand before its best cut (0: there is none), and its cost.
+    """Return the order, the number of its views before the best cut (0: there is none), and the cost of that cut.
 
-    A cut that s views touch from one side, and that leaves a and b, costs s / (a b): few views, and balanced sides.
+    The cost is (s + 1) / (a b), for a separator of s views between sides of a and b: small separator, balanced sides.
     """
     n = len(order)
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
-    tied = rank[graph.indices]  # each view to itself, too
-    first, last = (ufunc.reduceat(tied, graph.indptr[:-1]) for ufunc in (np.minimum, np.maximum))
+    neighbour = rank[graph.indices]  # each view is its own neighbour, too
+    first, last = (ufunc.reduceat(neighbour, graph.indptr[:-1]) for ufunc in (np.minimum, np.maximum))
     cut, every = np.arange(1, n), np.arange(n)
-    # touched from before the cut, and from behind it
+    # number of views before each cut with neighbours behind it, and the reverse
     before = np.cumsum(np.bincount(every, minlength=n) - np.bincount(last, minlength=n))[:-1]
     behind = np.cumsum(np.bincount(first, minlength=n) - np.bincount(every, minlength=n))[:-1]
     fewest = np.minimum(before, behind)
@@ -142,31 +140,30 @@ def best_cut(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, int, float
     return order, int(cut[best]) if np.isfinite(cost[best]) else 0, float(cost[best])
 
 
-def _touching(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
-    """Return the fewest views that touch all ties between two sides (König's theorem)."""
+def _vertex_cover(graph: sp.csr_array, near: IntArray, far: IntArray) -> IntArray:
+    """Return the fewest views that touch all edges between two sides: the minimum vertex cover (König's theorem)."""
     across = graph[near][:, far]
     rows = np.flatnonzero(np.diff(across.indptr))
     cols = np.unique(across.indices)
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
     across = sp.csr_array(across[rows][:, cols])
-    of_col = _matching(across)
-    reached, by_tie = np.ones(len(rows), dtype=bool), np.zeros(len(cols), dtype=bool)
-    reached[of_col[of_col >= 0]] = False
-    new = np.flatnonzero(reached)
-    while len(new):  # along ties to the far side, along the matching back
+    row_of_col = _matching(across)
+    row_reached, col_reached = np.ones(len(rows), dtype=bool), np.zeros(len(cols), dtype=bool)
+    row_reached[row_of_col[row_of_col >= 0]] = False
+    new = np.flatnonzero(row_reached)
+    while len(new):  # alternating paths: along any edge to the far side, along a matched one back
         touched = np.unique(across[new].indices)
-        touched = touched[~by_tie[touched]]
-        by_tie[touched] = True
-        back = of_col[touched]
-        new = back[~reached[back]]
-        reached[new] = True
-    return np.concatenate([near[rows[~reached]], far[cols[by_tie]]])
+        touched = touched[~col_reached[touched]]
+        col_reached[touched] = True
+        back = row_of_col[touched]
+        new = back[~row_reached[back]]
+        row_reached[new] = True
+    return np.concatenate([near[rows[~row_reached]], far[cols[col_reached]]])
 
 
 def _matching(across: sp.csr_array) -> IntArray:
-    """Return the row that each column is matched with, or -1, as many as can be: a flow of one from each row
-    to a column.
+    """Return the row matched with each column (-1: none) in a maximum matching, found as a maximum flow.
 
     scipy's `maximum_bipartite_matching` takes time exponential in the depth of such graphs (scipy issue 26147).
     """
@@ -179,12 +176,12 @@ def _matching(across: sp.csr_array) -> IntArray:
     starts = np.concatenate([[0], rows + across.indptr[:-1], to_sink, [rows + ties + cols]])
     size = rows + cols + 2
     capacity = np.ones(len(indices), dtype=np.int32)
-    pipes = sp.csr_array((capacity, indices.astype(np.int32), starts.astype(np.int32)), shape=(size, size))
-    flow = maximum_flow(pipes, 0, size - 1).flow
-    back = flow[1 + rows : size - 1, 1 : 1 + rows].tocoo()  # less than nothing flows back along a tie
+    network = sp.csr_array((capacity, indices.astype(np.int32), starts.astype(np.int32)), shape=(size, size))
+    flow = maximum_flow(network, 0, size - 1).flow
+    reverse = flow[1 + rows : size - 1, 1 : 1 + rows].tocoo()  # the reverse of a used edge has flow -1
     out = np.full(cols, -1)
-    used = back.data < 0
-    out[back.row[used]] = back.col[used]
+    used = reverse.data < 0
+    out[reverse.row[used]] = reverse.col[used]
     return out
 
 
@@ -200,30 +197,30 @@ class Structure:
     by_point: IntArray  # (K,) observations sorted by point
     # (P + 1,) observations of point p are by_point[point_bounds[p] : point_bounds[p + 1]]
     point_bounds: IntArray
-    first: IntArray  # (Q,) pairs of observations of one point, sorted by their pair of views
-    second: IntArray  # (Q,)
+    first: IntArray  # (Q,) first observations of all pairs on one point; pairs are sorted by views
+    second: IntArray  # (Q,) their second observations
     pair_view: IntArray  # (M, 2) pairs of views i < j that share a point
     pair_bounds: IntArray  # (M + 1,) observation pairs of view pair m are pair_bounds[m] : pair_bounds[m + 1]
-    place: Array  # (N, 2) where each view stands on the ground, roughly
+    place: Array  # (N, 2) approximate position of each view on the ground
     _orders: dict[bytes, Dissection] = field(default_factory=dict, repr=False)
 
     def order(self, use: BoolArray) -> Dissection:
-        """Return the order of elimination of the views in use (N,), computed once."""
+        """Return the elimination order of the views in `use` (N,), computed once."""
         key = use.tobytes()
         if key not in self._orders:
             self._orders[key] = dissect(self.pair_view, self.place, use)
         return self._orders[key]
 
     def sum_points(self, rows: Array) -> Array:
-        """Return the sums (m, P) over every point's observations of rows (m, K)."""
+        """Return the sums (m, P) of rows (m, K) over the observations of each point."""
         return np.array([np.bincount(self.point, row, self.num_points) for row in rows])
 
     def of_points(self, points: Array) -> Array:
-        """Return the coordinates (3, K) of every observation's point, of points (P, 3)."""
+        """Return the coordinates (3, K) of the point of each observation, from points (P, 3)."""
         return np.ascontiguousarray(points.T).take(self.point, axis=1, mode="clip")
 
     def sum_views(self, rows: Array) -> Array:
-        """Return the sums (N, m) over every view's observations of rows (m, K)."""
+        """Return the sums (N, m) of rows (m, K) over the observations of each view."""
         out = np.zeros((self.num_views, len(rows)))
         filled = np.flatnonzero(np.diff(self.bounds))
         if len(filled):
@@ -239,7 +236,7 @@ def make_structure(
     place: Array | None = None,
     joined: IntArray | None = None,
 ) -> Structure:
-    """Return the structure of observations (K,) that are already sorted by view; all views `joined` are pairs, too."""
+    """Return the structure of observations (K,) sorted by view; any two of the views `joined` (n,) are a pair, too."""
     bounds = np.searchsorted(view, np.arange(num_views + 1))
     by_point, point_bounds = counting_sort(point, num_points)
     first, second = _observation_pairs(by_point, point_bounds)
@@ -270,14 +267,14 @@ def make_structure(
 
 
 def unknowns_of(views: IntArray, size: int) -> IntArray:
-    """Return the places (n q,) of the unknowns of views (n,), of `size` q each."""
+    """Return the indices (n q,) of the unknowns of views (n,), of q = `size` unknowns each."""
     return np.asarray((views[:, None] * size + np.arange(size)).ravel())
 
 
 def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """Return the stable order (n,) of keys 0 .. size - 1, and the start and end of each key's part (size + 1,).
+    """Return the stable order (n,) of keys 0 .. size - 1, and the bounds (size + 1,) of the range of each key.
 
-    Sixteen bits at a time, which numpy sorts by counting.
+    A radix sort: numpy sorts numbers of 16 bits by counting.
     """
     order = np.argsort(key.astype(np.uint16), kind="stable")
     for shift in range(16, size.bit_length(), 16):
@@ -286,7 +283,7 @@ def counting_sort(key: IntArray, size: int) -> tuple[IntArray, IntArray]:
 
 
 def _observation_pairs(by_point: IntArray, starts: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all pairs of observations of each point; views ascend within a point, so i < j in every pair."""
+    """Return all pairs of observations of each point; the first has the lower view."""
     length = np.diff(starts)
     first, second = [], []
     for n in np.unique(length[length > 1]):
