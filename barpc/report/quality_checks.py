@@ -261,12 +261,12 @@ def unseen_parts(run: Run, i: int) -> Iterator[UnseenPart]:
     count = (of_parts.stop - of_parts.start) // 2
     first = unknowns.in_waves.start + of_parts.start
     moved = adjustment.params[i, first : first + 2 * count].reshape(2, count)
-    for n in np.flatnonzero(np.isfinite(waves.strips[i, :, 1])).tolist():
+    for n in np.flatnonzero(np.isfinite(waves.steps[i, :, 1])).tolist():
         own = first + np.array([n, count + n])
         variance, axes = np.linalg.eigh(adjustment.covariance.view(i)[np.ix_(own, own)])
         if not np.sqrt(variance[1]) > max(LEAST_MOVED, 2.0 * np.sqrt(max(variance[0], 0.0))):
             continue  # seen from several sides
-        axis, start, stop = int(waves.strips[i, n, 0]), *waves.strips[i, n, 1:3]
+        axis, start, stop = int(waves.steps[i, n, 0]), *waves.steps[i, n, 1:3]
         along, across = axes[:, 1], axes[:, 0]
         if not abs(across[axis]) > _PARALLEL:
             continue

@@ -124,7 +124,7 @@ def bsplines(u: Array, count: int) -> Array:
 
 
 def profile(place: Array, start: Array, stop: Array, origin: Array, rate: Array) -> Array:
-    """Return the share of a strip's displacement at places [px] (see `RowSpline.strips`)."""
+    """Return the share of a step's displacement at places [px] (see `RowSpline.steps`)."""
     with np.errstate(invalid="ignore"):
         inside = (place >= start) & (place < stop)
         return np.asarray(np.where(inside, np.exp(-np.maximum((place - origin) * rate, 0.0)), 0.0))
@@ -140,7 +140,6 @@ class _Curved(Frozen):
     """Base of displacements by cubic B-splines along one image coordinate, `_axis`, of the corrected position."""
 
     _axis: ClassVar[int]
-    coeffs: Array
     _by_image: Callable[[Array], Array]  # the displacement (..., 2) [px] of points seen at (..., 2) [px]
     rate: Callable[[Array], Array]  # its derivative (..., 2) [px/px] by that coordinate (...)
 
@@ -160,10 +159,11 @@ class _Curved(Frozen):
         """Return where a model without it has points that are seen at (..., 2) [px]."""
         return image - self._by_image(image)
 
-    def _splined(self, u: Array, rate: bool) -> Array:
-        """Return the spline (..., 2) at u (...) in -1 .. 1, or its derivative by u."""
-        first, pieces = bspline_pieces(u.ravel(), len(self.coeffs), rate)
-        out = sum(piece[:, None] * self.coeffs[first + n] for n, piece in enumerate(pieces))
+    @staticmethod
+    def _splined(coeffs: Array, u: Array, rate: bool) -> Array:
+        """Return the spline (..., 2) of coefficients (M, 2) at u (...) in -1 .. 1, or its derivative by u."""
+        first, pieces = bspline_pieces(u.ravel(), len(coeffs), rate)
+        out = sum(piece[:, None] * coeffs[first + n] for n, piece in enumerate(pieces))
         return np.asarray(out).reshape(*u.shape, 2)
 
 
@@ -173,49 +173,50 @@ class RowSpline(_Curved):
 
     Parameters
     ----------
-    coeffs : (M, 2)
+    splines : (M, 2)
         Coefficients of uniform cubic B-splines over the rows, (col, row) [px]; M = 0: none, else at least 4.
     row_offset, row_scale : float, middle row, and rows from there to the ends of the knots [px]
-    edges : (C,), columns at which another detector begins [px], ascending
-    steps : (C + 1, 2), displacement of each detector, (col, row) [px]; without any detector (0, 2)
-    strips : (M, 5)
-        Displaced strips: axis (0: columns, 1: rows), first and last place, and origin and rate of their decay,
+    detector_edges : (C,), columns at which another detector begins [px], ascending
+    detector_steps : (C + 1, 2), displacement of each detector, (col, row) [px]; without any detector (0, 2)
+    steps : (M, 5)
+        Displaced columns or rows: axis (0: columns, 1: rows), first and last place, and origin and rate of the decay
         exp(-(x - origin) rate) [px, 1/px]; rate 0: none. They may overlap.
-    moved : (M, 2), displacement of each strip, (col, row) [px]; with a decay, at its origin
+    step_sizes : (M, 2), displacement of each step, (col, row) [px]; with a decay, at its origin
     periods : (M,), periods of the sinusoids over all rows [px]
-    swings : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
+    amplitudes : (M, 2, 2), amplitudes of cosine and sine of 2 pi row / period, (col, row) [px]
 
     Examples
     --------
-    >>> step = barpc.RowSpline(np.zeros((0, 2)), edges=[500.0], steps=[[0.0, 0.0], [0.2, 0.0]])
+    >>> step = barpc.RowSpline(np.zeros((0, 2)), detector_edges=[500.0], detector_steps=[[0.0, 0.0], [0.2, 0.0]])
     >>> step.apply(np.array([[100.0, 7.0], [600.0, 7.0]])).tolist()
     [[100.0, 7.0], [600.2, 7.0]]
     """
 
     _axis = 1
-    coeffs: Array
+    splines: Array
     row_offset: float = 0.0
     row_scale: float = 1.0
-    edges: Array = field(default_factory=lambda: np.zeros(0))
-    steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    strips: Array = field(default_factory=lambda: np.zeros((0, 5)))
-    moved: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    detector_edges: Array = field(default_factory=lambda: np.zeros(0))
+    detector_steps: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    steps: Array = field(default_factory=lambda: np.zeros((0, 5)))
+    step_sizes: Array = field(default_factory=lambda: np.zeros((0, 2)))
     periods: Array = field(default_factory=lambda: np.zeros(0))
-    swings: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    amplitudes: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
 
     def __post_init__(self) -> None:
-        shapes = (("coeffs", (None, 2)), ("edges", (None,)), ("steps", (None, 2)), ("strips", (None, 5)))
-        further = ("moved", (None, 2)), ("periods", (None,)), ("swings", (None, 2, 2))
+        shapes = (("splines", (None, 2)), ("detector_edges", (None,)), ("detector_steps", (None, 2)))
+        further = ("steps", (None, 5)), ("step_sizes", (None, 2)), ("periods", (None,)), ("amplitudes", (None, 2, 2))
         for name, shape in (*shapes, *further):
             self._array(name, shape, RpcError)
-        fine = np.isin(self.strips[:, 0], (0.0, 1.0)).all()
-        if len(self.strips) != len(self.moved) or not fine:
-            raise RpcError("strips: each has an axis (0 or 1), two ends, an origin, a rate and a displacement")
-        if len(self.periods) != len(self.swings) or not (self.periods > 0).all():
+        fine = np.isin(self.steps[:, 0], (0.0, 1.0)).all()
+        if len(self.steps) != len(self.step_sizes) or not fine:
+            raise RpcError("steps: each has an axis (0 or 1), two ends, an origin, a rate and a displacement")
+        if len(self.periods) != len(self.amplitudes) or not (self.periods > 0).all():
             raise RpcError("sinusoids: each has a period above 0 and amplitudes of its cosine and sine")
-        if 0 < len(self.coeffs) < 4:
-            raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.coeffs)}")
-        if len(self.steps) != (len(self.edges) + 1) * bool(len(self.edges)) or (np.diff(self.edges) <= 0).any():
+        if 0 < len(self.splines) < 4:
+            raise RpcError(f"a cubic spline has at least 4 coefficients, found {len(self.splines)}")
+        edges = self.detector_edges
+        if len(self.detector_steps) != (len(edges) + 1) * bool(len(edges)) or (np.diff(edges) <= 0).any():
             raise RpcError("detectors: their edges ascend, and there is one detector more than edges")
         if not (np.isfinite(self.row_offset) and np.isfinite(self.row_scale) and self.row_scale > 0):
             raise RpcError(f"spline rows: offset {self.row_offset}, scale {self.row_scale}")
@@ -223,16 +224,17 @@ class RowSpline(_Curved):
     @property
     def spacing(self) -> float:
         """Rows between knots [px]; NaN without a spline."""
-        return 2.0 * self.row_scale / (len(self.coeffs) - 3) if len(self.coeffs) else np.nan
+        return 2.0 * self.row_scale / (len(self.splines) - 3) if len(self.splines) else np.nan
 
     def at(self, image: Array) -> Array:
         """Return the displacement (..., 2) [px] of points seen at image points (..., 2) [px]."""
         out = self._along(image[..., 1], rate=False)
-        if len(self.steps):
-            out += self.steps[np.searchsorted(self.edges, image[..., 0], side="right").clip(0, len(self.edges))]
-        for strip, moved in zip(self.strips, self.moved, strict=True):
-            out += profile(image[..., int(strip[0])], *strip[1:])[..., None] * moved
-        for period, moves in zip(self.periods, self.swings, strict=True):
+        if len(self.detector_steps):
+            detector = np.searchsorted(self.detector_edges, image[..., 0], side="right")
+            out += self.detector_steps[detector.clip(0, len(self.detector_edges))]
+        for step, size in zip(self.steps, self.step_sizes, strict=True):
+            out += profile(image[..., int(step[0])], *step[1:])[..., None] * size
+        for period, moves in zip(self.periods, self.amplitudes, strict=True):
             out += np.moveaxis(sine_and_cosine(image[..., 1], period), 0, -1) @ moves
         return np.where(np.isfinite(image).all(axis=-1, keepdims=True), out, np.nan)
 
@@ -241,18 +243,18 @@ class RowSpline(_Curved):
     def rate(self, row: Array) -> Array:
         """Return its derivative by the row (..., 2) [px/px] at rows (...) [px]."""
         out = self._along(row, rate=True) / self.row_scale
-        for (axis, start, stop, origin, rate), moved in zip(self.strips, self.moved, strict=True):
+        for (axis, start, stop, origin, rate), size in zip(self.steps, self.step_sizes, strict=True):
             if axis == 1.0:
                 fading = ((row - origin) * rate > 0.0) * rate
-                out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * moved
-        for period, (by_cos, by_sin) in zip(self.periods, self.swings, strict=True):
+                out -= (profile(row, start, stop, origin, rate) * fading)[..., None] * size
+        for period, (by_cos, by_sin) in zip(self.periods, self.amplitudes, strict=True):
             cos, sin = sine_and_cosine(row, period)[..., None] * (2.0 * np.pi / period)
             out += cos * by_sin - sin * by_cos
         return out
 
     def _along(self, row: Array, rate: bool) -> Array:
         u = (np.asarray(row, dtype=np.float64) - self.row_offset) / self.row_scale
-        return self._splined(u, rate) if len(self.coeffs) else np.zeros((*u.shape, 2))
+        return self._splined(self.splines, u, rate) if len(self.splines) else np.zeros((*u.shape, 2))
 
 
 @dataclass(frozen=True)
@@ -262,7 +264,7 @@ class Splined(Displaced):
     Examples
     --------
     >>> rpc = barpc.read_rpc("data_samples/view_00.tif")
-    >>> step = barpc.RowSpline(np.zeros((0, 2)), edges=[500.0], steps=[[0.0, 0.0], [0.2, 0.0]])
+    >>> step = barpc.RowSpline(np.zeros((0, 2)), detector_edges=[500.0], detector_steps=[[0.0, 0.0], [0.2, 0.0]])
     >>> (barpc.Splined(rpc, step).project([5.4, 43.3, 120.0]) - rpc.project([5.4, 43.3, 120.0])).round(9).tolist()
     [0.2, 0.0]
     """
@@ -312,7 +314,8 @@ class ColumnSpline(_Curved):
         return self._along(col, rate=True) * (2.0 / self.width)
 
     def _along(self, col: Array, rate: bool) -> Array:
-        return self._splined((np.asarray(col, dtype=np.float64) + self.start + 0.5) * (2.0 / self.width) - 1.0, rate)
+        of_line = np.asarray(col, dtype=np.float64) + self.start + 0.5
+        return self._splined(self.coeffs, of_line * (2.0 / self.width) - 1.0, rate)
 
 
 @dataclass(frozen=True)

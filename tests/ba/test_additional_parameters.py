@@ -30,7 +30,7 @@ def test_unknowns_of_another_layout_are_gone_on_from_where_they_are_the_same() -
     """Splines of as many, strips and one more, swings of as many; detectors are asked again."""
     strips, edges = np.zeros((2, 2, 5)), np.zeros((2, 1))
     known = AdditionalParameters(9, edges, strips[:, :1], np.zeros((2, 1)))
-    more = replace(known, strips=strips)
+    more = replace(known, steps=strips)
     params = np.random.default_rng(0).normal(size=(2, known.size))
     found = more.carried(params, known)
     for kind in (0, 3):
@@ -40,7 +40,7 @@ def test_unknowns_of_another_layout_are_gone_on_from_where_they_are_the_same() -
     np.testing.assert_array_equal(found[:, more.kinds[2]].T, [col, 0.0 * col, row, 0.0 * row])
     assert not replace(known, count=11).carried(params, known)[:, : 2 * 8].any()
     assert not AdditionalParameters(0, periods=np.zeros((2, 2))).carried(params, known).any()
-    assert not AdditionalParameters(0, strips=strips).carried(params[:, known.kinds[0]], AdditionalParameters(9)).any()
+    assert not AdditionalParameters(0, steps=strips).carried(params[:, known.kinds[0]], AdditionalParameters(9)).any()
 
 
 PERIODS = np.array([[200.0, 31.5], [np.inf, np.inf], [700.0, np.inf]])
@@ -99,7 +99,7 @@ def test_a_view_without_edges_has_no_steps_and_one_with_fewer_its_own() -> None:
     params = np.array([0.5, -0.25])
     for view, edges in ((0, [5.0, 9.0]), (1, [7.0]), (2, [])):
         made = waves.correction(params, view, 0.0, 1.0)
-        assert made.edges.tolist() == edges
+        assert made.detector_edges.tolist() == edges
         moved = made.at(np.column_stack([col[:4], np.zeros(4)]))
         expected = np.outer(basis[0, 4 * view : 4 * view + 4], params)
         np.testing.assert_allclose(moved, expected, atol=1e-12)

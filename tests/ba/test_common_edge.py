@@ -92,7 +92,7 @@ def test_all_images_are_displaced_by_the_same_at_a_common_edge() -> None:
 
 def places(*rows: tuple[float, float]) -> AdditionalParameters:
     """Additional parameters of views with a part each: (axis, start)."""
-    return AdditionalParameters(0, strips=np.array([[[axis, at, 1200.0, 0.0, 0.0]] for axis, at in rows]))
+    return AdditionalParameters(0, steps=np.array([[[axis, at, 1200.0, 0.0, 0.0]] for axis, at in rows]))
 
 
 def test_only_columns_from_the_same_place_in_all_images_are_alike() -> None:

@@ -129,9 +129,9 @@ def test_terms_that_were_found_are_estimated_with_the_cameras_and_all_ties_come_
     (term,) = found.findings
     waves = waves_of(found)
     assert waves is not None
-    own = waves.strips[1, 0] if term.kind == "step" else waves.periods[1]
+    own = waves.steps[1, 0] if term.kind == "step" else waves.periods[1]
     np.testing.assert_array_equal(own, term.where if term.kind == "step" else [term.period])
-    assert np.isinf(waves.strips[[0, 2]]).all()
+    assert np.isinf(waves.steps[[0, 2]]).all()
     assert np.isinf(waves.periods[[0, 2]]).all()
     assert found.outcome.inlier.mean() > max(0.99, one.found.outcome.inlier.mean())
     # to check tracks a part of the rows is one of wrong matches, a sinusoid is not
@@ -284,11 +284,11 @@ def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> Non
     layout = image_terms._layout_of(parts, 4)
     waves, params = layout.waves, layout.start
     assert params is not None
-    assert (waves.count, waves.edges.shape, waves.strips.shape) == (0, (4, 0), (4, 2, 5))
-    np.testing.assert_array_equal(waves.strips[2], [rows, decay])
-    np.testing.assert_array_equal(waves.strips[1, 0], decay)
-    assert np.isinf(waves.strips[[0, 3]]).all()
-    assert np.isinf(waves.strips[1, 1]).all()
+    assert (waves.count, waves.edges.shape, waves.steps.shape) == (0, (4, 0), (4, 2, 5))
+    np.testing.assert_array_equal(waves.steps[2], [rows, decay])
+    np.testing.assert_array_equal(waves.steps[1, 0], decay)
+    assert np.isinf(waves.steps[[0, 3]]).all()
+    assert np.isinf(waves.steps[1, 1]).all()
     np.testing.assert_array_equal(waves.periods, [[50.0], [np.inf], [np.inf], [np.inf]])
     # columns of all strips, then rows; of sinusoids too
     np.testing.assert_array_equal(params[2], [1, 7, 2, 8, 0, 0, 0, 0])

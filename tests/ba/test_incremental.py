@@ -45,14 +45,14 @@ def test_a_prior_is_read_as_it_was_written(tmp_path) -> None:
 
 def test_strips_are_read_as_they_were_written_and_a_new_view_has_none(tmp_path) -> None:
     strips = np.random.default_rng(3).uniform(0.0, 9.0, (2, 3, 5))
-    replace(prior_of(), layout=AdditionalParameters(0, strips=strips)).save(tmp_path / "prior.npz")
+    replace(prior_of(), layout=AdditionalParameters(0, steps=strips)).save(tmp_path / "prior.npz")
     found = BlockPrior.load(tmp_path / "prior.npz").waves(("c", "new", "a"))
     assert found is not None
-    np.testing.assert_array_equal(found.strips[[2, 0]], strips)
-    assert np.isinf(found.strips[1]).all()
+    np.testing.assert_array_equal(found.steps[[2, 0]], strips)
+    assert np.isinf(found.steps[1]).all()
     assert found.size == 6
     for damaged in (strips[:1], strips[..., :4], strips[0]):
-        replace(prior_of(), layout=AdditionalParameters(0, strips=damaged)).save(tmp_path / "prior.npz")
+        replace(prior_of(), layout=AdditionalParameters(0, steps=damaged)).save(tmp_path / "prior.npz")
         with pytest.raises(InputError, match="not the prior of an adjusted block"):
             BlockPrior.load(tmp_path / "prior.npz")
 

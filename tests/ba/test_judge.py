@@ -80,10 +80,10 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
     assert found.inlier[inside & ~found.held_out].mean() > 0.9
     sensor = found.sensors[one.view]
     assert isinstance(sensor, Splined)
-    assert len(sensor.correction.strips) == 1
+    assert len(sensor.correction.steps) == 1
     assert np.sqrt((found.residuals[inside & ~found.held_out] ** 2).sum(axis=1).mean()) < 0.16
     others = [s for v, s in enumerate(found.sensors) if v != one.view]
-    assert not any(isinstance(s, Splined) and s.correction.moved.any() for s in others)
+    assert not any(isinstance(s, Splined) and s.correction.step_sizes.any() for s in others)
 
 
 @pytest.mark.nightly

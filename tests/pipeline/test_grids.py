@@ -354,7 +354,7 @@ def test_what_is_added_to_the_rpc_of_a_displaced_camera_is_of_no_altitude(inner)
     if inner:
         bent = ColumnSpline(camera.size[0], np.random.default_rng(1).normal(0, 0.3, (12, 2)))
         model = replace(model, sensor=Calibrated(camera.rpc, bent))
-    model = Splined(model, RowSpline(np.zeros((0, 2)), periods=[9000.0], swings=[[[0.5, 0.35], [-0.35, 0.5]]]))
+    model = Splined(model, RowSpline(np.zeros((0, 2)), periods=[9000.0], amplitudes=[[[0.5, 0.35], [-0.35, 0.5]]]))
     sample = grids.Sample.of(model, camera.size, camera.alt_range)
     options = FitOptions(method="gauss-newton")
     followed = fit_rpc(model, camera.size, camera.alt_range, options=options, strict=False).rpc

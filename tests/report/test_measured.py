@@ -390,10 +390,10 @@ def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps():
     assert both["detectors"] == (100.0, 200.0)
     alone = _image_correction_entry(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
     assert set(alone) == {"detector_px", "detectors"}
-    strips = {"strips": np.zeros((2, 5)), "moved": np.array([[3.0, 4.0], [0.0, 1.0]])}
+    strips = {"steps": np.zeros((2, 5)), "step_sizes": np.array([[3.0, 4.0], [0.0, 1.0]])}
     swings = {
         "periods": np.array([90.0, 70.0]),
-        "swings": np.array([[[0.3, 0.0], [0.0, 0.4]], [[0.0, 0.0], [1.2, 0.0]]]),
+        "amplitudes": np.array([[[0.3, 0.0], [0.0, 0.4]], [[0.0, 0.0], [1.2, 0.0]]]),
     }
     found = _image_correction_entry(RowSpline(np.zeros((0, 2)), **strips, **swings))
     assert found["step_px"] == pytest.approx(np.sqrt(26.0 / 2.0))

@@ -48,7 +48,7 @@ def test_points_are_seen_where_they_are_projected_plus_the_displacement() -> Non
 
 
 def test_a_detector_begins_at_its_edge() -> None:
-    spline = RowSpline(np.zeros((0, 2)), edges=[100.0], steps=[[0.0, 0.0], [0.5, -0.5]])
+    spline = RowSpline(np.zeros((0, 2)), detector_edges=[100.0], detector_steps=[[0.0, 0.0], [0.5, -0.5]])
     found = spline.at(np.array([[99.9, 7.0], [100.0, 7.0], [np.nan, 7.0]]))
     np.testing.assert_array_equal(found, [[0.0, 0.0], [0.5, -0.5], [np.nan, np.nan]])
     assert np.isnan(spline.spacing)
@@ -82,7 +82,7 @@ MOVED = [[0.5, -0.25], [0.0, 0.125], [2.0, 1.0]]
 
 
 def test_strips_move_what_is_seen_in_them_and_add_up() -> None:
-    spline = RowSpline(np.zeros((0, 2)), strips=STRIPS[:2], moved=MOVED[:2])
+    spline = RowSpline(np.zeros((0, 2)), steps=STRIPS[:2], step_sizes=MOVED[:2])
     image = np.array([[800.0, 3999.9], [800.0, 4000.0], [699.0, 8999.9], [699.0, 9000.0], [np.nan, 5000.0]])
     expected = [[0.0, 0.0], [0.5, -0.25], [0.5, -0.125], [0.0, 0.125], [np.nan, np.nan]]
     np.testing.assert_array_equal(spline.at(image), expected)
@@ -92,7 +92,7 @@ def test_strips_move_what_is_seen_in_them_and_add_up() -> None:
 @pytest.mark.parametrize("rate", [1e-3, -2e-3])
 def test_what_fades_begins_at_its_origin_and_has_its_rate(rate: float) -> None:
     strip = [[1.0, -20.0, 19100.0, 9000.0, rate]]
-    spline = RowSpline(np.zeros((0, 2)), strips=strip, moved=MOVED[2:])
+    spline = RowSpline(np.zeros((0, 2)), steps=strip, step_sizes=MOVED[2:])
     away = np.sign(rate) * np.array([-500.0, 0.0, 1.0 / abs(rate), 3000.0])
     image = np.column_stack([away * 0.0, 9000.0 + away])
     factor = np.exp(-np.maximum(away * rate, 0.0))
@@ -104,7 +104,7 @@ def test_what_fades_begins_at_its_origin_and_has_its_rate(rate: float) -> None:
 
 
 def test_a_camera_behind_strips_is_the_same_both_ways_and_has_its_jacobian() -> None:
-    model = Splined(make_rpc(), RowSpline(COEFFS, 9499.5, 9500.0, strips=STRIPS, moved=MOVED))
+    model = Splined(make_rpc(), RowSpline(COEFFS, 9499.5, 9500.0, steps=STRIPS, step_sizes=MOVED))
     image = np.array([[3000.0, 5000.0], [300.0, 350.0], [12000.0, 17000.0], [600.0, 8000.0]])
     ground = model.localize(image, np.full(4, 300.0))
     np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
@@ -123,11 +123,11 @@ def test_a_swing_without_a_period_is_none() -> None:
 
 
 def test_swings_repeat_themselves_and_have_their_slope() -> None:
-    spline = RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], swings=SWINGS)
+    spline = RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], amplitudes=SWINGS)
     row = np.array([0.0, 17.0, 1234.5])
     image = np.column_stack([row * 0.0 + 5.0, row])
     np.testing.assert_allclose(spline.at(image), spline.at(image + [0.0, 3600.0]), atol=1e-12)
-    alone = RowSpline(np.zeros((0, 2)), periods=[400.0], swings=SWINGS[:1])
+    alone = RowSpline(np.zeros((0, 2)), periods=[400.0], amplitudes=SWINGS[:1])
     expected = np.column_stack([0.1 * np.cos(2 * np.pi * row / 400.0), -0.2 * np.sin(2 * np.pi * row / 400.0)])
     np.testing.assert_allclose(alone.at(image), expected, atol=1e-12)
     slope = (spline.at(image + [0.0, 0.01]) - spline.at(image - [0.0, 0.01])) / 0.02
@@ -135,7 +135,7 @@ def test_swings_repeat_themselves_and_have_their_slope() -> None:
 
 
 def test_a_camera_behind_swings_is_the_same_both_ways_and_has_its_jacobian() -> None:
-    model = Splined(make_rpc(), RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], swings=SWINGS))
+    model = Splined(make_rpc(), RowSpline(np.zeros((0, 2)), periods=[400.0, 90.0], amplitudes=SWINGS))
     image = np.array([[3000.0, 5000.0], [300.0, 350.0], [12000.0, 17000.0]])
     ground = model.localize(image, np.full(3, 300.0))
     np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
@@ -148,20 +148,20 @@ def test_a_camera_behind_swings_is_the_same_both_ways_and_has_its_jacobian() -> 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"coeffs": np.zeros((3, 2))},
-        {"coeffs": np.zeros((5, 3))},
-        {"coeffs": COEFFS, "row_scale": 0.0},
-        {"coeffs": COEFFS, "edges": [5.0], "steps": [[0.0, 0.0]]},
-        {"coeffs": COEFFS, "edges": [5.0, 5.0], "steps": np.zeros((3, 2))},
-        {"coeffs": COEFFS, "steps": np.zeros((1, 2))},
-        {"coeffs": COEFFS * np.nan},
-        {"coeffs": COEFFS, "strips": STRIPS, "moved": MOVED[:2]},
-        {"coeffs": COEFFS, "strips": [[2.0, 0.0, 1.0, 0.0, 0.0]], "moved": MOVED[:1]},
-        {"coeffs": COEFFS, "strips": [[1.0, 0.0, np.inf, 0.0, 0.0]], "moved": MOVED[:1]},
-        {"coeffs": COEFFS, "strips": [[1.0, 0.0, 1.0]], "moved": MOVED[:1]},
-        {"coeffs": COEFFS, "periods": [300.0], "swings": np.zeros((2, 2, 2))},
-        {"coeffs": COEFFS, "periods": [0.0], "swings": np.zeros((1, 2, 2))},
-        {"coeffs": COEFFS, "periods": [np.inf], "swings": np.zeros((1, 2, 2))},
+        {"splines": np.zeros((3, 2))},
+        {"splines": np.zeros((5, 3))},
+        {"splines": COEFFS, "row_scale": 0.0},
+        {"splines": COEFFS, "detector_edges": [5.0], "detector_steps": [[0.0, 0.0]]},
+        {"splines": COEFFS, "detector_edges": [5.0, 5.0], "detector_steps": np.zeros((3, 2))},
+        {"splines": COEFFS, "detector_steps": np.zeros((1, 2))},
+        {"splines": COEFFS * np.nan},
+        {"splines": COEFFS, "steps": STRIPS, "step_sizes": MOVED[:2]},
+        {"splines": COEFFS, "steps": [[2.0, 0.0, 1.0, 0.0, 0.0]], "step_sizes": MOVED[:1]},
+        {"splines": COEFFS, "steps": [[1.0, 0.0, np.inf, 0.0, 0.0]], "step_sizes": MOVED[:1]},
+        {"splines": COEFFS, "steps": [[1.0, 0.0, 1.0]], "step_sizes": MOVED[:1]},
+        {"splines": COEFFS, "periods": [300.0], "amplitudes": np.zeros((2, 2, 2))},
+        {"splines": COEFFS, "periods": [0.0], "amplitudes": np.zeros((1, 2, 2))},
+        {"splines": COEFFS, "periods": [np.inf], "amplitudes": np.zeros((1, 2, 2))},
     ],
 )
 def test_what_is_no_spline_is_refused(wrong: dict[str, object]) -> None:

@@ -30,6 +30,7 @@ PRIOR_KIND = replace(ARRAYS, words="the prior of an adjusted block")
 _SPARSE_ARRAYS = ("diagonal", "pairs", "pair_view")
 _OPTIONAL = ("told", "shown", "written")
 _SCENE_FIELDS = ("by_unknown", "own", "radius")
+_LAYOUT_KEYS = {"steps": "strips"}  # names in files, where they are not those of the fields
 _FACTOR_BYTES = 1e8  # bytes of the factor of a whole block to keep in memory; the rest goes to a temporary file
 
 
@@ -107,7 +108,8 @@ class BlockPrior:
 
     def save(self, path: Path) -> None:
         """Write the prior to an .npz file."""
-        arrays = {name: getattr(self, name) for name in ("params", "center")} | self._layout.of_views
+        arrays = {name: getattr(self, name) for name in ("params", "center")}
+        arrays |= {_LAYOUT_KEYS.get(name, name): one for name, one in self._layout.of_views.items()}
         if isinstance(self.information, np.ndarray):
             arrays["information"] = self.information
         else:
@@ -141,7 +143,8 @@ class BlockPrior:
             params = file["params"]
             matrix = file["information"] if "information" in file else _read_blocks(file, len(params))
             less = None if "information" in file else file["less"]
-            of_views = {name: file.get(name, np.zeros((len(names), *shape))) for name, shape in OF_VIEWS.items()}
+            empty = {name: np.zeros((len(names), *shape)) for name, shape in OF_VIEWS.items()}
+            of_views = {name: file.get(_LAYOUT_KEYS.get(name, name), none) for name, none in empty.items()}
             layout = AdditionalParameters(int(file.get("splines", 0)), **of_views)
             known = str(file["model"]), int(file["drift"]), params, matrix, file["center"], less
             scene = None

@@ -21,7 +21,7 @@ from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_an
 
 MIN_SPLINES = 7  # fewest splines of an image
 FIRST_SIGMA = 1.0  # px: prior standard deviation before variances are estimated
-OF_VIEWS = {"edges": (0,), "strips": (0, 5), "periods": (0,)}  # arrays with a row per view -> shape of an empty row
+OF_VIEWS = {"edges": (0,), "steps": (0, 5), "periods": (0,)}  # arrays with a row per view -> shape of an empty row
 DRIFTS = 3  # polynomials in the row (constant, linear, quadratic) to which splines are orthogonal
 
 
@@ -32,8 +32,8 @@ class AdditionalParameters:
     count: int  # B-splines over the rows of an image; 0: none
     # (N, C) first columns of further detectors [px], ascending; infinite where a view has fewer
     edges: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # (N, M, 5) displaced parts, as `RowSpline.strips`; infinite where a view has fewer
-    strips: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
+    # (N, M, 5) displaced parts, as `RowSpline.steps`; infinite where a view has fewer
+    steps: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (N, M) periods of the sinusoids over the rows [px]; infinite where a view has fewer
     periods: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -51,7 +51,7 @@ class AdditionalParameters:
     @property
     def alike(self) -> IntArray:
         """Indices of displaced parts that are the same columns in all images: they share one displacement."""
-        places = self.strips
+        places = self.steps
         same = np.isfinite(places).all(axis=(0, 2)) & (places == places[:1]).all(axis=(0, 2)) & (len(places) > 1)
         return np.flatnonzero(same & (places[:1, :, 0] == 0.0).all(axis=0))
 
@@ -71,7 +71,7 @@ class AdditionalParameters:
         own = self.of_views.values()
         return (
             [one.ndim for one in own] == [2, 3, 2]
-            and self.strips.shape[2] == 5
+            and self.steps.shape[2] == 5
             and all(len(one) == views and one.dtype == np.float64 for one in own)
             and bool((self.periods > 0.0).all())
             and (self.count == 0 or 4 <= self.count <= size)
@@ -105,7 +105,7 @@ class AdditionalParameters:
         return (
             self._spline_basis.shape[1],
             self._step_basis.shape[1],
-            self.strips.shape[1],
+            self.steps.shape[1],
             2 * self.periods.shape[1],
         )
 
@@ -155,8 +155,8 @@ class AdditionalParameters:
         if self.edges.shape[1]:
             steps = self._step_basis.T[:, (seen[0][:, None] >= self.edges[index]).sum(axis=1)]
             found.append(steps * np.isfinite(self.edges[index, 0]))
-        if self.strips.shape[1]:
-            axis, *shape = np.moveaxis(self.strips, -1, 0)[:, index]  # (n, M) each
+        if self.steps.shape[1]:
+            axis, *shape = np.moveaxis(self.steps, -1, 0)[:, index]  # (n, M) each
             found.append(profile(np.where(axis == 0.0, seen[0][:, None], seen[1][:, None]), *shape).T)
         if self.periods.shape[1]:
             found.append(np.concatenate(list(sine_and_cosine(seen[1][:, None], self.periods[index])), axis=1).T)
@@ -181,16 +181,16 @@ class AdditionalParameters:
 
     def correction(self, params: Array, view: int, row_offset: float, row_scale: float) -> RowSpline:
         """Return the image correction of a view with unknowns (size,); rows are normalised by offset and scale."""
-        splines, steps, displacements, amplitudes = (params[part].reshape(2, -1).T for part in self.kinds)
-        edges, strips, periods = (one[view] for one in self.of_views.values())
-        in_edges, in_part, in_period = np.isfinite(edges), np.isfinite(strips[:, 1]), np.isfinite(periods)
+        splines, detectors, displacements, amplitudes = (params[part].reshape(2, -1).T for part in self.kinds)
+        edges, steps, periods = (one[view] for one in self.of_views.values())
+        in_edges, in_part, in_period = np.isfinite(edges), np.isfinite(steps[:, 1]), np.isfinite(periods)
         return RowSpline(
             self._spline_basis @ splines,
             row_offset,
             row_scale,
             edges[in_edges],
-            (self._step_basis @ steps)[: in_edges.sum() + in_edges.any()],
-            strips[in_part],
+            (self._step_basis @ detectors)[: in_edges.sum() + in_edges.any()],
+            steps[in_part],
             displacements[in_part],
             periods[in_period],
             amplitudes.reshape(2, -1, 2).swapaxes(0, 1)[in_period],  # sinusoid, cosine or sine, coordinate

@@ -99,7 +99,7 @@ class JointPrior:
         if not len(waves.alike):
             return None
         first = size - waves.size + waves.kinds[2].start
-        own = first + np.concatenate([waves.alike, waves.alike + waves.strips.shape[1]])
+        own = first + np.concatenate([waves.alike, waves.alike + waves.steps.shape[1]])
         of_view = np.zeros(size)
         of_view[own] = ALIKE_SIGMA**-2.0
         information = np.asarray(np.kron(np.eye(views) - 1.0 / views, np.diag(of_view)), np.float64)

@@ -93,8 +93,8 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
     for at in steps:
         one = findings[at]
-        n = int((waves.strips[one.view] == one.where).all(axis=1).argmax())
-        own = first + np.array([n, waves.strips.shape[1] + n])
+        n = int((waves.steps[one.view] == one.where).all(axis=1).argmax())
+        own = first + np.array([n, waves.steps.shape[1] + n])
         known = np.linalg.inv(covariance.view(one.view)[np.ix_(own, own)])
         pull = known @ found.final.params[one.view, own]  # of tie points alone: the prior has mean zero
         known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
@@ -232,7 +232,7 @@ def _solve_with(
     block, waves, start = parts.inner, layout.waves, layout.start
     outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
     if unknowns.waves is not None:  # selected terms stay
-        waves = replace(waves, strips=unknowns.waves.strips, periods=unknowns.waves.periods)
+        waves = replace(waves, steps=unknowns.waves.steps, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
     bent = make_problem(block, options, unknowns.center, None, drift, waves)
     bent = bent if held is None else replace(bent, joint_prior=held)

@@ -185,16 +185,17 @@ def _image_correction_entry(spline: RowSpline | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if spline is None:
         return found
-    if len(spline.coeffs):
+    if len(spline.splines):
         rows = spline.row_offset + spline.row_scale * np.linspace(-1, 1, _SPLINE_ROWS)
-        along = RowSpline(spline.coeffs, spline.row_offset, spline.row_scale).at(np.column_stack([rows, rows]))
+        along = RowSpline(spline.splines, spline.row_offset, spline.row_scale).at(np.column_stack([rows, rows]))
         found |= {"jitter_px": _rms_size(along), "jitter_rows": spline.spacing}
+    if len(spline.detector_steps):
+        edges = tuple((spline.detector_edges + 0.5).tolist())
+        found |= {"detector_px": _rms_size(spline.detector_steps), "detectors": edges}
     if len(spline.steps):
-        found |= {"detector_px": _rms_size(spline.steps), "detectors": tuple((spline.edges + 0.5).tolist())}
-    if len(spline.strips):
-        found["step_px"] = _rms_size(spline.moved)
-    if len(spline.swings):
-        size = float(np.sqrt((spline.swings**2).sum()))  # of all together
+        found["step_px"] = _rms_size(spline.step_sizes)
+    if len(spline.amplitudes):
+        size = float(np.sqrt((spline.amplitudes**2).sum()))  # of all together
         found |= {"sinusoid_px": size, "sinusoid_rows": tuple(spline.periods.tolist())}
     return found
 
