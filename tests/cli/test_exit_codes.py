@@ -53,7 +53,7 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     few += [row for row in rows if row.startswith("view_02")][:20]
     (tmp_path / "few.csv").write_text("\n".join([head, *few]))
     said = command("adjust", *pristine, "--matches", tmp_path / "few.csv", "--matches-only", "-o", tmp_path / "out")
-    assert_told(said, "1 image needs review", "view_02: weakly connected")
+    assert_told(said, "1 of 3 images needs review", "view_02: weakly connected")
 
 
 def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # noqa: F811

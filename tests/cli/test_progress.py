@@ -82,7 +82,7 @@ def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:  # noq
                 shown += part
     os.close(screen)
     lines = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.decode()).splitlines()
-    assert any(line.startswith(("The cameras of both", "2 images need")) for line in lines), lines[-5:]
+    assert any(line.startswith(("The cameras of both", "2 of 2 images need")) for line in lines), lines[-8:]
 
 
 def test_tenths_are_told_only_where_they_are_asked_for() -> None:
