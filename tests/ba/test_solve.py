@@ -117,6 +117,16 @@ def test_a_step_that_fails_is_damped_and_the_damping_let_go(monkeypatch) -> None
     np.testing.assert_allclose(found.state.params, 0.5 * 6)  # of those that failed nothing stays
 
 
+@pytest.mark.parametrize(("gained", "ends"), [(0.049, True), (0.051, False)])
+def test_a_damped_step_that_lowers_the_cost_by_next_to_nothing_is_the_last(monkeypatch, gained, ends) -> None:
+    found, dampings = run(monkeypatch, [100.0, 150.0, 100.0 - gained, 90.0], [50.0, 50.0, 50.0, 1e-9])
+    assert isinstance(found, Minimum)
+    assert ("a damped step gains too little" in found.status) == ends
+    assert len(dampings) == (2 if ends else 4)
+    assert found.settled
+    assert found.state.history[-1] == found.reduced.cost == (100.0 - gained if ends else 90.0)
+
+
 def test_a_minimum_that_was_damped_has_no_factor_to_hand_on(monkeypatch) -> None:
     found, _ = run(monkeypatch, [100.0, 150.0, 90.0], [50.0, 50.0, 1e-9])
     assert isinstance(found, Minimum)

@@ -30,7 +30,7 @@ from barpc.ba.solving.normal import Reduced
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
-from barpc.base.statistics import CONVERGED, ITERATIONS, ROUNDING
+from barpc.base.statistics import CONVERGED, ITERATIONS, ROUNDING, STANDS
 from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
@@ -195,9 +195,12 @@ def _levenberg_marquardt(
             status = _status(state, "the last step gained what it should")
             return Minimum(replace(ahead, cost=cost), reduced, factor, status, (residual, projected))
         if cost <= state.cost * (1.0 + 1e-12):
+            slow = damping > 0.0 and state.cost - cost < STANDS  # a fifth of a standard deviation of a weak mode
             del reduced, factor  # two of a large block do not fit into memory
             reduced = problem.reduce(ahead.params, ahead.points, weight, projected)
             state = replace(ahead, cost=reduced.cost, history=(*state.history, reduced.cost))
+            if slow:
+                return Minimum(state, reduced, status=_status(state, "a damped step gains too little"))
             before = gain if not damping else np.inf
             damping = damping / 10.0 if damping > 1e-8 else 0.0
             continue
