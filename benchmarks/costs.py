@@ -8,6 +8,8 @@ of the last step, at which time grows as a power of the size: wanted is 1.15 at 
 - understated: 50 tie points an image, of which one in twenty is 60 px (RMS) off and states 4 m;
 - reference: three images, 2000 tie points, and points of an orthoimage;
 - edges: three images whose detector has so many edges, given as options;
+- cameras: images with the side file of a vendor each, read by names relative to their folder (needs ../shared/data);
+- one pass: images with parallel lines of sight, of which none is a band of another;
 - sets: the search for GCPs that agree alone: 2 % off, a third in another datum, and all less accurate than stated.
 
     OMP_NUM_THREADS=1 python benchmarks/costs.py
@@ -17,17 +19,27 @@ of the last step, at which time grows as a power of the size: wanted is 1.15 at 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
+import re
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import rasterio
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.control.agreement import Offsets, agreement
 from barpc.base.geodesy import Array, metres_per_unit
+from barpc.pipeline.acquisitions import one_each
+from barpc.pipeline.loading import load_views
+from barpc.rpcio import read_rpc
 from barpc.scene import Reference
+from barpc.sensor.rpc import RPC
 from barpc.simulate import simulate_block
 
 Made = Callable[[], object]
@@ -89,6 +101,43 @@ def sets(**how: float) -> Callable[[int], Made]:
     return made
 
 
+SIDE_FILES = {
+    "{}.XML": "rpc_WV2.xml",
+    "{}.RPB": "md_dg.RPB",
+    "{}_RPC.TXT": "20191015_073816_ssc1d3_0011_basic_l1a_panchromatic_dn_RPC.TXT",
+}
+
+
+def with_side_files(count: int) -> Made:
+    """Return the reading of images whose cameras are vendors' files, each with other numbers."""
+    formats = Path(__file__).resolve().parents[2] / "shared/data/rpc_formats"
+    folder = tempfile.TemporaryDirectory()
+    for n, (name, given) in zip(range(count), itertools.cycle(SIDE_FILES.items()), strict=False):
+        stem, text = f"image_{n:05d}", (formats / given).read_text()
+        width, height = np.rint(2.0 * read_rpc(formats / given).image_offset).astype(int).tolist()
+        shape = {"driver": "GTiff", "count": 1, "dtype": "uint8", "sparse_ok": True, "tiled": True}
+        with rasterio.open(f"{folder.name}/{stem}.tif", "w", width=width, height=height, **shape):
+            pass
+        other = re.sub(r"(?i)(line_?off(?:set)?\W+)(\d+)", lambda m, n=n: m[1] + str(int(m[2]) + n), text, count=1)
+        Path(folder.name, name.format(stem)).write_text(other)
+
+    def read() -> None:
+        with folder as place, contextlib.chdir(place):
+            load_views(sorted(path.name for path in Path().glob("*.tif")))
+
+    return read
+
+
+def one_pass(count: int) -> Made:
+    """Return the search for bands among images of one pass."""
+    (view,) = simulate_block(2, 20, seed=1, num_checks=0).views[:1]
+    assert isinstance(view.sensor, RPC)
+    ground, offsets = view.sensor.ground_offset, np.random.default_rng(1).uniform(-0.2, 0.2, (count, 2))
+    moved = [replace(view.sensor, ground_offset=ground + np.append(offset, 0.0)) for offset in offsets]
+    views = [replace(view, name=f"v{n}", sensor=one) for n, one in enumerate(moved)]
+    return lambda: one_each(views, [None] * count)  # type: ignore[list-item]  # cameras are handed on alone
+
+
 GCPS = 309, 1084, 4337
 SUBJECTS: dict[str, tuple[Callable[[int], Made], tuple[int, ...]]] = {
     "gcps": (with_gcps, GCPS),
@@ -96,6 +145,8 @@ SUBJECTS: dict[str, tuple[Callable[[int], Made], tuple[int, ...]]] = {
     "understated": (understated, (100, 300, 1000)),
     "reference": (with_reference, GCPS),
     "edges": (with_edges, (1, 4, 16)),
+    "cameras": (with_side_files, (100, 300, 1000)),
+    "one pass": (one_pass, (100, 300, 1000, 3000)),
     "sets, 2 % wrong": (sets(wrong=0.02), (*GCPS, 17_000)),
     "sets, a third in another datum": (sets(datum=0.3), GCPS),
     "sets, understated": (sets(times=3.0), GCPS),

@@ -13,7 +13,7 @@ import scipy.ndimage as ndi
 
 from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.report.outcome import Carried
-from barpc.scene import Camera, View
+from barpc.scene import BoolArray, Camera, View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
 from barpc.tie.pixels import read_pixels
@@ -33,13 +33,14 @@ def one_each(
     The finest image of an acquisition leads; before it those named in `leads`.
     """
     rpcs = [i for i, view in enumerate(views) if isinstance(view.sensor, RPC)]
-    ends = {i: _ends(views[i]) for i in rpcs}
-    sight = np.array([_direction(ends[i]) for i in rpcs]).reshape(-1, 3)
-    alike = np.triu(sight @ sight.T > _ALONG, 1)
+    ends = np.array([_ends(views[i]) for i in rpcs]).reshape(-1, 2, 3)
+    sight = np.array([_direction(one) for one in ends]).reshape(-1, 3)
     maps: dict[tuple[int, int], tuple[Array, Array]] = {}
-    for a, b in np.argwhere(alike).tolist():
-        i, j = rpcs[a], rpcs[b]
-        if _same_ray(views[j].sensor, ends[i]) and (found := _image_map(views[i], views[j])) is not None:
+    for n, j in enumerate(rpcs):
+        alike = np.flatnonzero(sight[:n] @ sight[n] > _ALONG)
+        for i in (rpcs[k] for k in alike[_same_rays(views[j].sensor, ends[alike])]):
+            if (found := _image_map(views[i], views[j])) is None:
+                continue
             step, start = found
             maps[i, j], maps[j, i] = (step, start), (1.0 / step, -start / step)
     led: dict[int, int] = {}
@@ -75,10 +76,10 @@ def _pixel(view: View) -> float:
     return float(f"{np.linalg.norm(np.diff(ecef_from_ground(at), axis=0)):.2g}")
 
 
-def _same_ray(sensor: SensorModel, ends: Array) -> bool:
-    """Return whether a camera sees the two ends of a line of sight at one place."""
-    low, high = sensor.project(ends)
-    return bool(np.abs(high - low).max() < _SAME)
+def _same_rays(sensor: SensorModel, ends: Array) -> BoolArray:
+    """Return which lines of sight with ends (n, 2, 3) a camera sees as points."""
+    seen = sensor.project(ends)
+    return np.asarray(np.abs(seen[:, 1] - seen[:, 0]).max(axis=1) < _SAME)
 
 
 def _image_map(one: View, other: View) -> tuple[Array, Array] | None:

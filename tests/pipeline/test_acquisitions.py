@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import barpc
 from barpc.base.errors import InputError
 from barpc.pipeline.acquisitions import one_each
 from barpc.pipeline.loading import load_views
+from barpc.sensor.rpc import RPC
+from barpc.simulate import simulate_block
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
@@ -114,3 +117,15 @@ def test_a_real_multispectral_image_follows_its_panchromatic_one(shared_data: Pa
     for alt in (300.0, 1000.0, 1900.0):
         ground = band.localize(at, np.full(len(at), alt))
         assert np.abs(lead.project(ground) - (4 * at - (40.0, 42.0))).max() < 0.1
+
+
+def test_the_cameras_of_a_pass_are_asked_for_all_others_at_once(monkeypatch) -> None:
+    (view,) = simulate_block(2, 20, seed=1, num_checks=0).views[:1]
+    moved = [replace(view.sensor, ground_offset=view.sensor.ground_offset + [0.1 * n, 0.0, 0.0]) for n in range(40)]
+    asked: list[int] = []
+    project = RPC.project
+    monkeypatch.setattr(RPC, "project", lambda self, ground: (asked.append(len(ground)), project(self, ground))[1])
+    views = [replace(view, name=f"v{n}", sensor=one) for n, one in enumerate(moved)]
+    kept, carried = one_each(views, [None] * 40)  # type: ignore[list-item]  # cameras are handed on alone
+    assert (kept, carried) == (list(range(40)), ())
+    assert asked == list(range(40))
