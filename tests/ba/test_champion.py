@@ -156,14 +156,14 @@ def test_a_deck_that_covers_more_than_half_is_told_by_the_priors(monkeypatch: py
     made = simulate_block(4, 1200, seed=1)
     views, tracks, member = moving(made, 0.6, 100.0, ("",) * 4)
     exchanged: list[bool] = []
-    before = models._of_ground
+    before = models._likelier_ground
 
     def noted(found: Any, parts: Any, *rest: Any) -> Any:
         out = before(found, parts, *rest)
         exchanged.append(out[1] is not parts)
         return out
 
-    monkeypatch.setattr(models, "_of_ground", noted)
+    monkeypatch.setattr(models, "_likelier_ground", noted)
     adjust_tracks(views, tracks)
     assert exchanged[:1] == [True]
     exchanged.clear()

@@ -200,7 +200,7 @@ def test_noise_that_falls_does_not_stand(linear: Linear) -> None:
     one = mixture.Mixture(linear, None, None, None)
     one.cooled, noises, stands = mixture.COOLED, [one.noise], list[bool]()
     for _ in range(30):
-        stands.append(one._noise(one._expected(), 0.0))
+        stands.append(one._update_noise(one._expected(), 0.0))
         noises.append(one.noise)
     falls = np.array(noises[1:]) / noises[:-1]
     assert falls[0] == pytest.approx(mixture.COOLED)

@@ -75,7 +75,7 @@ def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **giv
     parts: Any = SimpleNamespace(inner=None, outer=None)
     options = AdjustOptions(**given)
     first: Any = by_script(None, None, options)
-    model: Any = models._search_beside(first, parts, options, by_script)
+    model: Any = models._search_models(first, parts, options, by_script)
     return model.found.model, model.in_space_rms, asked
 
 
@@ -143,7 +143,7 @@ def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypa
     monkeypatch.setattr(models, "with_terms", without_strips)
     monkeypatch.setattr(models, "_without_moving_ground", without_moving)
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    model: Any = models._search_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    model: Any = models._search_models(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
     assert (model.found.model, model.in_space_rms) == ("affine", 1.0)
     # beside the affine, with it and in space; then beside the model in space
     assert asked == (["moving", "strips", "strips", "moving", "strips"] if judged else [])
@@ -570,7 +570,7 @@ def followed(monkeypatch, error: float, prior: Any = None, affine: float = 0.5) 
     monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
     monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)
-    model: Any = models._search_beside(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
+    model: Any = models._search_models(solve_block(None, None, AdjustOptions()), parts, AdjustOptions(), solve_block)
     return model.found.model, model.in_space_rms
 
 

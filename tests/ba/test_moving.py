@@ -185,7 +185,7 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     base = replace(base, right=np.where(moves[block.order] & cut, 0.1, np.maximum(base.right, 0.6)))
     by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.full(len(cell), 0.5))
-    shares = list(moving_ground._first_shares(linear, group, base, none, np.zeros(0)))
+    shares = list(moving_ground._start_shares(linear, group, base, none, np.zeros(0)))
     assert len(shares) == moving_ground._STARTS + cut
     assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
     inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]

@@ -343,7 +343,7 @@ def test_no_terms_is_the_plain_model_and_needs_no_search(monkeypatch: pytest.Mon
     def searched(*_: Any) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(models, "_search_beside", searched)
+    monkeypatch.setattr(models, "_search_models", searched)
     tracks = block.tracks
     xy = tracks.xy.copy()
     xy[(tracks.view == 1) & (np.abs(tracks.xy[:, 1] - 9000.0) < 1500.0)] += (1.0, 2.0)

@@ -117,5 +117,5 @@ def test_the_level_beside_a_peak_is_one_of_noise_and_more_where_rows_wander() ->
     walk = np.interp(row, np.linspace(0.0, rows, 400), np.cumsum(rng.normal(size=400)))
     for size, wander, least, most in ((0.0, 0.0, 1.0, 1.3), (3.0, 0.0, 1.0, 1.3), (3.0, 0.3, 2.0, 40.0)):
         one = periods._Rows(row, rows, right, noise + size * swing + wander * walk)
-        k = int(np.argmin(np.abs(one.waves - rows / period)))
+        k = int(np.argmin(np.abs(one.cycles - rows / period)))
         assert least <= one._level(k, period) < most

@@ -11,7 +11,7 @@ from scipy import ndimage
 from barpc.ba.constraints.block import join
 from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
 from barpc.ba.parameters.unknowns import Unknowns
-from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth
+from barpc.ba.robust.systematic_residuals import NUM_TERMS, NoiseCorrelation, Smooth
 from barpc.ba.solving.structure import make_structure
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.options import AdjustOptions
@@ -63,7 +63,7 @@ def smooth_of(view, reference, ties: np.ndarray | None = None) -> Smooth:
     half = SIZE[:, None] / 2.0
     unknowns = Unknowns("rotation", 0, np.zeros((1, 3)), np.ones(1), half - 0.5, half)
     structure = make_structure(np.zeros(len(xy), np.int64), np.arange(len(xy)), 1, len(xy))
-    return Smooth(structure, block.xy, unknowns, Resemblance.of(block))
+    return Smooth(structure, block.xy, unknowns, NoiseCorrelation.of(block))
 
 
 def told(smooth: Smooth, residual: np.ndarray) -> tuple[bool, float, float]:

@@ -253,7 +253,7 @@ def passes(
             self.observations: Any = SimpleNamespace(
                 sigma=np.ones(10_000),
                 weight=lambda use, noise, misfit: use / (noise * (1.0 + misfit**2)),
-                told_by=lambda weight: weight,
+                tie_information=lambda weight: weight,
                 mean_freedom=lambda use: 2.0,
             )
             self.misfit = misfit[0]
@@ -266,7 +266,7 @@ def passes(
         def _search(self) -> None:
             pass
 
-        def _cut(self) -> None:
+        def _reject(self) -> None:
             self.use = np.arange(10_000) >= cut[min(self.passes - 1, len(cut) - 1)]
 
         def _solve(self) -> Any:

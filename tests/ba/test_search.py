@@ -15,7 +15,7 @@ from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, search
 from barpc.ba.select.anomalies import shared_errors
-from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _Taken, _uncovered
+from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _SelectedTerm, _uncovered
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
 from barpc.ba.terms import TERMS
@@ -302,7 +302,7 @@ def test_a_sinusoid_of_a_pair_may_be_that_of_the_other_where_the_evidence_is_no_
 def combined(*rows: tuple[str, int, float]) -> _SearchState:
     """A combination of terms, each of a kind and view, with what it gains."""
     seen = residuals_of(tracks=30)
-    taken = tuple(_Taken(placed(kind, view), gain, 1.0, "", (), seen) for kind, view, gain in rows)
+    taken = tuple(_SelectedTerm(placed(kind, view), gain, 1.0, "", (), seen) for kind, view, gain in rows)
     return _SearchState(seen, taken)
 
 

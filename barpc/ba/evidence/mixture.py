@@ -167,7 +167,7 @@ class _Expected:
     log: Array  # (T,) log-likelihood of each track
     right: Array  # (M,) probability of being an inlier, alone or with others of the track
     shares: list[Array]  # (S,) probability of each subset
-    subsets: list[_OfSubsets]
+    subsets: list[_SubsetLikelihoods]
 
     def moved(self, subsets: Subsets) -> Array:
         """Return the probability (T,) that a track with inliers moved."""
@@ -183,11 +183,11 @@ def _expect(
     area = max(linear.area, 2.0 * np.pi * noise**2 * np.exp(NEAR_LIMIT))
     view = linear.view[subsets.rows]
     odds, wrong = (np.log1p(-eps) - np.log(eps))[view], np.add.reduceat(np.log(eps)[view], rows)
-    found = [_OfSubsets.at(linear, residual, noise, area)]
+    found = [_SubsetLikelihoods.at(linear, residual, noise, area)]
     log = [found[0].log]
     if moved is not None:
         share = moved.share[subsets.rows[rows]][subsets.of_subset]
-        found.append(_OfSubsets.at(linear, moved.residual, moved.noise, area))
+        found.append(_SubsetLikelihoods.at(linear, moved.residual, moved.noise, area))
         log = [log[0] + np.log1p(-share), found[1].log + np.log(share)]
     prior = subsets.members @ odds + wrong[subsets.of_subset]
     np.exp(odds, out=odds)
@@ -203,14 +203,14 @@ def _expect(
 
 
 @dataclass(frozen=True, eq=False)
-class _OfSubsets:
+class _SubsetLikelihoods:
     log: Array  # (S,) log-likelihood if the subset has the inliers
     square: Array  # (S,) squared residuals with the ground point estimated
     values: Array  # (M, 2) residuals of observations
     followed: Array  # (S, 3) components of these that the ground point absorbs
 
     @classmethod
-    def at(cls, linear: Linear, residual: Array, noise: float, area: float) -> _OfSubsets:
+    def at(cls, linear: Linear, residual: Array, noise: float, area: float) -> _SubsetLikelihoods:
         """Return the likelihoods of all subsets at residuals (2, K) [stated sigmas]."""
         subsets = linear.subsets
         values, followed = residual.T.take(subsets.rows, axis=0), np.empty((len(subsets.size), 3))
@@ -304,9 +304,9 @@ class Mixture:
         self.curvature: list[Array] = []
         self.summed: list[Array] = []
         if warm is not None and extra is not None and group is None and known < len(self.x):
-            self._begin(warm, extra, own)
+            self._set_first_guess(warm, extra, own)
 
-    def _begin(self, warm: MixtureFit, extra: Array, precision: Array) -> None:
+    def _set_first_guess(self, warm: MixtureFit, extra: Array, precision: Array) -> None:
         """Set the new unknowns to the likeliest of several first guesses: from all views, or with one view ignored.
 
         Where rows of two views are displaced, the L1 guess may be one displacement for both. The displacement of one
@@ -347,7 +347,7 @@ class Mixture:
                 inverse = np.tril(dtrtri(factor[0], lower=1)[0])
                 fitted = len(matrix) - float((inverse**2).sum(axis=0) @ self.precision)
             self.x = self.x - cho_solve(factor, self._gradient(expected), check_finite=False)
-            settled = self._noise(expected, fitted) and abs(expected.log - last) < LIKELIHOOD_TOLERANCE
+            settled = self._update_noise(expected, fitted) and abs(expected.log - last) < LIKELIHOOD_TOLERANCE
             last = expected.log
             if settled and is_new:
                 break
@@ -391,7 +391,7 @@ class Mixture:
         absorbed = np.swapaxes(followed, 1, 2) @ solve_triangular(lower, self._gradient(expected), lower=True)
         return curvature / self.noise**2, own - absorbed, followed
 
-    def _noise(self, expected: _Expectations, fitted: float) -> bool:
+    def _update_noise(self, expected: _Expectations, fitted: float) -> bool:
         """Update the noise and the shares of wrong observations; return whether the noise has converged."""
         still = expected.kinds[0]
         found = min(max(float(np.sqrt(still.squares / max(still.freedom - fitted, 1.0))), LEAST_NOISE), self.noisiest)
@@ -400,12 +400,12 @@ class Mixture:
         wrong = np.bincount(self.linear.view[self.part], 1.0 - expected.right[self.part], minlength=self.linear.views)
         self.eps = np.clip((wrong + WRONG_SHARE_PRIOR[0]) / (self.count + WRONG_SHARE_PRIOR[1]), SLIGHT, 1.0 - SLIGHT)
         if self.group is not None:
-            self._group(expected, noise, noise <= found)
-        stands = abs(np.log(noise / self.noise)) < CONVERGED
+            self._update_group(expected, noise, noise <= found)
+        converged = abs(np.log(noise / self.noise)) < CONVERGED
         self.noise = noise
-        return bool(stands)
+        return bool(converged)
 
-    def _group(self, expected: _Expectations, noise: float, cold: bool) -> None:
+    def _update_group(self, expected: _Expectations, noise: float, cold: bool) -> None:
         """Update the share of moving tracks in every cell, and their noise."""
         assert self.group is not None
         share, scatter = self.group.share, noise
@@ -492,11 +492,11 @@ class Mixture:
             right = np.concatenate(turned)[order].reshape(-1, size)
             for v, (a, b) in enumerate(pairwise(2 * np.searchsorted(linear.view[rows[order]], np.arange(views + 1)))):
                 across[v] = left[a:b].T @ right[a:b]
-        cameras = self._of_cameras(np.concatenate([one.reshape(-1, 2, 2) for one in of_pairs]))
+        cameras = self._camera_matrix(np.concatenate([one.reshape(-1, 2, 2) for one in of_pairs]))
         cross = across.reshape(views * q, size)
         return np.block([[cameras, cross], [cross.T, of_beside]])
 
-    def _of_cameras(self, weight: Array) -> Array:
+    def _camera_matrix(self, weight: Array) -> Array:
         """Return the normal matrix (N q, N q) of the camera unknowns, by weights (M, 2, 2) of pairs."""
         linear, (views, q), pairs = self.linear, self.linear.shape, self.linear.pairs
         sums, at = np.empty((len(pairs.views), q, q)), pairs.bounds

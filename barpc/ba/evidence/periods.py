@@ -52,27 +52,27 @@ def find_periods(
     off : (2, K), residuals in standard deviations
     """
     views = size.shape[1]
-    told = np.flatnonzero(right > 0.0)
-    by_view = told[np.argsort(view[told], kind="stable")]
+    in_use = np.flatnonzero(right > 0.0)
+    by_view = in_use[np.argsort(view[in_use], kind="stable")]
     found = []
-    for v, mine in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
+    for v, own in enumerate(np.split(by_view, np.searchsorted(view[by_view], np.arange(1, views)))):
         rows = float(size[1, v])
         price = price_of_period(rows, views)
-        if len(mine) >= FEW and rows > 2.0 * _MIN_PERIODS * _SHORTEST:
-            clipped = np.clip(off[:, mine], -OUTLIER, OUTLIER)
-            best = _Rows(row[mine], rows, right[mine], clipped).largest(price + least)
+        if len(own) >= FEW and rows > 2.0 * _MIN_PERIODS * _SHORTEST:
+            clipped = np.clip(off[:, own], -OUTLIER, OUTLIER)
+            best = _Rows(row[own], rows, right[own], clipped).largest(price + least)
             if best is not None:
                 found.append(Period(v, best[0], best[1] - price))
     return sorted(found, key=lambda one: -one.gain)
 
 
 class _Rows:
-    """Residuals of one image, in bins of `_BIN` rows."""
+    """Residuals of one image in bins of `_BIN` rows, and the frequencies to test [cycles per image]."""
 
     def __init__(self, row: Array, rows: float, right: Array, off: Array) -> None:
         self.row, self.off, self.right = row, off, right
         self.bins = int(np.ceil(rows / _BIN))
-        self.waves = np.arange(int(_FREQUENCY_OVERSAMPLING * rows / _SHORTEST)) / _FREQUENCY_OVERSAMPLING  # in an image
+        self.cycles = np.arange(int(_FREQUENCY_OVERSAMPLING * rows / _SHORTEST)) / _FREQUENCY_OVERSAMPLING
         self.first = int(np.ceil(_FREQUENCY_OVERSAMPLING * _MIN_PERIODS))
 
     def largest(self, least: float) -> tuple[float, float] | None:
@@ -80,13 +80,13 @@ class _Rows:
         gain = self._spectrum(self.off)
         if _minus_log_p(gain.max(initial=0.0)) <= least:
             return None
-        band = np.floor(2.0 * np.log2(self.waves[self.first :]))
+        band = np.floor(2.0 * np.log2(self.cycles[self.first :]))
         starts = self.first + np.flatnonzero(np.diff(band, prepend=-1.0))
         best = None
         for start, stop in pairwise([*starts.tolist(), len(gain)]):
             k = start + int(gain[start:stop].argmax())
             if _minus_log_p(gain[k]) > max(least, 0.0 if best is None else best[1]):
-                period = self.bins * _BIN / (self.waves[k] + parabola_vertex(gain, k) / _FREQUENCY_OVERSAMPLING)
+                period = self.bins * _BIN / (self.cycles[k] + parabola_vertex(gain, k) / _FREQUENCY_OVERSAMPLING)
                 log_p = _minus_log_p(gain[k] / self._level(k, period))
                 if log_p > max(least, 0.0 if best is None else best[1]):
                     best = float(period), log_p
@@ -94,7 +94,7 @@ class _Rows:
 
     def _spectrum(self, off: Array) -> Array:
         """Return half the chi-square that a cosine and a sine explain in both coordinates, at each frequency."""
-        right, last = self.right, len(self.waves)
+        right, last = self.right, len(self.cycles)
         centred = (off - (off @ right / right.sum())[:, None]) * right
         spread = centred @ centred.T / right.sum()  # covariance of the residuals, which ground points reduce
         spread[np.diag_indices(2)] += 1e-9 * np.trace(spread) + 1e-30
@@ -103,9 +103,8 @@ class _Rows:
         sums = np.array([np.bincount(at, weight, self.bins) for weight in whitened])
         found = np.fft.rfft(sums, _FREQUENCY_OVERSAMPLING * self.bins, axis=1)[:, :last]
         real, imag = found.real.copy(), found.imag.copy()
-        count = np.fft.rfft(np.bincount(at, right, self.bins), _FREQUENCY_OVERSAMPLING // 2 * self.bins)[
-            :last
-        ]  # of twice the frequency
+        # at twice the frequency
+        count = np.fft.rfft(np.bincount(at, right, self.bins), _FREQUENCY_OVERSAMPLING // 2 * self.bins)[:last]
         half, twice, both = 0.5 * right.sum(), 0.5 * count.real, 0.5 * count.imag
         determinant = np.maximum(half**2 - twice**2 - both**2, 1e-12 * half**2)
         gain = (half - twice) * (real * real).sum(axis=0) + (half + twice) * (imag * imag).sum(axis=0)
@@ -116,8 +115,8 @@ class _Rows:
         basis = np.vstack([np.ones(len(self.row)), sine_and_cosine(self.row, np.array(period))])
         weighted = basis * self.right
         gain = self._spectrum(self.off - (np.linalg.solve(weighted @ basis.T, weighted @ self.off.T)).T @ basis)
-        away = np.abs(self.waves - self.waves[k])
-        beside = (away > _MIN_PERIODS) & (away < SURE + self.waves[k])
+        away = np.abs(self.cycles - self.cycles[k])
+        beside = (away > _MIN_PERIODS) & (away < SURE + self.cycles[k])
         beside[: self.first] = False
         of_noise = 0.5 * chdtri(4.0, 0.5)  # median of half a chi-square
         return max(float(np.median(gain[beside]) / of_noise), 1.0) if beside.any() else 1.0

@@ -29,7 +29,7 @@ _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # first and last + 1 bin of all 
 _FEWEST_INSIDE = 8  # check observations of a region: fewer are not tested
 _PERMUTATIONS = 2000  # twice as many as a p-value of `CHANCE` needs
 _FINEST = 32  # parts along each side of an image, at most; one observation is taken in each of their cells
-# of the larger extent of residuals: a smaller one across it comes from epipolar lines that turn over an image
+# least extent of residuals across their main direction, over that along it: a smaller one has no information
 MIN_EXTENT_RATIO = 0.05
 
 
@@ -45,8 +45,8 @@ class Interval:
     share: float  # of wrong observations
     off: float  # common displacement of the others, in the units of the residuals
     by_share: bool  # whether the share is significant; else the displacement is
-    apart: float = 0.0  # median residual of the wrong observations, where it was measured
-    moves: bool = False  # whether the share is that of a moving group
+    apart: float = 0.0  # median residual of the wrong observations [px]; 0: not measured
+    moves: bool = False  # whether the share is of observations of a moving group, not of wrong ones
     part: float = 1.0  # length over that of the image
 
 
@@ -149,7 +149,7 @@ def neighbours_alike(view: IntArray, place: Array, residual: Array, views: int) 
         if len(rows) < 2:
             continue
         axes, size = np.linalg.svd(residual[:, rows], full_matrices=False)[:2]
-        # in pairs all residuals lie along epipolar lines: across these there is no direction, or that of their turn
+        # residuals of a pair have one direction: the component across it has no information
         along = axes.T[size > MIN_EXTENT_RATIO * size[0]] @ residual[:, rows]
         along[1:] -= np.median(along[1:], axis=1, keepdims=True)
         for axis in (0, 1):
@@ -223,7 +223,7 @@ def met_worse(unused: Unused, size: Array, limit: float, least: float, share: fl
     """
     whole = [_thinned(unused.part(unused.view == v), size[:, v]) for v in range(size.shape[1])]
     whole = [one for one in whole if len(one.view) >= FEWEST]
-    tests = 2.0 * len(whole) * _PLACES.shape[1]  # two tests of each region
+    tests = 2.0 * len(whole) * _REGION_BOUNDS.shape[1]  # two tests of each region
     found = [_worst(one, size[:, one.view[0]], limit, least, share, tests) for one in whole]
     return sorted((one for one in found if one), key=lambda one: one.chance)
 
@@ -239,12 +239,12 @@ def _region_bounds() -> IntArray:
     return np.array([*lines, *((rows, n, cols, k) for cols, k, rows, n in lines), *cells]).T
 
 
-_PLACES = _region_bounds()
+_REGION_BOUNDS = _region_bounds()
 
 
 def _cells_of_regions() -> BoolArray:
     """Return the mask (P, C) of the smallest cells of an image in each region."""
-    columns, k, rows, n = _PLACES[:, :, None]
+    columns, k, rows, n = _REGION_BOUNDS[:, :, None]
     row, col = np.divmod(np.arange(_FINEST**2), _FINEST)
     return np.asarray((col * columns // _FINEST == k) & (row * rows // _FINEST == n))
 
@@ -309,8 +309,8 @@ def _worst(one: Unused, size: Array, limit: float, least: float, share: float, t
     if test == 0:
         off = float(np.median(np.hypot(*one.residual[:, together[worst]])))
         far = float(together[worst].sum() / count[worst])
-    ends = _ends(size[0], *_PLACES[:2, worst]), _ends(size[1], *_PLACES[2:, worst])
-    whole = min(BANDS / _PLACES[[0, 2], worst].max(), 1.0) if None in ends else 0.0
+    ends = _limits(size[0], *_REGION_BOUNDS[:2, worst]), _limits(size[1], *_REGION_BOUNDS[2:, worst])
+    whole = min(BANDS / _REGION_BOUNDS[[0, 2], worst].max(), 1.0) if None in ends else 0.0
     moved = off * (far or 1.0) * whole
     return ImageRegion(int(one.view[0]), *ends, int(count[worst]), far, off, float(chances[test, worst]), moved)
 
@@ -379,5 +379,5 @@ def _variances(along: Array, of_near: Array, mean: Array, cells: Array) -> Array
     return np.stack(found, axis=1)
 
 
-def _ends(size: float, parts: int, k: int) -> tuple[float, float] | None:
+def _limits(size: float, parts: int, k: int) -> tuple[float, float] | None:
     return None if parts == 1 else (float(k * size / parts), float((k + 1) * size / parts))

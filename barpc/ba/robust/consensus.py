@@ -35,7 +35,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
     """Find the pairs of views whose epipolar offsets are a mixture of two normals, from the observations in use."""
     many = np.repeat(np.diff(structure.pair_bounds) >= MANY, np.diff(structure.pair_bounds))
     rows = np.flatnonzero(many & use[structure.first] & use[structure.second])
-    offset = _across(residual, by_point, structure.first[rows], structure.second[rows])
+    offset = _epipolar_offsets(residual, by_point, structure.first[rows], structure.second[rows])
     bounds = np.searchsorted(rows, structure.pair_bounds)
     count = np.diff(bounds)
     by_pair = sp.csr_array((np.ones(len(rows)), np.arange(len(rows)), bounds), (len(count), len(rows)))
@@ -94,28 +94,28 @@ def agreeing(
     `xy` (2, K) are observed col, row; the residuals (2, K) are at approximate points; `sigma` (K,) is stated. All [px].
     """
     first, second = structure.first, structure.second
-    offset = _across(residual, projected.by_point, first, second)
+    offset = _epipolar_offsets(residual, projected.by_point, first, second)
     spread = np.hypot(sigma[first], sigma[second])
-    against = np.zeros(len(first), dtype=bool)
+    in_conflict = np.zeros(len(first), dtype=bool)
     usable = use[first] & use[second] & np.isfinite(offset)
     for m, (start, stop) in enumerate(zip(structure.pair_bounds[:-1], structure.pair_bounds[1:], strict=True)):
         rows = start + np.flatnonzero(usable[start:stop])
         if len(rows) >= FEW:
             place = xy[:, first[rows]]
-            against[rows] = ~_on_one_plane(place, offset[rows], spread[rows], seed=m)
+            in_conflict[rows] = ~_on_one_plane(place, offset[rows], spread[rows], seed=m)
     keep = use.copy()
     for _ in range(structure.num_views):
-        live = against & keep[first] & keep[second]
-        if not live.any():
+        active = in_conflict & keep[first] & keep[second]
+        if not active.any():
             break
-        count = np.bincount(first[live], minlength=len(use)) + np.bincount(second[live], minlength=len(use))
+        count = np.bincount(first[active], minlength=len(use)) + np.bincount(second[active], minlength=len(use))
         worst = np.zeros(structure.num_points)
         np.maximum.at(worst, structure.point, count)
         keep &= ~((count > 0) & (count == worst[structure.point]))
     return keep
 
 
-def _across(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
+def _epipolar_offsets(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
     """Return the epipolar offsets (Q,) [px] of pairs of observations: they do not depend on the ground point."""
     offset = np.empty(len(first))
     for part in parts(len(first)):

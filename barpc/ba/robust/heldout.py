@@ -26,8 +26,8 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
 _CHECK_SHARE = 0.1
-_STEPS_A_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel: changes of their last digits alter few draws
-_NOTHING = float(np.finfo(np.float64).tiny)  # least variance; reached if all residuals are zero
+_STEPS_PER_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel: changes of their last digits alter few draws
+_MIN_VARIANCE = float(np.finfo(np.float64).tiny)  # reached if all residuals are zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def keep_out(block: Block) -> BoolArray:
     needed = np.bincount(block.point[few[block.view] | ~block.use], minlength=block.num_points)
     count = np.bincount(block.point, minlength=block.num_points)
     drawn = np.zeros(block.num_points, dtype=np.uint64)
-    col, row = np.rint(block.xy * _STEPS_A_PIXEL).astype(np.int64).astype(np.uint64)
+    col, row = np.rint(block.xy * _STEPS_PER_PIXEL).astype(np.int64).astype(np.uint64)
     np.add.at(drawn, block.point, splitmix64(col * np.uint64(0x9E3779B97F4A7C15) + row))
     chosen = splitmix64(drawn) < np.uint64(_CHECK_SHARE * 2.0**64)
     chosen &= (count >= 2) & (needed == 0) & (np.arange(block.num_points) < block.num_tracks)
@@ -124,9 +124,9 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     expected = block.sigma**2 * observations.freedom(counted)
     count, noise = np.bincount(block.view, minlength=views), np.full(views, np.nan)
     many = count >= FEWEST
-    told = many[block.view]
-    number = (np.cumsum(many) - 1)[block.view[told]]
-    noise[many] = scatter(squared[told], expected[told] / block.sigma[told] ** 2, number)
+    many_rows = many[block.view]
+    number = (np.cumsum(many) - 1)[block.view[many_rows]]
+    noise[many] = scatter(squared[many_rows], expected[many_rows] / block.sigma[many_rows] ** 2, number)
     rms = noise * np.sqrt(np.bincount(block.view, expected, views) / np.maximum(count, 1))
     return HeldOut(residual, index, points, noise, rms)
 
@@ -155,22 +155,22 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     at = BEST * (count - 1.0)
     low = ordered[starts + np.floor(at).astype(np.int64)]
     middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
-    far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _NOTHING)
+    far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _MIN_VARIANCE)
     variance, wrong = (
-        np.maximum(middle / BEST, _NOTHING),
+        np.maximum(middle / BEST, _MIN_VARIANCE),
         np.full(len(count), WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1]),
     )
-    farthest, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
+    log_far, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
     moves = np.ones(len(count), dtype=bool)  # views that have not converged
     for _ in range(ITERATIONS):
-        peak = np.maximum(farthest - half * np.log(variance)[view], NEAR_LIMIT)
+        peak = np.maximum(log_far - half * np.log(variance)[view], NEAR_LIMIT)
         right = expit(peak - constant / variance[view] - np.log(wrong / (1.0 - wrong))[view])
         of_right, squares = (np.add.reduceat(rows, starts) for rows in (right, right * squared))
-        found = np.maximum(squares / np.maximum(of_right, 1e-300), _NOTHING)
-        stands = np.abs(found - variance) < CONVERGED * variance
+        found = np.maximum(squares / np.maximum(of_right, 1e-300), _MIN_VARIANCE)
+        converged = np.abs(found - variance) < CONVERGED * variance
         variance = np.where(moves, found, variance)
         wrong = np.where(moves, (WRONG_SHARE_PRIOR[0] + count - of_right) / (WRONG_SHARE_PRIOR[1] + count), wrong)
-        moves &= ~stands
+        moves &= ~converged
         if not moves.any():
             break
     return np.asarray(np.sqrt(variance))

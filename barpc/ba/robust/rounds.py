@@ -12,7 +12,7 @@ from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.projected import Projected
 from barpc.ba.robust.heldout import robust_points
-from barpc.ba.robust.systematic_residuals import NUM_TERMS, Resemblance, Smooth, SmoothFit, SmoothTest
+from barpc.ba.robust.systematic_residuals import NUM_TERMS, NoiseCorrelation, Smooth, SmoothFit, SmoothTest
 from barpc.ba.robust.variances import SAME_PRIOR, PriorTest, Variances, same_prior
 from barpc.ba.robust.weights import MEDIAN, Observations, geman_mcclure
 from barpc.ba.solving.problem import Problem
@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # RMS, in sigmas, above which smooth parts and points are estimated in turns
 _MIN_NOISE_RATIO = 0.5  # least noise of the robust steps, over the stated standard deviations
-_MANY_CUT = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
+_MANY_REJECTED = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
 _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
@@ -87,15 +87,15 @@ class Rounds:
         self.state, self.options, self.heights, self.residual = state, options, heights, residual
         is_tie = block.point < block.num_tracks
         of_reference = block.point >= block.num_known
-        faint = downweighting(block, heights)[block.point]
-        sigma = block.sigma * faint
+        downweighted = downweighting(block, heights)[block.point]
+        sigma = block.sigma * downweighted
         earlier = problem.joint_prior
         told = 0.0 if earlier is None else earlier.told
         self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference, told)
         # joint prior of an earlier block, and the observations that are in it
         self.earlier, self.again = (None if block.known is None else earlier), block.known
-        alike = Resemblance.of(block)
-        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=faint == 1.0)
+        alike = NoiseCorrelation.of(block)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=downweighted == 1.0)
         given, control = problem.camera_prior, heights.has_control
         shown = None if earlier is None else earlier.shown
         self.variances = Variances.of(given, unknowns, options, control, block.views, shown, heights.widest)
@@ -122,7 +122,7 @@ class Rounds:
         if not self.is_known:
             self._search()
         while True:
-            outcome = self._cut_and_solve(once)
+            outcome = self._reject_and_solve(once)
             if outcome is not None:
                 return outcome
 
@@ -170,14 +170,14 @@ class Rounds:
         counted = _observation_weights(self.observations, use, squared, counted)
         return replace(few.state, points=points), residual, counted, few.noise, projected
 
-    def _cut_and_solve(self, once: bool) -> Outcome | None:
+    def _reject_and_solve(self, once: bool) -> Outcome | None:
         """Reject observations, solve, and estimate priors and noise.
 
         The outcome is returned by the last pass only; else None.
         """
         was_in_use = self.use
-        many_cut = self.use.sum() < (1.0 - _MANY_CUT) * self.everything.sum()
-        if self.passes and many_cut:
+        many_rejected = self.use.sum() < (1.0 - _MANY_REJECTED) * self.everything.sum()
+        if self.passes and many_rejected:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = retriangulate_rejected(
                 self.problem, self.state, self.residual, self.use, weight, self.projected
@@ -185,7 +185,7 @@ class Rounds:
             self.scatter = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
-        self._cut()
+        self._reject()
         found = self._solve()
         prior, tested = self.variances.learnt(self.problem, found, self.learnt)
         smooth = self._estimate_noise()
@@ -193,7 +193,7 @@ class Rounds:
         logger.info("pass %d: %d of %d observations, noise %.3f", *numbers)
         again = self.passes > 1 or self.goes_on
         same = again and int((self.use != was_in_use).sum()) <= SLIGHT * len(self.use)
-        settled = self._weights_stand()
+        settled = self._weights_have_converged()
         # an error common to all views affects the accuracy of the scene, but no residual: its prior must converge
         share = STANDS if tested.shared > 1.0 else SAME_PRIOR
         settled &= same_prior(prior, self.problem.camera_prior, share)
@@ -210,7 +210,7 @@ class Rounds:
                 inlier=self.use,
                 noise=self.noise,
                 passes=self.passes,
-                told=self.observations.told_by(self.use / (self.observations.sigma * self.noise)),
+                told=self.observations.tie_information(self.use / (self.observations.sigma * self.noise)),
                 prior=tested,
                 smooth=smooth,
                 by_point=self._by_points().by_point.copy(),  # the next projection overwrites it
@@ -218,12 +218,12 @@ class Rounds:
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
 
-    def _weights_stand(self) -> bool:
+    def _weights_have_converged(self) -> bool:
         """Return whether the new noise and misfit leave the weights of the observations unchanged."""
         next_weight = self.observations.weight(self.use, self.noise, self.misfit)[self.use]
         return bool((np.abs(self.weight[self.use] / next_weight - 1.0) < STANDS).all())
 
-    def _cut(self) -> None:
+    def _reject(self) -> None:
         """Reject observations by their residuals without the smooth part."""
         scatter = self._scatter() if self.scatter is None else self.scatter
         s = self.observations.squared(scatter, self.use.astype(np.float64))
@@ -285,12 +285,12 @@ def downweighting(block: Block, heights: PointConstraints) -> Array:
     without tie points keep their weight: they alone connect the image.
     """
     alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
-    faint = np.zeros(block.num_points, dtype=bool)
-    faint[block.num_tracks : block.num_known] = True
-    faint[block.point[alone[block.view]]] = False
+    downweighted = np.zeros(block.num_points, dtype=bool)
+    downweighted[block.num_tracks : block.num_known] = True
+    downweighted[block.point[alone[block.view]]] = False
     if heights.has_control:
-        faint[heights.control[0].index] = False
-    return np.where(faint, GROSS, 1.0)
+        downweighted[heights.control[0].index] = False
+    return np.where(downweighted, GROSS, 1.0)
 
 
 def _robust(

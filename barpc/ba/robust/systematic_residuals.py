@@ -37,7 +37,7 @@ _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=
 
 
 @dataclass(frozen=True, eq=False)
-class Resemblance:
+class NoiseCorrelation:
     """Correlation of the noise of a block's K observations.
 
     Points registered to a reference image have correlated errors: their templates overlap, and seasons, shadows and
@@ -53,7 +53,7 @@ class Resemblance:
     precision: Array  # (K,) `share` times the variance of the tie points of the view over that of the observation
 
     @classmethod
-    def of(cls, block: Block) -> Resemblance | None:
+    def of(cls, block: Block) -> NoiseCorrelation | None:
         """Return the noise correlation of the observations of a block; None if it has no reference image."""
         given = block.reference
         if given is None:
@@ -68,8 +68,8 @@ class Resemblance:
         for view in np.unique(block.view[rows]):
             own = np.flatnonzero(rows & (block.view == view))
             ties = ~rows & (block.view == view)
-            asked = own[:: -(-len(own) // MANY)]  # a sample: the points lie on a grid
-            alike = found.overlap(asked[:, None], own[None]).sum(axis=1).mean()
+            sampled = own[:: -(-len(own) // MANY)]  # the points lie on a grid
+            alike = found.overlap(sampled[:, None], own[None]).sum(axis=1).mean()
             share[own] = 1.0 / (alike + len(own) / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
             precision[own] = share[own] * (usual / block.sigma[own]) ** 2
@@ -135,7 +135,7 @@ class Smooth:
         structure: Structure,
         xy: Array,
         unknowns: Unknowns,
-        alike: Resemblance | None = None,
+        alike: NoiseCorrelation | None = None,
         tells: BoolArray | None = None,
     ) -> None:
         self.structure, self.alike = structure, alike
@@ -213,14 +213,14 @@ class Smooth:
         apart = view * (np.ptp(self._place) + 1.0)
         for place in self._place[:, kept]:
             order = kept[np.argsort(apart + place, kind="stable")]
-            ordered, told = residual[:, order], count
+            ordered, num_pairs = residual[:, order], count
             product = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0)
             if self.alike is not None:
-                product, told = self._beyond_noise(product, (ordered**2).sum(axis=0), order, pairs)
+                product, num_pairs = self._beyond_noise(product, (ordered**2).sum(axis=0), order, pairs)
             mean = self._sums(last, product * pairs) / count
             scatter = np.sqrt(self._sums(last, (product - mean[last]) ** 2 * pairs) / count)
-            sure = mean > OUTLIER * scatter / np.sqrt(np.maximum(told, 1.0))
-            shared = np.maximum(shared, np.sqrt(np.where(sure, mean, 0.0)))
+            is_significant = mean > OUTLIER * scatter / np.sqrt(np.maximum(num_pairs, 1.0))
+            shared = np.maximum(shared, np.sqrt(np.where(is_significant, mean, 0.0)))
         return replace(tested, shared=shared, redundancy=redundancy)
 
     def _sums(self, view: IntArray, values: Array) -> Array:

@@ -113,11 +113,11 @@ class Observations:
         floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
-        alike = np.sqrt(np.minimum(MAX_INDEPENDENT_ERRORS / np.maximum(count, 1.0), 1.0))
-        weight = np.where(self.of_reference, use / self.sigma * alike[self.structure.view], weight)
+        reduction = np.sqrt(np.minimum(MAX_INDEPENDENT_ERRORS / np.maximum(count, 1.0), 1.0))
+        weight = np.where(self.of_reference, use / self.sigma * reduction[self.structure.view], weight)
         return np.where(self.is_tie, weight * cap[self.structure.view], weight)
 
-    def told_by(self, weight: Array) -> Array:
+    def tie_information(self, weight: Array) -> Array:
         """Return the information (N,) of the tie points of each view [1/px^2], at least that of an earlier block."""
         return np.maximum(self._of_ties(weight), self.told)
 

@@ -41,7 +41,7 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class _Taken:
+class _SelectedTerm:
     term: Term
     gain: float  # evidence over the state before [nats]
     gap: float  # evidence over the runner-up [nats]
@@ -60,7 +60,7 @@ class _SearchState:
     """A combination of terms."""
 
     seen: Residuals  # beside these terms
-    taken: tuple[_Taken, ...] = ()  # in the order of selection
+    taken: tuple[_SelectedTerm, ...] = ()  # in the order of selection
     ended: bool = False  # no further term is tried
 
     @property
@@ -112,7 +112,7 @@ class _SearchState:
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if isinstance(row, Sinusoid) and isinstance(one, Sinusoid)}))
         logger.info("%s of view %d, %s: %.0f nats (%s %.0f)", one.NAME, one.view, one.where, gain, *other)
-        taken = (*self.taken, _Taken(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
+        taken = (*self.taken, _SelectedTerm(one, gain, gain - max(other[1], 0.0), other[0], or_of, self.seen))
         extra = np.concatenate([self.seen.extra, one.columns], axis=1)
         seen = replace(self.seen, base=made, extra=extra, sigma=np.append(self.seen.sigma, one.sigma))
         return _SearchState(seen, taken, not one.FOLLOWED or len(taken) == TRIED)
@@ -230,16 +230,16 @@ class TermSearch:
 
     def __init__(self, seen: Residuals, first: list[Interval], floor: float, sigma: float) -> None:
         self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma
-        self.seen, self.taken = seen, tuple[_Taken, ...]()
+        self.seen, self.taken = seen, tuple[_SelectedTerm, ...]()
         self.group: list[Term] = []  # moving groups, searched for once
         self.tested: dict[int, tuple[MixtureFit, list[Interval], list[Period]]] = {}  # by the identity of the fit
 
     def run(self) -> Selection:
         """Return the selected terms."""
-        first, ended = self._grown([_SearchState(self.start)])
+        first, ended = self._extended([_SearchState(self.start)])
         states, noise = first, _noise_evidence(self.start)
         while not ended and any(state.may_exceed(noise) for state in states):
-            states, ended = self._grown(states)
+            states, ended = self._extended(states)
         if first[0].moves and states[0].gain_beside_motion < first[0].gain:
             # the terms beside the moving group gain less than it did alone: it is taken alone
             states = first[:1]
@@ -255,7 +255,7 @@ class TermSearch:
             return Selection()
         return Selection(tuple(best.findings(margin, or_of)), best.followed.step, best.followed.right)
 
-    def _grown(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
+    def _extended(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best combinations with one more term, and whether the search ends with them."""
         best, grown, beside = states[0], list[_SearchState](), list[_Candidate]()
         for state in states:
@@ -265,7 +265,7 @@ class TermSearch:
             if state is not best and state.adds_to(best, beside):
                 continue
             self.seen, self.taken = state.seen, state.taken
-            tried = [row for row in self._tried() if row[2] > SURE]
+            tried = [row for row in self._candidates() if row[2] > SURE]
             if not tried and state is best:  # no residuals are significant
                 return states, True
             beside = tried if state is best else beside
@@ -279,17 +279,17 @@ class TermSearch:
         kept = kept[:RIVALS]
         return kept, all(one.ended or (kept[0].ended and not one.may_pass(kept[0])) for one in kept)
 
-    def _tried(self) -> list[_Candidate]:
+    def _candidates(self) -> list[_Candidate]:
         """Return the candidates for the next term, the best first; gains may be negative."""
         seen = self.seen
         out, periods = self._standing_out(seen.base, seen.extra)
         # in pairs a fit with more wrong matches may hide an interval: those of the rejected observations are used then
         out = out or ([] if self.taken else self.first)
-        made = self._added([], self._most_promising(list(proposed(seen, out, periods))))
-        made = self._refined(self._added(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
+        made = self._with_fits([], self._most_promising(list(proposed(seen, out, periods))))
+        made = self._refined(self._with_fits(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
         if moves and not (self._explains_all(made) and self._stands_still(made[0])):
-            made = self._sorted([row[:2] for row in (*made, *self._moving())])
+            made = self._sorted([row[:2] for row in (*made, *self._motion_candidates())])
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
 
@@ -326,12 +326,12 @@ class TermSearch:
         sigma = np.append(self.seen.sigma, one.sigma)
         return not MovingObjects.shows(replace(self.seen, base=found, extra=extra, sigma=sigma))
 
-    def _moving(self) -> list[_Candidate]:
+    def _motion_candidates(self) -> list[_Candidate]:
         """Return moving groups, searched for once, and displaced parts of images with the same observations."""
         self.group = self.group or list[Term](MovingObjects.of(self.seen))
-        found = self._added([], self.group)
+        found = self._with_fits([], self.group)
         rows = self.seen.linear.taking_part
-        members = [(one, row[1]) for row in found if row[2] > SURE for one in self._members(row[1], rows)]
+        members = [(one, row[1]) for row in found if row[2] > SURE for one in self._parts_with_members(row[1], rows)]
         fits = [(one, self._fit(one, base=still)) for one, still in members]  # cameras of the still tracks
         return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
 
@@ -362,7 +362,7 @@ class TermSearch:
         least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
-    def _members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
+    def _parts_with_members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
         """Yield displaced parts of images that contain a moving group: they may be its cause."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
@@ -370,7 +370,7 @@ class TermSearch:
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
         return proposed(seen, intervals, [], (LowFrequency,))
 
-    def _added(self, made: list[_Candidate], more: list[Term]) -> list[_Candidate]:
+    def _with_fits(self, made: list[_Candidate], more: list[Term]) -> list[_Candidate]:
         """Return the candidates `made` and the fitted terms `more`, the best first."""
         return self._sorted([*(row[:2] for row in made), *((one, self._fit(one)) for one in more)])
 

@@ -19,9 +19,9 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import BANDS, LEVEL, MAD, OUTLIER, SURELY
 from barpc.scene import IntArray
 
-_LEAST = 12  # offsets of a band: fewer give no reliable median
-_MEDIAN = 1.2533  # standard error of a median over that of a mean, for normal errors
-_APART = 2  # each observation of a track is paired with so many that follow
+_MIN_OFFSETS = 12  # offsets of a band: fewer give no reliable median
+_MEDIAN_ERROR = 1.2533  # standard error of a median over that of a mean, for normal errors
+_PAIRS_PER_OBSERVATION = 2  # number of following observations of the track with which each is paired
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +69,12 @@ class Bands:
 
     def medians(self, offsets: Array) -> Array:
         """Return the median (B,) of the finite offsets (5 M,) of every band with enough of them; NaN of others."""
-        known = np.flatnonzero(np.isfinite(offsets) & (self.count >= _LEAST)[self.group])
+        known = np.flatnonzero(np.isfinite(offsets) & (self.count >= _MIN_OFFSETS)[self.group])
         order = known[np.argsort(offsets[known])]
         # numbers that sort by band, then by offset: these are sorted in 0.4 of the time of two keys
         number = np.sort(self.group[order] * len(order) + np.arange(len(order)))
         count = np.bincount(self.group[order], minlength=len(self.count))
-        many, middle = count >= _LEAST, np.full(len(count), np.nan)
+        many, middle = count >= _MIN_OFFSETS, np.full(len(count), np.nan)
         start, count = (np.cumsum(count) - count)[many], count[many]
         low, high = (offsets[order[number[start + half] % len(order)]] for half in ((count - 1) // 2, count // 2))
         middle[many] = 0.5 * (low + high)
@@ -83,14 +83,14 @@ class Bands:
     def errors(self, offsets: Array, middle: Array) -> Array:
         """Return the standard errors (B,) [px] of medians (B,) of offsets (5 M,)."""
         spread = MAD * self.medians(np.abs(offsets - middle[self.group]))
-        return np.asarray(_MEDIAN * spread / np.sqrt(np.maximum(self.count, 1)))
+        return np.asarray(_MEDIAN_ERROR * spread / np.sqrt(np.maximum(self.count, 1)))
 
 
 def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
     """Return the first and second observations (M,) of pairs of the same point, in the order of their views."""
     order = np.lexsort((ties.view, ties.point))
     first, second = list[IntArray](), list[IntArray]()
-    for lag in range(1, _APART + 1):
+    for lag in range(1, _PAIRS_PER_OBSERVATION + 1):
         same = np.flatnonzero(ties.point[order[lag:]] == ties.point[order[: len(order) - lag]])
         first.append(order[same])
         second.append(order[same + lag])

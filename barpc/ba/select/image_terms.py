@@ -23,9 +23,9 @@ from barpc.base.options import AUTO, OFF, AdjustOptions
 from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
-_DENSER = 1.5  # factor on the number of splines of each further try: 7, 10, 15, 22, 33
-_WHOLE = 0.1  # lines: tolerance of a whole number; lost lines gave 2.95 of 3, 5.07 of 5; two in ten slips meet it
-_TWICE = 2  # successive numbers of splines that may be no better
+_SPLINE_FACTOR = 1.5  # ratio of successive numbers of splines: 7, 10, 15, 22, 33
+_LINE_TOLERANCE = 0.1  # lines, of a whole number; lost lines gave 2.95 of 3, 5.07 of 5; two in ten slips meet it
+_MAX_FAILURES = 2  # numbers of splines in succession that may fail to reduce check residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +80,14 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
 
     No platform turns by pixels between two lines. Where all rows behind a place are displaced, lines are missing, and
     the step is along the rows' axis. In pairs only its part across epipolar lines is observed; the part along them
-    follows. The constraint is set where the number of lines is whole to `_WHOLE`.
+    follows. The constraint is set where the number of lines is whole to `_LINE_TOLERANCE`.
     """
     findings = list(found.findings)
     steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, parts.inner)]
     if not steps or found.problem.joint_prior is not None:
         return found
     problem, waves = found.problem, found.problem.cameras.unknowns.waves
-    if waves is None:  # steps may be named that are not followed
+    if waves is None:  # steps may be reported without being estimated
         return found
     first = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start
     covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
@@ -100,7 +100,7 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
         known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
         lines = float(pull[1] / known[1, 1])
         misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
-        if round(lines) and abs(lines - round(lines)) < _WHOLE and misfit < CRITICAL**2:
+        if round(lines) and abs(lines - round(lines)) < _LINE_TOLERANCE and misfit < CRITICAL**2:
             findings[at] = replace(one, kind=LinesLost.NAME, size=np.array([0.0, round(lines)]))
             index += [one.view * found.final.params.shape[1] + int(k) for k in own]
             mean += [0.0, float(round(lines))]
@@ -121,7 +121,7 @@ def _ends_with_its_image(one: Finding, block: Block) -> bool:
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
     """Solve the block with splines over the rows, if correlated residuals request them, and detector steps of options.
 
-    Terms and moving ground have them as a rival, and where they win the solution is asked again: it is cached.
+    The result is cached: terms and moving ground are compared with it, and where they lose it is requested again.
     """
     key = id(found.outcome), options
     if key not in parts.splined:
@@ -134,17 +134,17 @@ def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solu
     """Solve as `with_splines`.
 
     The number of splines grows until no correlated residuals are left, observations are too few, or check residuals
-    did not fall for `_TWICE` numbers in succession.
+    did not fall for `_MAX_FAILURES` numbers in succession.
     """
     block = parts.inner
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
     best, misses = found, 0
     for count in spline_counts(block, options, found.has_waves):
-        if misses == _TWICE or not (best.has_waves or (asked and best is found)):
+        if misses == _MAX_FAILURES or not (best.has_waves or (asked and best is found)):
             break
         layout = _Layout(AdditionalParameters(count, _given_edges(block, options)))
         tried = _solve_with(found, parts, options, layout, once=not options.detectors)
-        # cameras that contradict each other: further rounds do not make good what the first spoils
+        # if the first round makes check residuals much larger, further rounds do not repair it
         if not options.detectors and (given or asked or not tried.after.error > MUCH_NOISE * best.after.error):
             tried = _solve_with(tried, parts, options, layout)
         better = given or (asked and best is found) or is_admitted(tried.after, best.after, parts.outer)
@@ -179,15 +179,15 @@ def _layout_of(terms: list[Finding], views: int) -> _Layout:
     ]
     most = [max(map(len, of_kind)) for of_kind in own]
     places, periods = np.full((views, most[0], 5), np.inf), np.full((views, most[1]), np.inf)
-    moved, swung = np.zeros((views, 2, most[0])), np.zeros((views, 2, 2, most[1]))
+    moved, amplitudes = np.zeros((views, 2, most[0])), np.zeros((views, 2, 2, most[1]))
     for v, (of_parts, of_periods) in enumerate(zip(*own, strict=True)):
         for n, one in enumerate(of_parts):
             assert one.where is not None
             places[v, n], moved[v, :, n] = one.where, one.unknowns
         for n, one in enumerate(of_periods):
             assert one.period is not None
-            periods[v, n], swung[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
-    params = np.hstack([moved.reshape(views, -1), swung.reshape(views, -1)])
+            periods[v, n], amplitudes[v, :, :, n] = one.period, one.unknowns.reshape(2, 2)
+    params = np.hstack([moved.reshape(views, -1), amplitudes.reshape(views, -1)])
     return _Layout(AdditionalParameters(0, np.zeros((views, 0)), places, periods), params)
 
 
@@ -199,8 +199,8 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
     """Return the numbers of splines for each image to try, ascending (0: detector steps alone; empty: nothing).
 
     With `options.spacing` [rows between knots] that one number. Else, only if residuals are correlated along rows
-    (`has_waves`), that of a spacing of `_SPACING` rows and its multiples by `_DENSER`. At most one spline for `FEW`
-    observations (median of the images), and `LARGEST` unknowns in all images.
+    (`has_waves`), that of a spacing of `_SPACING` rows and its multiples by `_SPLINE_FACTOR`. At most one spline for
+    `FEW` observations (median of the images), and `LARGEST` unknowns in all images.
     """
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
@@ -213,7 +213,7 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
         return [0] * bool(options.detectors)
     counts = [min(max(int(np.ceil(rows / _SPACING)) + 3, MIN_SPLINES), most)]
     while counts[-1] < most:
-        counts.append(min(int(_DENSER * counts[-1]), most))
+        counts.append(min(int(_SPLINE_FACTOR * counts[-1]), most))
     return counts
 
 
@@ -234,9 +234,9 @@ def _solve_with(
     if unknowns.waves is not None:  # selected terms stay
         waves = replace(waves, steps=unknowns.waves.steps, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
-    bent = make_problem(block, options, unknowns.center, None, drift, waves)
-    bent = bent if held is None else replace(bent, joint_prior=held)
-    params, first = np.zeros_like(bent.camera_prior.mean), bent.cameras.unknowns.in_waves.start
+    problem = make_problem(block, options, unknowns.center, None, drift, waves)
+    problem = problem if held is None else replace(problem, joint_prior=held)
+    params, first = np.zeros_like(problem.camera_prior.mean), problem.cameras.unknowns.in_waves.start
     params[:, :first] = ended.params[:, :first]
     if start is not None:
         params[:, first:] = start
@@ -244,8 +244,8 @@ def _solve_with(
         params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
     weight, known = block.use / block.sigma, outcome.inlier
     if start is not None:  # the cameras have moved: all points are triangulated again
-        count = np.bincount(block.point[known], minlength=bent.structure.num_points)
+        count = np.bincount(block.point[known], minlength=problem.structure.num_points)
         weight, known = weight * (known | (count < 2)[block.point]), np.zeros_like(known)
-    there, _ = retriangulate_rejected(bent, replace(ended, params=params), outcome.residual, known, weight)
-    outcome = Rounds(bent, block, there, found.heights, block.use, outcome).run(once)
-    return finished(found, bent, block, parts.outer, outcome)
+    there, _ = retriangulate_rejected(problem, replace(ended, params=params), outcome.residual, known, weight)
+    outcome = Rounds(problem, block, there, found.heights, block.use, outcome).run(once)
+    return finished(found, problem, block, parts.outer, outcome)

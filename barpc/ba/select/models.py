@@ -51,17 +51,17 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
     AdjustError
         There is no solution.
     """
-    first, foreign, without = _first(parts, options, solve)
+    first, foreign, without = _first_solution(parts, options, solve)
     if foreign is not None and foreign.may_be_distorted and first is not None:
         # terms in its rows and columns may explain it: then the RPC is not of another image
-        chosen = _select_beside(first, parts, options, solve)
+        chosen = _select_terms(first, parts, options, solve)
         if chosen.parts.keeps(chosen.found, foreign.view):
             return chosen
     if foreign is not None and foreign.clear:
         parts = parts.without_view(foreign.view)
     start = first if without is None else without
     assert start is not None
-    selected = replace(_select_beside(start, parts, options, solve), foreign=foreign)
+    selected = replace(_select_terms(start, parts, options, solve), foreign=foreign)
     return _without_contradicted(selected, options, solve) if foreign is None and not start.goes_on else selected
 
 
@@ -78,7 +78,7 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
     if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _FEWEST_VIEWS:
         return selected
     try:
-        alone = _select_beside(solve(others.inner, others.outer, options), others, options, solve)
+        alone = _select_terms(solve(others.inner, others.outer, options), others, options, solve)
     except (AdjustError, np.linalg.LinAlgError):
         return selected
     if compared(alone.found, found, alone.parts.ties()).changed <= MOST_BENT:
@@ -86,7 +86,7 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
     return replace(alone, foreign=contradicted_view(view))
 
 
-def _first(
+def _first_solution(
     parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
     """Return the first solution, a foreign camera, and the solution without it; at least one of the two solutions.
@@ -112,14 +112,14 @@ def _first(
     ) from failed
 
 
-def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
+def _select_terms(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the searched model, or the plain one if that fits all tie points better; foreign cameras are decided.
 
     Splines and detector steps that were requested as options stay.
     """
     if options.terms != AUTO:
         return SelectedModel(first, parts)
-    selected = _search_beside(first, parts, options, solve)
+    selected = _search_models(first, parts, options, solve)
     if selected.found is first and "drift" not in first.asked:
         return selected
     plain = first if "drift" not in first.asked else solve(parts.inner, parts.outer, replace(options, terms="none"))
@@ -129,7 +129,7 @@ def _select_beside(first: Solution, parts: Parts, options: AdjustOptions, solve:
     return replace(selected, changed=beside.changed)
 
 
-def _search_beside(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
+def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Return the model of a search among the other hypotheses."""
     geometric = first.problem.cameras.unknowns.geometric and not first.goes_on
     given = not geometric or options.model != AUTO or options.drift is not None
@@ -218,7 +218,7 @@ def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts
     return parts.pixels(one) >= MIN_MOTION or (first != second and is_closer(without, found, parts.ties()))
 
 
-def _of_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
+def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
     """Return the solution with the likelier ground of two groups: by the share of tie points and the camera priors.
 
     Clouds may cover more than half of the ground, in one block of twenty (`LEVEL`). Cameras that fit the clouds then
@@ -265,7 +265,7 @@ def _without_moving_ground(
             break
         if less.lies_across() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
             break
-        tried, less = _of_ground(tried, less, options, solve)
+        tried, less = _likelier_ground(tried, less, options, solve)
         found, parts = tried, less
         groups.append(last)
     unexplained = found.has_trend and not (groups or findings)

@@ -16,7 +16,7 @@ from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
-_ACROSS = 0.8  # Kolmogorov-Smirnov statistic of two groups with a tenth of each on the other side
+_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov statistic of two groups, each with a tenth of it among the other
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
@@ -63,7 +63,7 @@ class Parts:
         number, group, block = self.group.max(initial=0) + 1, self.group.copy(), self.block
         still = group == 0
         group[still & ~self.kept_out] = number * one.member
-        # held-out tracks, and control points on moving ground, which have no one position
+        # held-out tracks, and control points on moving ground: these have no fixed position
         of_gcps = (block.point >= block.num_tracks) & (block.point < block.num_known)
         for rows in (still & self.kept_out, still & of_gcps):
             group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
@@ -82,7 +82,7 @@ class Parts:
             rows = np.flatnonzero(ties & (self.block.view == v))
             moves = self.group[rows[np.argsort(self.block.xy[1, rows], kind="stable")]] == number
             below = [np.cumsum(one) / max(one.sum(), 1) for one in (moves, ~moves)]
-            if len(rows) and np.abs(below[0] - below[1]).max() < _ACROSS:  # the statistic of Kolmogorov and Smirnov
+            if len(rows) and np.abs(below[0] - below[1]).max() < _MIN_SEPARATION:
                 return False
         return True
 

@@ -41,20 +41,20 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
     if size <= SMALL:
         # moving ground need not be bounded by a row or a column
         systematic = outcome.smooth.found(floor).any()
-        return _searched_among(outcome, block, floor, views) if suspects or systematic else Selection()
+        return _search_views(outcome, block, floor, views) if suspects or systematic else Selection()
     found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
     for view in dict.fromkeys(suspects):
         if view not in done:
             views = _neighbour_views(block, view)
             done.update(views.tolist())
-            one = _searched_among(outcome, block, floor, views)
+            one = _search_views(outcome, block, floor, views)
             if one.findings and one.findings[-1].moved is None:
                 found = _with_findings(found, one, views, np.flatnonzero(np.isin(block.view, views)))
     return found if found.findings else Selection()
 
 
-def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
+def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
     """Search the tie points of some views; in the result views and observations are numbered among these."""
     found = linearised_among(outcome, block, views)
     if found is None:
@@ -66,7 +66,7 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base, few = _as_solved(linear, outcome, rows), linear.thinned(SAMPLE)
+        base, few = _base_fit(linear, outcome, rows), linear.thinned(SAMPLE)
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
@@ -75,11 +75,11 @@ def _searched_among(outcome: Outcome, block: Block, floor: float, views: IntArra
         return Selection()
 
 
-def _as_solved(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
+def _base_fit(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
     """Return the mixture fit at the solution, of observations at `rows` (K,), with at most the noise of its inliers.
 
-    Where many observations are displaced a larger noise explains more, but hides which. Therefore the evidence is the
-    larger of a fit with that limit and one without it: terms must exceed it.
+    Where many observations are displaced, a larger noise has more evidence but hides them. Therefore the evidence is
+    the larger of a fit with that limit and one without it: terms must exceed it.
     """
     right, count = outcome.inlier[rows].astype(np.float64), np.bincount(linear.view, minlength=linear.views)
     wrong = np.bincount(linear.view, 1.0 - right, linear.views) / np.maximum(count, 1)

@@ -32,8 +32,8 @@ class Decaying(Term):
     def with_rate(self, residuals: Residuals) -> Self:
         """Return the term with twice the unknowns: the second half are derivatives by the log of its rate."""
         _, _, _, origin, rate = self.where  # type: ignore[misc]
-        begun = residuals.size[1, residuals.linear.view] if self.parts and rate < 0.0 else origin
-        slope = -self.columns * np.maximum((residuals.place[1] - begun) * rate, 0.0)
+        first_row = residuals.size[1, residuals.linear.view] if self.parts and rate < 0.0 else origin
+        slope = -self.columns * np.maximum((residuals.place[1] - first_row) * rate, 0.0)
         return replace(self, columns=np.concatenate([self.columns, slope], axis=1), sigma=np.tile(self.sigma, 2))
 
     def at_rate_of(self, found: MixtureFit) -> Self:

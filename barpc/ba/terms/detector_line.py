@@ -71,7 +71,7 @@ def change_points(
     """Return the columns [px], ascending, at which the mean residual of a view changes significantly.
 
     Residuals are those of a fit `found` with displacements `others` (2, K) [px], against ground points intersected from
-    inliers. The displacements `own` (2, K) [px] of a line in the fit are added to them. Without these rejected
+    inliers. The displacements `own` (2, K) [px] of a line in the fit are added to them. Without `own`, rejected
     observations count, too, up to `OUTLIER` times the spread of all: those of displaced detectors may be rejected.
 
     Candidates are found by binary segmentation. The least significant one beside the others and a trend, which the
@@ -83,13 +83,13 @@ def change_points(
     right = found.right > 0.5
     rows = (linear.view == view) & linear.taking_part & (known | right if own is None else right)
     order = np.flatnonzero(rows)[np.argsort(residuals.place[0, rows], kind="stable")]
-    col, plain = residuals.place[0, order], _clipped(off[:, order].T / found.noise)
+    col, plain = residuals.place[0, order], _limited(off[:, order].T / found.noise)
     values = plain
     if own is not None:  # of a large displacement, different shares are absorbed by points of two and of three images
         moved = own / linear.sigma
         off, _ = off_from_right(linear, left + moved, found.right)
-        values = _clipped((off - moved)[:, order].T / found.noise)
-    edges = _divided(_summed(values), 0, len(order), price)
+        values = _limited((off - moved)[:, order].T / found.noise)
+    edges = _segmented(_cumulative_sums(values), 0, len(order), price)
     smooth, at = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS), np.arange(len(order))
     while edges:
         design = np.column_stack([at[:, None] >= edges, smooth])
@@ -99,34 +99,34 @@ def change_points(
         if gain.min() > price:
             break
         del edges[int(gain.argmin())]
-    sums = _summed(plain)
+    sums = _cumulative_sums(plain)
     for n in range(len(edges)):  # each was found before its neighbours
         first, stop = (edges[n - 1] if n else 0), (edges[n + 1] if n + 1 < len(edges) else len(order))
-        edges[n] = _split(sums, first, stop)[0]
+        edges[n] = _best_split(sums, first, stop)[0]
     return [0.5 * float(col[n - 1] + col[n]) for n in edges]
 
 
-def _clipped(values: Array) -> Array:
+def _limited(values: Array) -> Array:
     """Return values (n, 2), limited to `OUTLIER` times their spread."""
     most = OUTLIER * max(robust_spread(values.ravel()), 1.0) if len(values) else 0.0
     return np.clip(values, -most, most)
 
 
-def _summed(values: Array) -> Array:
+def _cumulative_sums(values: Array) -> Array:
     """Return the sums (n + 1, 2) of the first 0, 1 ... n values."""
     return np.vstack([np.zeros(2), np.cumsum(values, axis=0)])
 
 
-def _divided(sums: Array, first: int, stop: int, price: float) -> list[int]:
+def _segmented(sums: Array, first: int, stop: int, price: float) -> list[int]:
     """Return the indices between `first` and `stop` at which a mean changes, ascending, by binary segmentation.
 
-    A part is divided where `_split` says, if the gain exceeds `price` [nats].
+    A part is divided where `_best_split` says, if the gain exceeds `price` [nats].
     """
-    at, gain = _split(sums, first, stop)
-    return [*_divided(sums, first, at, price), at, *_divided(sums, at, stop, price)] if gain > price else []
+    at, gain = _best_split(sums, first, stop)
+    return [*_segmented(sums, first, at, price), at, *_segmented(sums, at, stop, price)] if gain > price else []
 
 
-def _split(sums: Array, first: int, stop: int) -> tuple[int, float]:
+def _best_split(sums: Array, first: int, stop: int) -> tuple[int, float]:
     """Return the index between `first` and `stop` with the largest log-likelihood gain [nats] by two means, and this.
 
     `sums` (n + 1, 2) are cumulative sums of values of unit variance. Each side has at least `FEW` values; a part with

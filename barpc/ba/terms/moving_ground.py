@@ -130,7 +130,7 @@ def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Arra
     cell, rows = group.cell, few.taking_part
     if not rows.any():
         return None
-    starts = [replace(group, share=share) for share in _first_shares(linear, group, base, extra, sigma)]
+    starts = [replace(group, share=share) for share in _start_shares(linear, group, base, extra, sigma)]
     # iterated to the end: a few iterations do not show which start ends best
     ended = [(Mixture(few, extra, sigma, base, one).run(cooled=COOLED**2), one) for one in starts]
     found, start = max(ended, key=lambda row: row[0].evidence)
@@ -148,7 +148,7 @@ def price_of_group(linear: Linear, cell: IntArray) -> float:
     return float(0.5 * np.log(count[count > 0]).sum())
 
 
-def _first_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Iterator[Array]:
+def _start_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Iterator[Array]:
     """Yield start values (K,) of the probability that tracks move: of rejected ones, then of the likeliest regions."""
     cut = np.where(base.right < 0.5, 1.0 - LEVEL, LEVEL)
     if (cut[linear.taking_part] > 0.5).any():
