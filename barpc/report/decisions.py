@@ -71,7 +71,7 @@ def _added(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     elif scene.left or scene.held_out_places or any(view.cause in _UNEXPLAINED for view in views):
         yield "None of the additional parameters that were tested explains the inconsistent residuals."
     else:
-        yield "No additional parameters were selected."
+        yield "No additional parameters of the images were selected."
 
 
 def _left(one: JustificationEntry) -> str:
@@ -84,7 +84,7 @@ def _left(one: JustificationEntry) -> str:
 
 def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
     """Yield the degree of the attitude drift, and the residuals of a lower one; `asked`: the option."""
-    degree, words = scene.drift_degree, "The attitude may drift along the rows, as a polynomial of degree"
+    degree, words = scene.drift_degree, "A drift of the attitude along the rows is estimated, as a polynomial of degree"
     if asked is not None:
         yield f"The degree of the attitude drift, {degree}, was set by an option."
     elif not degree:
@@ -93,7 +93,7 @@ def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
         yield f"{words} {degree}, as in the earlier run."
     else:
         sigma = ", ".join(metres(known(one)) for one in scene.drift_sigma_m) + " (by degree)" * (degree > 1)
-        yield f"{words} {degree}. Its prior sigma on the ground is {sigma} at the first and last row."
+        yield f"{words} {degree}. The prior sigma of the drift is {sigma} on the ground, at the first and last row."
         if scene.drift_justification is not None:
             yield f"Degree {degree - 1} left {_left(scene.drift_justification)}."
 
@@ -125,13 +125,13 @@ def _priors(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     if widened := [(by, one.name) for one in views if (by := one.prior_scale or 0.0) > _WIDENED]:
         (least, _), (most, name) = min(widened), max(widened)
         named = len(widened) == 1 or most > _WIDENED * least  # the priors of two images are widened alike
-        times = f"up to {most:.1f} times ({name})" if named else f"{most:.1f} times"
+        times = f"by up to {most:.1f} ({name})" if named else f"by {most:.1f}"
         yield (
-            "The corrections exceed the accuracies assumed of the cameras. The prior sigmas of "
-            f"{counted(len(widened), 'image')} were widened, {times}."
+            "The corrections are larger than the prior sigmas of the cameras allow. Those of "
+            f"{counted(len(widened), 'image')} were multiplied {times}."
         )
     if (scene.prior_shared or 1.0) > _WIDENED:
-        yield f"The prior sigmas of an error common to all images were widened {scene.prior_shared:.1f} times."
+        yield f"The prior sigmas of an error common to all images were multiplied by {scene.prior_shared:.1f}."
 
 
 def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:

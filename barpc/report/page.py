@@ -282,7 +282,7 @@ def _corrections_section(files: RunFiles) -> Section | None:
     tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
     answer = f"By up to {max(moves):.2f} px at the image centre (corrected minus delivered). "
-    answer += "The sigmas include that of the scene's position."
+    answer += "The sigmas in the tables include that of the scene's position."
     return Section("moves", "How was each camera corrected?", answer, tables=tables)
 
 

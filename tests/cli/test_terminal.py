@@ -149,7 +149,7 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
     print_summary(summary)
     titles = [text for text, style in spoken if style.get("bold")]
     assert titles[:2] == [
-        "Images: residuals (RMS) of the tie points in use",
+        "Images: tie points, and the RMS of their residuals",
         "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)",
     ]
     assert titles[2:] == [GCP_CAPTION, "Look here."]
@@ -197,7 +197,7 @@ def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
     ]
     monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
     print_summary(a_summary([a_view("A")], status=status))
-    assert spoken[2][0] == "Images:\nresiduals\n(RMS) of the\ntie points\nin use"
+    assert spoken[2][0] == "Images: tie\npoints, and\nthe RMS of\ntheir\nresiduals"
 
 
 COMPARISON: dict[str, Any] = {

@@ -361,7 +361,7 @@ def _(s, model):
     assert model == s.scene.model.replace("+", " and ")
 
 
-@says(r"No additional parameters were selected\.")
+@says(r"No additional parameters of the images were selected\.")
 def _(s):
     assert not s.scene.explanations
 
@@ -376,12 +376,12 @@ def _(s, degree):
     assert int(degree) == s.scene.drift_degree == s.options["adjust"]["drift"]
 
 
-@says(r"The attitude may drift along the rows, as a polynomial of degree (\d+)(.*)\.")
+@says(r"A drift of the attitude along the rows is estimated, as a polynomial of degree (\d+)(.*)\.")
 def _(s, degree, rest):
     assert int(degree) == s.scene.drift_degree
     assert s.options["adjust"]["drift"] is None
     assert ("as in the earlier run" in rest) == (None in s.scene.drift_sigma_m)
-    if found := re.search(r"on the ground is (.*) at the first", rest):
+    if found := re.search(r"sigma of the drift is (.*) on the ground, at the first", rest):
         assert found[1].removesuffix(" (by degree)") == ", ".join(map(metres, s.scene.drift_sigma_m))
 
 
@@ -407,8 +407,8 @@ def _(summary, times, either):
 
 
 @says(
-    r"The corrections exceed the accuracies assumed of the cameras\. The prior sigmas of (\d+) images? were widened, "
-    rf"(?:up to )?{NUM} times(?: \((.*)\))?\."
+    r"The corrections are larger than the prior sigmas of the cameras allow\. Those of (\d+) images? were multiplied "
+    rf"by (?:up to )?{NUM}(?: \((.*)\))?\."
 )
 def _(s, num, times, name):
     wide = {view.name: view.prior_scale for view in s.views if (view.prior_scale or 1.0) > 1.005}
@@ -436,7 +436,7 @@ def _(s, degree, size, image):
     near(size, one.systematic_px)
 
 
-@says(rf"The prior sigmas of an error common to all images were widened {NUM} times\.")
+@says(rf"The prior sigmas of an error common to all images were multiplied by {NUM}\.")
 def _(s, times):
     near(times, s.scene.prior_shared)
 
@@ -526,7 +526,7 @@ def _(s, offset, none):
     assert not none or not any("Best pair" in step.text for step in s.next)
 
 
-@says(rf"By up to {NUM} px at the image centre \(corrected minus delivered\)\. The sigmas include .*")
+@says(rf"By up to {NUM} px at the image centre \(corrected minus delivered\)\. The sigmas in the tables include .*")
 def _(s, most):
     near(most, max(np.hypot(*view.correction.center_shift_px) for view in s.views))
 

@@ -73,11 +73,11 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     )
     assert record.options["adjust"]["drift"] is None
     plain = said(record, drift_degree=1, drift_sigma_m=(0.12,))
-    assert "a polynomial of degree 1. Its prior sigma on the ground is 12 cm at the first and last row." in plain
+    assert "degree 1. The prior sigma of the drift is 12 cm on the ground, at the first and last row." in plain
     assert "left" not in plain
     more = said(record, drift_degree=2, drift_sigma_m=(0.12, 0.3), drift_justification=given)
     assert (
-        "a polynomial of degree 2. Its prior sigma on the ground is 12 cm, 30 cm (by degree) at the first and last row."
+        "degree 2. The prior sigma of the drift is 12 cm, 30 cm (by degree) on the ground, at the first and last row."
         in more
     )
     left = "systematic residuals of 0.31 px in B, and 0.12 px correlated between neighbours."
@@ -94,7 +94,7 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
 
 def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_selected(record):
     plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
-    assert "No additional parameters were selected." in plain
+    assert "No additional parameters of the images were selected." in plain
     assert "are alike in all parts" in plain
     for cause in ("systematic", "held_out", "wrong_matches", "left"):
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
@@ -102,7 +102,7 @@ def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_
         assert "None of the additional parameters that were tested explains the inconsistent residuals." in text
         assert "are alike in all parts" not in text
     odd = with_views(record, {"cause": "odd", "advice": "look"})
-    assert "No additional parameters were selected." in said(odd, held_out_places=())
+    assert "No additional parameters of the images were selected." in said(odd, held_out_places=())
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
     assert "are alike in all parts" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
@@ -111,20 +111,20 @@ def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_
 
 def test_priors_hold_or_were_widened(record):
     held = with_views(record, *[{"prior_scale": 1.0}] * 9)
-    assert "accuracies" not in said(held, prior_ratio=0.7)
+    assert "prior sigmas of the cameras" not in said(held, prior_ratio=0.7)
     first, second = (view.name for view in record.views[:2])
     for scales, widened in (
-        ((1.5, 3.2), f"2 images were widened, up to 3.2 times ({second})"),
-        ((3.2, 1.0), f"1 image were widened, up to 3.2 times ({first})"),
-        ((3.2, 3.2), "2 images were widened, 3.2 times"),  # as of a pair, which does not show whose is wrong
+        ((1.5, 3.2), f"2 images were multiplied by up to 3.2 ({second})"),
+        ((3.2, 1.0), f"1 image were multiplied by up to 3.2 ({first})"),
+        ((3.2, 3.2), "2 images were multiplied by 3.2"),  # as of a pair, which does not show whose is wrong
     ):
         text = said(with_views(held, *({"prior_scale": scale} for scale in scales)), prior_ratio=9.0)
-        start = "The corrections exceed the accuracies assumed of the cameras. The prior sigmas of"
+        start = "The corrections are larger than the prior sigmas of the cameras allow. Those of"
         assert f"{start} {widened}." in text.splitlines()
-    assert "accuracies" not in said(with_views(held, {"prior_scale": 3.2}), prior_ratio=None)
+    assert "prior sigmas of the cameras" not in said(with_views(held, {"prior_scale": 3.2}), prior_ratio=None)
     assert "common to all" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
-    assert "The prior sigmas of an error common to all images were widened 1.8 times." in shared
+    assert "The prior sigmas of an error common to all images were multiplied by 1.8." in shared
 
 
 def test_the_model_is_said(record):
@@ -186,15 +186,15 @@ def test_a_check_and_an_older_summary_say_what_they_know(check_run, record):
     )
     older = with_views(record, *[{"neighbour_correlated_px": None, "systematic_p": None, "num_rejected": 0}] * 9)
     found = decisions(replace(older, scene=bare, options=None, control_test=None, gcps=(), pairs=()))
-    assert [line.split()[0] for line in found] == ["The", "Observations"]
+    assert [line.split()[0] for line in found] == ["A", "Observations"]
 
 
 def test_an_accuracy_is_widened_from_half_a_percent_on(record):
     calm = with_views(record, *[{"prior_scale": 1.0}] * 9)
     for scale, widened in ((1.005, False), (1.006, True), (None, False)):
         text = said(with_views(calm, {"prior_scale": scale}), prior_ratio=1.0)
-        assert ("of 1 image were widened, up to 1.0 times" in text) == widened
-        assert ("accuracies" in text) == widened
+        assert ("of 1 image were multiplied by up to 1.0" in text) == widened
+        assert ("prior sigmas of the cameras" in text) == widened
     given = JustificationEntry(
         image="B", systematic_px=None, systematic_p=None, neighbour_correlated_px=0.0, num_images=1
     )
@@ -203,7 +203,7 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
 
 
 def test_where_nothing_won_it_is_said_why(record):
-    assert "No additional parameters were selected." in said(record)
+    assert "No additional parameters of the images were selected." in said(record)
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
     assert "None of the additional parameters that were tested explains the inconsistent residuals." in text

@@ -107,7 +107,7 @@ class ViewEntry(Record):
         "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
         "largest": Column("RPC misfit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
     }
-    CAPTION: ClassVar = "Images: residuals (RMS) of the tie points in use"
+    CAPTION: ClassVar = "Images: tie points, and the RMS of their residuals"
     PAGE: ClassVar = (
         "name verdict wrong num_observations num_check lost tie_coverage rmse_before rmse_after held_out_px "
         "correction.center_shift_px gsd_m incidence_deg rpc_source.format"
