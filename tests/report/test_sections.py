@@ -219,8 +219,8 @@ def test_corrections_are_told_by_the_farthest_move():
     ]
     section = asked("moves", views)
     assert section.answer == (
-        "By up to 5.00 px at the image centre (corrected minus delivered). The sigmas in the tables include that of the "
-        "scene's position."
+        "By up to 5.00 px at the image centre (corrected minus delivered). The sigmas in the tables include that of "
+        "the scene's position."
     )
     assert [table.key for table in section.tables] == ["corrections", "places"]
     assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-"]
