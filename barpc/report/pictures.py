@@ -13,7 +13,9 @@ from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, medians
 
-PICTURE_KEY = "On the pictures tie points used in an image are blue; those rejected there are red."
+PICTURE_KEY = (
+    "On the pictures tie points used in an image are blue; those rejected there, but used in other images, are red."
+)
 _DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 
 

@@ -151,9 +151,11 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
     common = _common_scale(found)
     if common > PRIOR_WIDENED and any(is_stated(view, found.options) for view in run.views):
         either = " Tie points of two images cannot show which camera is wrong." * (len(run.views) == 2)
+        alone = _by_cameras_alone(run, found)
+        position, add = ", and so is the scene's position" * alone, ", or add GCPs or a DEM" * alone
         yield (
-            f"The cameras are {common:.1f} times less accurate than stated, and so is the scene's position.{either} "
-            "Check the RPCs and the stated accuracies, or add GCPs or a DEM."
+            f"The cameras are {common:.1f} times less accurate than stated{position}.{either} "
+            f"Check the RPCs and the stated accuracies{add}."
         )
     yield from _of_image_model(run, found)
     if found.apart is not None and not found.apart.clear:

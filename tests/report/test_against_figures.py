@@ -396,10 +396,12 @@ def _(s, assumed, names):
 
 
 @says(
-    rf"The cameras are {NUM} times less accurate than stated, and so is the scene's position\.( Tie points of two "
-    r"images cannot show which camera is wrong\.)? Check .*"
+    rf"The cameras are {NUM} times less accurate than stated(, and so is the scene's position)?\.( Tie points of two "
+    r"images cannot show which camera is wrong\.)? Check the RPCs and the stated accuracies(, or add GCPs or a DEM)?\."
 )
-def _(summary, times, either):
+def _(summary, times, position, either, add):
+    assert bool(position) == bool(add)
+    assert not (position and summary.gcps)
     assert bool(either) == (len(summary.views) == 2)
     scale = min(view.prior_scale for view in summary.views)
     assert float(times) == round(scale, 1) > 2.0

@@ -298,6 +298,17 @@ def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
         assert two[0].split(". ")[1] == "Tie points of two images cannot show which camera is wrong"
 
 
+def test_with_gcps_the_position_is_not_as_uncertain_as_the_cameras():
+    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.full(3, 7.0), drift_sigma=())
+    alone, held = (
+        next(verdicts._of_cameras(run_of(adjusted(prior=prior), gcps=gcps), adjusted(prior=prior)))
+        for gcps in (None, object())
+    )
+    assert alone.startswith("The cameras are 7.0 times less accurate than stated, and so is the scene's position. ")
+    assert alone.endswith(", or add GCPs or a DEM.")
+    assert held == "The cameras are 7.0 times less accurate than stated. Check the RPCs and the stated accuracies."
+
+
 def test_an_accuracy_that_nobody_stated_is_no_reason():
     """The default is no statement: what was off is said with its size, and corrected."""
     nobody = SimpleNamespace(**{**vars(adjusted().options), "sigma_attitude": None, "sigma_position": None})
