@@ -177,7 +177,7 @@ def _compared_pairs(run_a: Summary, run_b: Summary) -> list[dict[str, Any]]:
 def _comparison_lines(comparison: Mapping[str, Any]) -> list[str]:
     views = comparison["views"]
     a, b = (median([view["rmse"][k] for view in views]) for k in (0, 1))
-    lines = [f"{len(views)} images in both: their tie points agree to {a:.3f} px in A, {b:.3f} px in B."]
+    lines = [f"{len(views)} images in both: their tie points have residuals of {a:.3f} px in A, {b:.3f} px in B."]
     moved = [view for view in views if view["rpc_difference_px"] is not None]
     if moved:
         most = max(moved, key=itemgetter("rpc_difference_px"))

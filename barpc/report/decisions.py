@@ -29,9 +29,10 @@ def decisions(summary: Summary) -> list[str]:
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
     if (test := summary.control_test) is not None:
         found.append(
-            f"Of {counted(test.num, 'residual')} of control points in the images, {test.num_beyond} exceed Baarda's w "
-            f"of {test.critical:.3g} ({two_digits(test.expected)} expected by chance). The largest is that of "
-            f"{test.point} in {test.image} (w = {known(test.largest_w):.1f})."
+            f"Of {counted(test.num, 'residual')} of control points in the images, {test.num_beyond} "
+            f"{'has' if test.num_beyond == 1 else 'have'} Baarda's w above {test.critical:.3g} "
+            f"({two_digits(test.expected)} expected by chance). The largest w is {known(test.largest_w):.1f} "
+            f"({test.point} in {test.image})."
         )
     return found
 
@@ -44,7 +45,7 @@ def _matched(pairs: Sequence[PairEntry], matcher: object) -> Iterator[str]:
         yield f"Not all pairs were matched by {matcher or 'one matcher'}: {by}."
     if shares := [(pair.decoy_share, pair.a, pair.b) for pair in tied if pair.decoy_share is not None]:
         share, a, b = max(shares)
-        yield f"The matcher expects at most {100 * share:.2g} % of a pair's matches to be false ({a} - {b})."
+        yield f"The matcher estimates that at most {100 * share:.2g} % of a pair's matches are false ({a} - {b})."
     if any(pair.chosen_by not in (None, "overlap and angle") for pair in tied):
         yield f"Pairs by selection criterion: {_tally((pair.chosen_by for pair in tied), ' ')}."
     if pairs and not tied:
@@ -84,7 +85,7 @@ def _left(one: JustificationEntry) -> str:
 
 def _drift(scene: SceneEntry, asked: object) -> Iterator[str]:
     """Yield the degree of the attitude drift, and the residuals of a lower one; `asked`: the option."""
-    degree, words = scene.drift_degree, "A drift of the attitude along the rows is estimated, as a polynomial of degree"
+    degree, words = scene.drift_degree, "The attitude drift is estimated as a polynomial of the row, of degree"
     if asked is not None:
         yield f"The degree of the attitude drift, {degree}, was set by an option."
     elif not degree:
@@ -127,7 +128,7 @@ def _priors(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         named = len(widened) == 1 or most > _WIDENED * least  # the priors of two images are widened alike
         times = f"by up to {most:.1f} ({name})" if named else f"by {most:.1f}"
         yield (
-            "The corrections are larger than the prior sigmas of the cameras allow. Those of "
+            "The corrections are larger than the prior sigmas of the cameras allow. The prior sigmas of "
             f"{counted(len(widened), 'image')} were multiplied {times}."
         )
     if (scene.prior_shared or 1.0) > _WIDENED:
@@ -146,4 +147,4 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:
-        yield "The residuals of check tie points are alike in all parts of every image."
+        yield "No part of an image has larger residuals of check tie points than the rest."

@@ -244,7 +244,7 @@ def map_labels(
         name = (
             view.name if len(view.name) <= _MAX_LABEL_LENGTH else f"…{view.name[1 - _MAX_LABEL_LENGTH :]}"
         )  # its end tells of a series
-        name += f" + {alike}" * bool(alike)
+        name += f" and {alike} more" * bool(alike)
         (x, y), half = place.tolist(), 4.1 * len(name)  # units of a bold character: 8.2, of digits
         x = min(max(x, half), WIDTH - half)
         rows = [y + 1.1 * _LABEL_HEIGHT * k for k in (0, 1, -1, 2, -2)]

@@ -98,23 +98,25 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
         return
     now = np.sqrt(np.diag(covariance))[_POSITION]
     options, found, words = summary.options or {}, list[ExpectedEntry](), list[str]()
+    lower = "would lower the uncertainty"
     if not (summary.reference and summary.reference.used) and not (scene.dem and scene.dem.num_held):
         then = _sigma_with(covariance, *_dem_observations(options))
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
-            words.append(f"--dem FILE --geoid NAME (to {metres(then[2])} up)")
+            words.append(f"A DEM (--dem FILE --geoid NAME) {lower} of the height to {metres(then[2])}.")
     up = now[2] * _height_ratio(summary, scene)
     if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))
-        words.append(f"a third image {NEW_ANGLE:g} deg from both (to {metres(up)} up)")
+        words.append(f"A third image {NEW_ANGLE:g} deg from both {lower} of the height to {metres(up)}.")
     then = _sigma_with(covariance, *_gcp_observations(summary, scene))
     if (now > LEAST_GAIN * then).any():
         found.append(ExpectedEntry("gcps", tuple(then.tolist())))
         accuracy = f"{metres(GROUND_SIGMA)} and {IMAGE_SIGMA:g} px"
-        words.append(f"--gcp FILE with {NUM_GCPS} points good to {accuracy} (to {lengths(then)})")
+        words.append(
+            f"GCPs at {NUM_GCPS} points, good to {accuracy} (--gcp FILE), {lower} of the position to {lengths(then)}."
+        )
     if found:
-        text = f"To lower the uncertainty of the position, add {', or '.join(words)}."
-        yield StepEntry("improve", text, expected=tuple(found), part="gauge")
+        yield StepEntry("improve", " ".join(words), expected=tuple(found), part="gauge")
 
 
 def _height_ratio(summary: Summary, scene: SceneEntry) -> float:

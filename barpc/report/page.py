@@ -47,7 +47,7 @@ _ROUNDING = 1e-6  # px
 _SIGNIFICANT = 1e-4  # probability of the F test below which residuals are systematic: `SmoothTest.found`
 _FOOTER = (
     "Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of the first pixel. The numbers of this page "
-    "are in summary.json and in the folder tables: residuals.csv, observations.csv, pairs.csv, footprints.geojson."
+    "are in summary.json and in the folder tables/: residuals.csv, observations.csv, pairs.csv, footprints.geojson."
 )
 REPORT_STAGE = "report"  # the stage that makes the page
 
@@ -111,12 +111,20 @@ class Section:
 _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
     "images": (ViewEntry.CAPTION, ViewEntry, ViewEntry.PAGE),
     "pairs": (PairEntry.CAPTION, PairEntry, PairEntry.PAGE),
-    "corrections": ("Corrections: shift at the image centre ± 1 sigma", ViewEntry, ViewEntry.CORRECTIONS),
-    "places": ("Ground point at each image centre: ellipse (1 sigma), CE90, stated CE90", ViewEntry, ViewEntry.PLACES),
+    "corrections": (
+        "Corrections: shift at the image centre (corrected minus delivered) ± 1 sigma",
+        ViewEntry,
+        ViewEntry.CORRECTIONS,
+    ),
+    "places": (
+        "Horizontal uncertainty of the ground point at each image centre, its altitude given",
+        ViewEntry,
+        ViewEntry.PLACES,
+    ),
     "gcps": (GCP_CAPTION, GcpEntry, GcpEntry.PAGE),
     "control": ("Control in each image: the largest residual (Baarda's w)", ViewEntry, ViewEntry.CONTROL),
     "reference": ("Reference: offset of each delivered camera", ReferenceViewEntry, ReferenceViewEntry.PAGE),
-    "decided": ("Images: widened prior, rejected observations, systematic residuals", ViewEntry, ViewEntry.DECISIONS),
+    "decided": ("Images: prior sigmas, rejected observations, systematic residuals", ViewEntry, ViewEntry.DECISIONS),
     "explained": ("Hypotheses selected to explain residuals", ExplanationEntry, ExplanationEntry.PAGE),
     "left": ("Rows and columns inconsistent with the rest", LeftEntry, LeftEntry.PAGE),
     "worse": ("Regions with larger residuals of check tie points", HeldOutEntry, HeldOutEntry.PAGE),
@@ -133,8 +141,9 @@ def _tables_of(key: str, rows: Sequence[Record], adjusted: bool = True) -> list[
     caption, kind, columns = _TABLE_CAPTIONS[key]
     found = table(key, caption, rows, kind, columns, adjusted)
     filled = [k for k in range(len(found.columns)) if any(row[k].text != "-" for row in found.rows)]
-    heads, cells = [found.columns[k] for k in filled], [[row[k] for k in filled] for row in found.rows]
-    return [replace(found, columns=heads, rows=cells)] if rows else []
+    heads, texts = ([every[k] for k in filled] for every in (found.columns, found.meanings))
+    cells = [[row[k] for k in filled] for row in found.rows]
+    return [replace(found, columns=heads, rows=cells, meanings=texts)] if rows else []
 
 
 def _images_section(files: RunFiles) -> Section:
@@ -167,7 +176,7 @@ def _map_section(files: RunFiles) -> Section:
         "those that need review on top": any(view.advice for view in summary.views),
         "dots: tie points": len(files.points),
         f"triangles: GCPs{', red where they contradict others' * any(map(doubted, summary.gcps))}": summary.gcps,
-        f"arrows: their residuals in plan (predicted minus given), at most {metres(miss)}": miss,
+        f"arrows: their residuals in plan (predicted minus given), the longest {metres(miss)}": miss,
         "inverted triangles: check points": summary.check_points,
         "thicker lines: more matches": len(links) > 1,
         "dashed: tie points that move": any(one.box for one in (summary.scene.explanations if summary.scene else ())),
@@ -205,8 +214,8 @@ def _randomness_section(files: RunFiles) -> Section | None:
 
 
 _LEGEND = (
-    "Thin lines: residuals, projected minus observed. Colour: their RMS in each of 8 x 8 cells. Bold arrows, at twice "
-    "the scale: means of cells that exceed three standard errors."
+    "Thin lines are residuals (projected minus observed). The colour is their RMS in each of 8 x 8 cells. A bold "
+    "arrow, at twice the scale, is the mean of a cell where that exceeds three standard errors."
 )
 
 
@@ -221,7 +230,7 @@ def _randomness(views: Sequence[ViewEntry], marked: Sequence[str]) -> str:
         if sizes
     ]
     large = max([*systematic, *correlated], default=(0.0, ""))[0] > SMOOTH_LEFT
-    found += [f"An image needs review above {SMOOTH_LEFT:g} px."] * bool(found)
+    found += [f"Up to {SMOOTH_LEFT:g} px needs no review."] * bool(found)
     if marked:
         found.append(f"Most cells of {listed(marked)} have a significant mean.")
     if found:
@@ -259,7 +268,7 @@ def _pairs_section(files: RunFiles) -> Section | None:
     heights = any(pair.height_m_per_px and pair.convergence_deg for pair in sure_pairs(files.summary.views, pairs))
     worst, answer = max(pairs, key=offset_of), "Unknown: no camera of a pair projects the tie points of the other."
     if set(worst.offset_rms) != {None}:
-        answer = f"Epipolar offsets are at most {offset_of(worst):.3f} px (RMS; {worst.a} - {worst.b})."
+        answer = f"The largest epipolar offset of a pair is {offset_of(worst):.3f} px (RMS; {worst.a} - {worst.b})."
         answer += f" Stereo needs less than {GOOD_RMSE} px."
     if not heights:
         enough = f"{MIN_PAIR_MATCHES} matches and a convergence angle that determines heights"
@@ -281,8 +290,8 @@ def _corrections_section(files: RunFiles) -> Section | None:
         return None
     tables = _tables_of("corrections", views)
     tables += _tables_of("places", views if any(value_of(view, "correction.ellipse") for view in views) else ())
-    answer = f"By up to {max(moves):.2f} px at the image centre (corrected minus delivered). "
-    answer += "The sigmas in the tables include that of the scene's position."
+    answer = f"The largest shift at an image centre is {max(moves):.2f} px. The sigmas in the tables include the "
+    answer += "uncertainty of the scene's position."
     return Section("moves", "How was each camera corrected?", answer, tables=tables)
 
 
@@ -335,12 +344,12 @@ def _files_section(files: RunFiles) -> Section | None:
         rows = [
             [cell_of(file), *(cell_of(found.get(name), ".1e") for name in consumers)] for file, found in outputs.items()
         ]
-        caption = "Written files, read again: largest difference from the corrected cameras [px]"
+        caption = "Written files, read again by each program: largest difference from the corrected cameras"
         tables.append(Table("files", caption, ["file", *(f"{consumer} [px]" for consumer in consumers)], rows))
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
     if not tables:
         return None
-    exact = "Not known for every image" if worst is None else f"Within {two_digits(max(worst, _ROUNDING))} px"
+    exact = "Not known for every image" if worst is None else f"Yes, to within {two_digits(max(worst, _ROUNDING))} px"
     answer = f"{exact}. The original images still carry the delivered RPC."
     return Section("files", "Do the new RPC files reproduce the corrected cameras?", answer, tables=tables)
 

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field
 from functools import cache, partial
 from inspect import get_annotations
+from itertools import groupby
+from operator import itemgetter
 from types import NoneType
 from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_args, get_type_hints
 
@@ -53,7 +55,7 @@ def column(
     meta = msgspec.Meta(description=f"{text}{end}.", **limits)
     texts: Any = enum and Literal[*enum]
     of_file = {"kind": texts | None if enum and default is None else texts, "meta": meta}
-    return field(default=default, metadata={**of_file, "column": (heads, form, adjusted)})
+    return field(default=default, metadata={**of_file, "column": (heads, form, adjusted, text)})
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(column,))
@@ -151,7 +153,8 @@ class Cell:
 class Table:
     """A table with its caption and the heads of its columns, units in them.
 
-    `marks`: the indices of each row's images, for the page's script: one, or two with a hyphen.
+    `marks`: the indices of each row's images, for the page's script: one, or two with a hyphen. `meanings`: those of
+    the columns, empty without one.
     """
 
     key: str
@@ -159,6 +162,13 @@ class Table:
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     marks: Sequence[str] = ()
+    meanings: Sequence[str] = ()
+
+    @property
+    def legend(self) -> list[tuple[str, str]]:
+        """Columns beside the first, which names the row, and their meaning; columns of one meaning together."""
+        alike = groupby(zip(self.meanings[1:], self.columns[1:], strict=False), key=itemgetter(0))
+        return [(", ".join(head for _, head in columns), meaning) for meaning, columns in alike if meaning]
 
     @property
     def texts(self) -> list[list[str]]:
@@ -174,6 +184,7 @@ class Column:
     value: Callable[[Any], Any]
     form: str = ""
     adjusted: bool = False
+    text: str = ""
 
     def cells(self, row: Record) -> list[Cell]:
         """Return its cells in a row."""
@@ -192,9 +203,13 @@ def table(
     found = [column_of(kind, name) for name in columns.split()]  # type: ignore[arg-type]
     found = [column for column in found if adjusted or not column.adjusted]
     cells = [[cell for column in found for cell in column.cells(row)] for row in rows]
-    heads = [[column.head] if isinstance(column.head, str) else column.head for column in found]
-    words = [head if adjusted else head.replace("before", "now") for some in heads for head in some]
-    return Table(key, caption, words, cells)
+    heads = [
+        (head, column.text)
+        for column in found
+        for head in ([column.head] if isinstance(column.head, str) else column.head)
+    ]
+    words = [head if adjusted else head.replace("before", "now") for head, _ in heads]
+    return Table(key, caption, words, cells, meanings=[text for _, text in heads])
 
 
 @cache
@@ -206,8 +221,8 @@ def column_of(kind: Any, path: str) -> Column:
         hint, declared = _hints(kind)[name], kind.__dataclass_fields__[name]
         parts = (hint, *get_args(hint))
         kind = next((part for part in parts if isinstance(part, type) and issubclass(part, Record)), kind)
-    heads, form, adjusted = declared.metadata["column"]
-    return Column(heads, partial(value_of, path=path), form, adjusted)
+    heads, form, adjusted, text = declared.metadata["column"]
+    return Column(heads, partial(value_of, path=path), form, adjusted, text)
 
 
 def value_of(record: Any, path: str) -> Any:

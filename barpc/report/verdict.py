@@ -154,7 +154,7 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
         alone = _by_cameras_alone(run, found)
         position, add = ", and so is the scene's position" * alone, ", or add GCPs or a DEM" * alone
         yield (
-            f"The cameras are {common:.1f} times less accurate than stated{position}.{either} "
+            f"All cameras are at least {common:.1f} times less accurate than stated{position}.{either} "
             f"Check the RPCs and the stated accuracies{add}."
         )
     yield from _of_image_model(run, found)
@@ -321,12 +321,12 @@ def _adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     gauge, gcps = run.adjustment.gauge, run.gcps
     tied = counted(sum(view.num_observations > 0 for view in views), "image")
     if len(run.tracks) and np.isfinite(after):
-        was = f" (before: {before:.3f} px)" if np.isfinite(before) else ""
-        yield f"Tie points of {tied} agree to {after:.3f} px{was}."
+        was = f"; before: {before:.3f} px" if np.isfinite(before) else ""
+        yield f"Tie points of {tied} have residuals of {after:.3f} px (median of the images' RMS{was})."
     else:
         yield "There are no tie points: control alone constrains the cameras."
     if len(run.tracks) or gcps is not None:
-        yield f"The scene as a whole moved by {enu(gauge.shift)}."
+        yield f"The adjustment moved the scene by {enu(gauge.shift)}."
     yield from _known_lines(run, run.adjustment, views)
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
     if many := [view.name for view in unsaid if anywhere(view, run)]:
@@ -467,7 +467,10 @@ def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
 def _checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     rmse = median([view.rmse_before for view in views])
     if np.isfinite(rmse):
-        yield f"Tie points of {counted(len(views), 'image')} agree to {rmse:.3f} px with the cameras as given."
+        yield (
+            f"Tie points of {counted(len(views), 'image')} have residuals of {rmse:.3f} px with the cameras as given "
+            "(median of the images' RMS)."
+        )
     elif len(run.tracks):
         yield "No residual could be computed: no camera projects tie points of another image."
     else:

@@ -98,7 +98,7 @@ def assert_refused(code, out, err, folder, *words, exit_code=1, kept=False):
 
 def test_the_main_job_writes_what_other_tools_read(crops, hashes, ran):
     folder, out = ran
-    for word in ("(before: ", "view_00.vrt", "The scene as a whole moved by", "  barpc dsm "):
+    for word in ("; before: ", "view_00.vrt", "The adjustment moved the scene by", "  barpc dsm "):
         assert word in out
     names = sorted(path.name for path in folder.iterdir())
     for name in ("view_00.vrt", "view_00_RPC.TXT", "view_01.vrt", "view_01_RPC.TXT", "summary.json"):

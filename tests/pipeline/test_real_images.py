@@ -219,7 +219,7 @@ def test_the_summary_is_plain_json_and_says_what_was_reached(triplet):
         "write",
         "verify",
     }
-    assert summary["verdict"][1].startswith("The scene as a whole moved by ")
+    assert summary["verdict"][1].startswith("The adjustment moved the scene by ")
 
 
 @pytest.mark.slow

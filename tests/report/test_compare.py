@@ -149,7 +149,7 @@ def test_what_is_said_of_two_runs(compared):
     assert (shift, rest) == pytest.approx((5.0, 0.0), abs=1e-6)
     assert 0.01 < bend <= whole < 2.0
     assert found["lines"] == [
-        "3 images in both: their tie points agree to 2.000 px in A, 0.200 px in B.",
+        "3 images in both: their tie points have residuals of 2.000 px in A, 0.200 px in B.",
         f"Their RPCs differ by up to 5 px (B), by {bend:.3g} px once the mean shift of each image is taken away.",
         "In A alone: X, Y.",
         "Option tie.band: 1 in A, None in B.",

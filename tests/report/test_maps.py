@@ -199,19 +199,21 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
         (found,) = drawn.points(f"outline {status}")
         assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "1", "2"]
-    assert drawn.titles("outline adjusted") == ["A: 5 used"]
+    assert drawn.titles("outline adjusted") == ["A: 5 tie points used"]
     (dots,) = drawn.all("path", "point")
     assert np.array(corners(dots.get("d"))) == pytest.approx(at(np.array(points)[:, :2]), abs=0.06)
-    assert drawn.titles("tie") == ["A - C: 30 used", "B - C: 70 used", "A - B: 900 used"]  # strongest on top
+    assert drawn.titles("tie") == [
+        f"{pair} tie points used" for pair in ("A - C: 30", "B - C: 70", "A - B: 900")
+    ]  # strongest on top
     middle = [at(outline[0][:-1]).mean(axis=0) for outline in outlines]
     assert drawn.lines("tie")[0] == pytest.approx(np.concatenate([middle[0], middle[2]]), abs=0.006)
     (*_, widest) = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
     assert widest == (3.0, 0.9)
     weakest, *_ = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
     assert weakest == pytest.approx((0.6 + 2.4 * math.sqrt(30 / 900), 0.2 + 0.7 * math.sqrt(30 / 900)), abs=0.006)
-    assert drawn.texts("name") == [  # B has its middle in the same place as A
+    assert drawn.texts("name") == [  # B has its middle in the same place as A; a line lower there is no GCP
         (name, pytest.approx(x, abs=0.006), pytest.approx(y + 4, abs=0.006), "middle")
-        for name, (x, y) in (("A + 1", middle[0]), ("C", middle[2]))
+        for name, (x, y) in (("A and 1 more", middle[0] + [0.0, 15.4]), ("C", middle[2]))
     ]
     x, y = at(np.array([10.05, 0.005]))
     assert np.array(drawn.points("gcps")[0]) == pytest.approx(
@@ -305,7 +307,7 @@ def test_residuals_of_gcps_are_named_arrows_in_plan_and_the_longest_is_said():
         start = at(np.array([lon, lat]))
         assert shaft[0] == pytest.approx(start, abs=0.02)
         assert shaft[1] == pytest.approx(start + (right, down), abs=0.02)
-    assert "arrows: their residuals in plan (predicted minus given), at most 2.0 m" in caption(files)
+    assert "arrows: their residuals in plan (predicted minus given), the longest 2.0 m" in caption(files)
     assert {text[0] for text in drawn.texts("label")} <= {"E", "N", "unknown"}
     assert drawn.texts("label")
     assert "arrows" not in caption(files_of(a_summary(views, gcps=(a_gcp("P", 10.0, 0.0),)), outlines))
@@ -366,7 +368,7 @@ def test_a_name_stands_beside_marks_where_there_is_room_and_is_never_lost_to_the
 
 def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
     # seven pixels are half a line of names; what is farther is another place, whose name stands a line lower
-    for away, shown in ((6.9, ["A + 2"]), (7.1, ["A", "B + 1"]), (14.1, ["A", "B + 1"])):
+    for away, shown in ((6.9, ["A and 2 more"]), (7.1, ["A", "B and 1 more"]), (14.1, ["A", "B and 1 more"])):
         places = [(a_view(name), np.array([60.0, 50.0 + away * (name != "A")])) for name in "ABC"]
         assert [text for text, *_ in drawn_names(places).texts("name")] == shown
 

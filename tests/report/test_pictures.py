@@ -147,7 +147,7 @@ def test_a_strip_names_its_rows_and_draws_a_line_through_each():
     assert drawn.box == (420, 210)
     assert [text for text, *_ in drawn.texts("name")] == list(strip.rows)
     assert drawn.points("epipolar") == [[(0, y), (420, y)] for y in (35, 105, 175)]
-    assert caption.startswith("A - B: windows of 12 px to every side of 6 tie points, along epipolar lines.")
+    assert caption.startswith("A - B: 6 tie points, each in a window of ±12 px whose rows are epipolar lines.")
 
 
 @pytest.mark.parametrize("num", [5, 39, 400])

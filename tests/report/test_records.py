@@ -234,3 +234,16 @@ def test_what_numbers_a_file_may_hold():
     assert (schema["Summary"]["views"]["minItems"], view["name"]["minLength"]) == (1, 1)
     motion = schema["ModeEntry"]["motion_m"]
     assert (motion["minItems"], motion["maxItems"]) == (7, 10)  # those of runs before have seven
+
+
+def test_a_legend_says_what_columns_mean_and_columns_of_one_meaning_stand_together():
+    found = table("t", "A caption", [WHOLE], Whole, "num part.size part.both twice")
+    assert found.columns == ["num", "size [m]", "one [px]", "other [px]", "twice"]
+    assert found.legend == [("size [m]", "How large"), ("one [px], other [px]", "Two")]
+
+
+@pytest.mark.parametrize("kind", [ViewEntry, PairEntry])
+def test_every_column_of_images_and_pairs_but_their_names_and_verdict_has_a_meaning(kind):
+    for words in (kind.PAGE, *(getattr(kind, name, "") for name in ("CORRECTIONS", "PLACES", "DECISIONS", "FITS"))):
+        empty = [name for name in words.split()[1:] if not column_of(kind, name).text]
+        assert empty in ([], ["verdict", "wrong"])

@@ -129,8 +129,8 @@ def pushed(view: int, cells: int, of: int):
 
 
 LEGEND = (
-    " Thin lines: residuals, projected minus observed. Colour: their RMS in each of 8 x 8 cells. Bold arrows, at twice "
-    "the scale: means of cells that exceed three standard errors."
+    " Thin lines are residuals (projected minus observed). The colour is their RMS in each of 8 x 8 cells. A bold "
+    "arrow, at twice the scale, is the mean of a cell where that exceeds three standard errors."
 )
 
 
@@ -150,7 +150,7 @@ def test_residuals_are_random_unless_most_cells_of_an_image_point_one_way():
 
 
 YES = "Yes: no image has systematic residuals (F test: p < 1e-4)."
-ABOVE = "An image needs review above 0.06 px."
+ABOVE = "Up to 0.06 px needs no review."
 
 
 @pytest.mark.parametrize(("figures", "said"), [
@@ -181,7 +181,10 @@ def test_pairs_are_told_by_the_worst_offset():
         a_pair("B", "C", convergence_deg=1.0, height_m_per_px=None),
     ]
     section = asked("pairs", pairs=pairs)
-    assert section.answer == "Epipolar offsets are at most 0.100 px (RMS; A - B). Stereo needs less than 0.5 px."
+    assert (
+        section.answer
+        == "The largest epipolar offset of a pair is 0.100 px (RMS; A - B). Stereo needs less than 0.5 px."
+    )
     assert section.tables[0].marks == ["0-1", "0-2", "1-2"]
     assert texts(section.tables[0])[0] == [
         "A - B",
@@ -219,8 +222,8 @@ def test_corrections_are_told_by_the_farthest_move():
     ]
     section = asked("moves", views)
     assert section.answer == (
-        "By up to 5.00 px at the image centre (corrected minus delivered). The sigmas in the tables include that of "
-        "the scene's position."
+        "The largest shift at an image centre is 5.00 px. The sigmas in the tables include the uncertainty of the "
+        "scene's position."
     )
     assert [table.key for table in section.tables] == ["corrections", "places"]
     assert texts(section.tables[0])[0] == ["A", "+3.000 ± 0.10", "-4.000 ± 0.10", "2.00", "-"]
@@ -301,7 +304,7 @@ def test_files_are_held_to_what_their_readers_found():
     fit = FitEntry((1e-3, 2e-3), (4e-3, 3e-3), 0.9, 1e-5, 1.0, "lstsq", 500)
     outputs = {"A_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}, "A.json": {"barpc": 0.0}}
     section = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B", fit=fit)])
-    assert section.answer == "Within 0.004 px. The original images still carry the delivered RPC."
+    assert section.answer == "Yes, to within 0.004 px. The original images still carry the delivered RPC."
     fits, files = section.tables
     assert texts(fits)[0] == ["A", "1.0e-03, 2.0e-03", "4.0e-03", "0.900", "1.0e-05", "100%", "500", "lstsq"]
     assert files.columns == ["file", "gdal [px]", "rpcm [px]", "barpc [px]"]
@@ -311,7 +314,7 @@ def test_files_are_held_to_what_their_readers_found():
     partly = asked("files", [a_view("A", fit=fit, outputs=outputs), a_view("B")])
     assert partly.answer.startswith("Not known for every image.")
     exact = asked("files", [a_view("A", fit=replace(fit, max_px=(4e-9, 3e-9)))])
-    assert exact.answer.startswith("Within 1e-06 px.")
+    assert exact.answer.startswith("Yes, to within 1e-06 px.")
     assert [table.key for table in partly.tables] == ["files"]
     unknown = asked("files", [a_view("A", fit=replace(fit, max_px=(None, 0.1)))])
     assert unknown.answer.startswith("Not known")
@@ -405,7 +408,7 @@ def test_a_surface_is_shown_by_the_cameras_before_and_after_and_under_two_images
     assert str(chart).count("QUJD") == 2
 
 
-@pytest.mark.parametrize(("after", "said"), [(0.0, "at most 0.000 px (RMS"), (None, "Unknown: no camera")])
+@pytest.mark.parametrize(("after", "said"), [(0.0, "is 0.000 px (RMS"), (None, "Unknown: no camera")])
 def test_an_offset_of_nothing_is_not_one_that_is_unknown(after, said):
     offset = None if after is None else OffsetEntry(0.0, 0.0, after, 50)
     section = asked("pairs", pairs=(a_pair(epipolar_before=offset, epipolar_after=offset),))

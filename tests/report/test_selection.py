@@ -51,7 +51,7 @@ def test_an_outline_that_is_clicked_is_chosen_in_the_tables_and_not_when_clicked
     assert lit == ["2"]
     assert [row for row in rows if row.startswith("t-images")] == ["t-images view_0002"]
     assert len([row for row in rows if row.startswith("t-pairs")]) == len(partners)
-    assert said == f"view_0002: {block_run.summary['views'][2]['num_observations']} used"
+    assert said == f"view_0002: {block_run.summary['views'][2]['num_observations']} tie points used"
     assert found["again"] == [[], [], ""]
 
 
@@ -60,7 +60,7 @@ def test_a_row_of_a_pair_chooses_both_its_images(found, pair):
     assert sorted(lit) == ["0", "1"]
     assert [row for row in rows if row.startswith("t-images")] == ["t-images view_0000", "t-images view_0001"]
     assert [row for row in rows if row.startswith("t-pairs")] == ["t-pairs view_0000 - view_0001"]
-    assert said == f"view_0000 - view_0001: {pair['num_matches']} used"
+    assert said == f"view_0000 - view_0001: {pair['num_matches']} tie points used"
     assert found["cleared"] == [[], [], ""]
 
 

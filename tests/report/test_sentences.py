@@ -292,7 +292,7 @@ def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
     found = reasons(adjusted(prior=prior))
     assert bool(found) == said_of
     if said_of:
-        assert found[0].startswith("The cameras are 2.1 times less accurate than stated")
+        assert found[0].startswith("All cameras are at least 2.1 times less accurate than stated")
         assert "two images" not in found[0]
         two = block_verdict(run_of(adjusted(prior=prior), views=run_of().views[:2]), views()[:2])["reasons"]
         assert two[0].split(". ")[1] == "Tie points of two images cannot show which camera is wrong"
@@ -304,9 +304,14 @@ def test_with_gcps_the_position_is_not_as_uncertain_as_the_cameras():
         next(verdicts._of_cameras(run_of(adjusted(prior=prior), gcps=gcps), adjusted(prior=prior)))
         for gcps in (None, object())
     )
-    assert alone.startswith("The cameras are 7.0 times less accurate than stated, and so is the scene's position. ")
+    assert alone.startswith(
+        "All cameras are at least 7.0 times less accurate than stated, and so is the scene's position. "
+    )
     assert alone.endswith(", or add GCPs or a DEM.")
-    assert held == "The cameras are 7.0 times less accurate than stated. Check the RPCs and the stated accuracies."
+    assert (
+        held
+        == "All cameras are at least 7.0 times less accurate than stated. Check the RPCs and the stated accuracies."
+    )
 
 
 def test_an_accuracy_that_nobody_stated_is_no_reason():
@@ -471,8 +476,10 @@ def test_what_tie_points_agree_to_is_the_median_over_the_images():
         a_view(name, rmse_before=b, rmse_after=a) for name, b, a in (("A", 1.0, 0.3), ("B", 5.0, 0.1), ("C", 2.0, 0.2))
     ]
     lines = said(run_of(), of)
-    assert lines[0] == "Tie points of 3 images agree to 0.200 px (before: 2.000 px)."
-    assert "The scene as a whole moved by +1.00 m east, -2.00 m north, +3.00 m up." in lines
+    assert (
+        lines[0] == "Tie points of 3 images have residuals of 0.200 px (median of the images' RMS; before: 2.000 px)."
+    )
+    assert "The adjustment moved the scene by +1.00 m east, -2.00 m north, +3.00 m up." in lines
     assert (
         lines[-1]
         == "Without ground control, the scene's position is uncertain by 10 m, 20 m, 5.0 m (east, north, up; 1 "
@@ -481,10 +488,12 @@ def test_what_tie_points_agree_to_is_the_median_over_the_images():
     assert len(lines) == 3
     without = said(run_of(tracks=[]), of)
     assert without[0] == "There are no tie points: control alone constrains the cameras."
-    assert not any("moved by" in line for line in without)
-    assert any("moved by" in line for line in said(run_of(tracks=[], gcps=gcps()), of))
+    assert not any("moved the scene by" in line for line in without)
+    assert any("moved the scene by" in line for line in said(run_of(tracks=[], gcps=gcps()), of))
     check = block_verdict(run_of(kind="check"), of)["verdict"]
-    assert check == ["Tie points of 3 images agree to 2.000 px with the cameras as given."]
+    assert check == [
+        "Tie points of 3 images have residuals of 2.000 px with the cameras as given (median of the images' RMS)."
+    ]
 
 
 def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():

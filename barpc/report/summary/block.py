@@ -11,7 +11,7 @@ from barpc.report.summary.words import Count, Vector
 
 AXES = "columns", "rows"
 DATUM = (
-    "Uncertainty (1 sigma) of the scene's position, and of its shape at its edge; share of each source of information"
+    "Uncertainty (1 sigma) of the scene's position, and of its shape at its edge; share of each source but tie points"
 )
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",

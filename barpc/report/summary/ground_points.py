@@ -22,7 +22,7 @@ class KnownPoint(Record):
     alt_m: float = column("Altitude", ABOVE)
 
 
-_MISS = "Intersected minus given position, east, north, up; null with fewer than two views"
+_MISS = "Intersected minus given position, east, north, up; none with fewer than two views"
 
 
 class GcpEntry(KnownPoint):
@@ -43,12 +43,14 @@ class GcpEntry(KnownPoint):
         default="used",
     )
     images: tuple[str, ...] = column("Views with an observation of it", default=())
-    w: Number = column("Largest component of the residual over its standard deviation", "", "w", ".1f", default=None)
+    w: Number = column(
+        "Largest component of the residual over its standard deviation (Baarda's w)", "", "w", ".1f", default=None
+    )
     redundancy: Number = column("Redundancy number, 0 to 1: how far the others control it", default=None)
     residual_px: Number = column("RMS of the residual in its images", "px", "in images", ".2f", default=None)
 
-    image_w: Number = column("Largest w in the images (Baarda)", "", "w in images", ".1f", default=None)
-    image_w_view: str | None = column("View of the largest w", head="largest in", default=None)
+    image_w: Number = column("The same of its residuals in the images", "", "w in images", ".1f", default=None)
+    image_w_view: str | None = column("Image of the largest w", head="largest in", default=None)
 
     @classmethod
     def worst(cls, points: Sequence[GcpEntry], most: int) -> list[GcpEntry]:

@@ -29,10 +29,27 @@ class PairEntry(Record):
 
     OWN: ClassVar = {
         "pair": Column("pair", lambda pair: f"{pair.a} - {pair.b}"),
-        "before": Column("before [px]", lambda pair: _offset_cell(pair.epipolar_before), ".3f"),
+        "before": Column(
+            "before [px]",
+            lambda pair: _offset_cell(pair.epipolar_before),
+            ".3f",
+            text="Delivered cameras, all verified matches",
+        ),
         "beaten": Column("instead of", lambda pair: "; ".join(pair.beaten)),
-        "after": Column("after [px]", lambda pair: _offset_cell(pair.epipolar_after), ".3f", adjusted=True),
-        "kept": Column("after, used [px]", lambda pair: _offset_cell(pair.epipolar_kept), ".3f", adjusted=True),
+        "after": Column(
+            "after [px]",
+            lambda pair: _offset_cell(pair.epipolar_after),
+            ".3f",
+            adjusted=True,
+            text="New cameras, all verified matches",
+        ),
+        "kept": Column(
+            "after, used [px]",
+            lambda pair: _offset_cell(pair.epipolar_kept),
+            ".3f",
+            adjusted=True,
+            text="New cameras, matches in use",
+        ),
     }
     CAPTION: ClassVar = "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)"
     PAGE: ClassVar = (
@@ -50,7 +67,7 @@ class PairEntry(Record):
     b: str = column("Second view")
     num_matches: Count = column("Common tie points in use", head="used")
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
-    base_to_height: Number = column("B/H along the lines of sight", head="B/H", form=".2f")
+    base_to_height: Number = column("Ratio of base to height, along the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
     epipolar_before: OffsetEntry | None = column(
         "Epipolar offset through the delivered cameras, of all verified matches"
@@ -61,7 +78,10 @@ class PairEntry(Record):
         "Matcher that succeeded, and whether its thresholds were relaxed", head="matched by", default=None
     )
     decoy_share: Number = column(
-        "Share of false matches, by search bands without true ones", head="false matches", form=".1%", default=None
+        "Share of false matches, estimated by search where no true ones are",
+        head="false matches",
+        form=".1%",
+        default=None,
     )
     noise_px: Number = column(
         "Spread across epipolar lines of matches before their positions are refined", "px", default=None

@@ -20,15 +20,17 @@ class EllipseEntry(Record):
     """Error ellipse of the ground point at the image centre, at a given altitude."""
 
     major_m: Number = column("Larger semi-axis of the one-sigma ellipse", "m", "major semi-axis", ".2f")
-    minor_m: Number = column("Smaller semi-axis", "m", "minor semi-axis", ".2f")
-    azimuth_deg: Number = column("Direction of the larger one, clockwise from north", "deg", "azimuth", ".0f")
-    ce90_m: Number = column("Radius of the circle that contains 90 %", "m", "CE90", ".2f")
+    minor_m: Number = column("Smaller semi-axis of the one-sigma ellipse", "m", "minor semi-axis", ".2f")
+    azimuth_deg: Number = column("Direction of the larger semi-axis, clockwise from north", "deg", "azimuth", ".0f")
+    ce90_m: Number = column(
+        "Radius of the circle that contains 90 % of the errors, with the new camera", "m", "CE90", ".2f"
+    )
 
 
 class SourceEntry(Record):
     """Source of a camera."""
 
-    format: str = column("Syntax of its file", head="RPC read from")
+    format: str = column("Kind of file from which it was read", head="RPC read from")
     path: str = column("File with the camera")
     notes: tuple[str, ...] = column("Remarks")
 
@@ -46,9 +48,9 @@ class CorrectionEntry(Record):
     shift_px: Pixel | None = column("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = column("Models in the image: by (col, row)", "px/px", default=None)
     rotation_urad: Vector | None = column("Rotation vector R, ECEF axes", "urad", default=None)
-    angle_urad: Number = column("Angle of R", "urad", "rotation", ".2f", default=None)
+    angle_urad: Number = column("Angle of the rotation R", "urad", "rotation", ".2f", default=None)
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
-    translation_norm_m: Number = column("Length of T", "m", "translation", ".2f", default=None)
+    translation_norm_m: Number = column("Length of the translation T", "m", "translation", ".2f", default=None)
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
     jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = column("Rows between its knots", "px", default=None)
@@ -66,7 +68,7 @@ class CenterEntry(Record):
     """Projection centre of a camera."""
 
     ecef_m: Vector = column("Position, ECEF", "m")
-    altitude_m: Number = column("Altitude above the ellipsoid", "m", "camera altitude", ",.0f")
+    altitude_m: Number = column("Altitude of the projection centre above the ellipsoid", "m", "camera altitude", ",.0f")
     method: str = column("line: intersection of the rays of an image line; nominal: assumed where implausible")
 
 
@@ -79,11 +81,11 @@ class FitEntry(Record):
         "Smallest denominator over the image's ground, relative to the centre", "", "smallest denominator", ".3f"
     )
     roundtrip_px: Number = column(
-        "Largest change by projection and localisation; null where it fails", "px", "round trip", ".1e"
+        "Largest change of a pixel by localisation and projection; none where that fails", "px", "round trip", ".1e"
     )
     coverage: Number = column("Share of the image covered by the fit's points", head="covered", form=".0%")
     method: str = column("Solver", head="solver")
-    num_check_points: Count = column("Check points", head="check points")
+    num_check_points: Count = column("Check points", head="points")
 
 
 def _moves(view: ViewEntry) -> list[Cell]:
@@ -102,10 +104,21 @@ class ViewEntry(Record):
         "verdict": Column("verdict", _verdict),
         "wrong": Column("reservation", lambda view: CAUSES[view.cause].label if view.cause in CAUSES else None),
         "lost": Column(
-            "rejected [%]", lambda view: 100.0 * view.lost if view.num_observations + view.num_rejected else None, ".1f"
+            "rejected [%]",
+            lambda view: 100.0 * view.lost if view.num_observations + view.num_rejected else None,
+            ".1f",
+            text="Observations rejected as outliers, of those used or rejected",
         ),
-        "moves": Column(("col [px]", "row [px]"), _moves, ".3f"),
-        "largest": Column("RPC misfit [px]", lambda view: largest(value_of(view, "fit.max_px")), ".1e", adjusted=True),
+        "moves": Column(
+            ("col [px]", "row [px]"), _moves, ".3f", text="Shift at the image centre ± its standard deviation"
+        ),
+        "largest": Column(
+            "largest [px]",
+            lambda view: largest(value_of(view, "fit.max_px")),
+            ".1e",
+            adjusted=True,
+            text="Largest error on check points",
+        ),
     }
     CAPTION: ClassVar = "Images: tie points, and the RMS of their residuals"
     PAGE: ClassVar = (
@@ -146,17 +159,17 @@ class ViewEntry(Record):
     gsd_m: Number = column("Ground sampling distance at the image centre", "m", "GSD", ".2f")
     incidence_deg: Number = column("Incidence angle, from the vertical to the sensor", "deg", "incidence", ".1f")
     azimuth_deg: Number = column("Direction to the sensor, clockwise from north", "deg")
-    num_observations: Count = column("Tie-point observations in use", head="used")
+    num_observations: Count = column("Observations of tie points in use", head="used")
     num_rejected: Count = column("Observations rejected as outliers", head="rejected")
     num_gcps: Count = column("Observations of ground control points")
     tie_coverage: Share = column("Share of the cells of an 8 x 8 grid with a tie point", head="covered", form=".0%")
     rmse_before: Number = column("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
     rmse_after: Number = column(
-        "The same through the new cameras; null for a check", "px", "after", ".3f", adjusted=True
+        "RMS reprojection error through the new cameras; none for a check", "px", "after", ".3f", adjusted=True
     )
     systematic_px: Number = column("RMS of systematic residuals, noise subtracted", "px", "systematic", ".3f")
     prior_scale: Number = column(
-        "Factor by which the camera's stated standard deviations were widened", "", "prior widened", ".1f"
+        "Factor by which the camera's stated standard deviations were multiplied", "", "prior sigma factor", ".1f"
     )
     correction: CorrectionEntry | None = column("The correction; null for a check")
     camera_center: CenterEntry | None = column("Projection centre, about which the camera was rotated")
@@ -169,15 +182,19 @@ class ViewEntry(Record):
     cause: str | None = column("Name of the reservation; null without one", default=None, enum=CAUSES)
     num_moving: Count = column("Excluded observations of tie points that move together", head="excluded", default=0)
     num_check: Count = column("Observations of check tie points", head="check", default=0)
-    held_out_px: Number = column("RMS of check tie points", "px", "check", ".3f", default=None)
-    stated_ce90_m: Number = column("CE90 of the delivered camera", "m", "CE90 stated", ".1f", default=None)
+    held_out_px: Number = column("RMS of check tie points", "px", "after, check", ".3f", default=None)
+    stated_ce90_m: Number = column(
+        "CE90 of the delivered camera, by the accuracies that its file states", "m", "CE90 stated", ".1f", default=None
+    )
     systematic_p: Number = column(
         "Probability of systematic_px by noise alone (F test)", "", "F test p", ".1e", default=None
     )
     neighbour_correlated_px: Number = column(
         "Error correlated between neighbours in row or column", "px", "correlated", ".3f", default=None
     )
-    control_w: Number = column("Largest w of its control (Baarda)", "", "w", ".1f", default=None)
+    control_w: Number = column(
+        "Largest residual of its control over its standard deviation (Baarda's w)", "", "largest w", ".1f", default=None
+    )
     control_w_point: str | None = column("Control point of that w", head="largest at", default=None)
     date: str | None = column("Acquisition date, where its metadata state it", default=None)
     certified: tuple[tuple[float, float, float, float, float], ...] | None = column(
