@@ -25,7 +25,7 @@ def decisions(summary: Summary) -> list[str]:
     if scene is not None:
         if scene.model:
             found.append(f"Each camera is corrected by {scene.model.replace('+', ' and ')}.")
-        found += [*_added(scene, views), *_drift(scene, options.get("adjust.drift"))]
+        found += [*_drift(scene, options.get("adjust.drift")), *_added(scene, views)]
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
     if (test := summary.control_test) is not None:
         found.append(
@@ -72,7 +72,7 @@ def _added(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     elif scene.left or scene.held_out_places or any(view.cause in _UNEXPLAINED for view in views):
         yield "None of the additional parameters that were tested explains the inconsistent residuals."
     else:
-        yield "No additional parameters of the images were selected."
+        yield "No further parameters of the images were selected."
 
 
 def _left(one: JustificationEntry) -> str:
@@ -147,4 +147,4 @@ def _rejected(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     untested = any(view.num_observations and view.held_out_px is None for view in views)
     doubted = untested or any(view.cause in _UNEXPLAINED for view in views)
     if scene.num_held_out and scene.held_out_places == () and not doubted:
-        yield "No part of an image has larger residuals of check tie points than the rest."
+        yield "No part of an image has significantly larger residuals of check tie points than the rest."

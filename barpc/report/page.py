@@ -117,7 +117,7 @@ _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
         ViewEntry.CORRECTIONS,
     ),
     "places": (
-        "Horizontal uncertainty of the ground point at each image centre, its altitude given",
+        "Horizontal uncertainty of the ground point at each image centre, if its altitude were known",
         ViewEntry,
         ViewEntry.PLACES,
     ),
@@ -154,7 +154,10 @@ def _images_section(files: RunFiles) -> Section:
     good, panels = sum(not view.advice for view in views), image_panels(files)
     answer = f"{good} of {counted(len(views), 'image')}{', after review' * (good and not files.summary.passed)}."
     if adjusted and files.summary.pairs:
-        answer += " Residuals measure how well the images agree with each other, not their accuracy on the ground."
+        answer += (
+            " Residuals of tie points measure how well the images agree with each other, not their accuracy on the "
+        )
+        answer += "ground."
     answer += f" {PICTURE_KEY}" * bool(panels)
     return Section("images", "Which images can I use?", answer, tables=[shown], **_panels(panels))
 
@@ -191,7 +194,7 @@ def _map_section(files: RunFiles) -> Section:
     tied = "All images are connected" if groups == 1 else f"The images form {groups} separate groups"
     said = ", ".join(f"{count} in {images} images" for images, count in lengths.items())
     said = f": {said}" * (1 < len(lengths) <= MAX_LENGTHS_SAID)
-    answer = f"{tied}, with {counted(summary.tracks.num_tracks, 'tie point')}{said}."
+    answer = f"{tied}, with {counted(summary.tracks.num_tracks, 'matched tie point')}{said}."
     answer = answer if links else "There are no tie points in use."
     answer += f" Connected to one other image only: {listed(lonely)}." * bool(lonely)
     if len(lengths) > MAX_LENGTHS_SAID:

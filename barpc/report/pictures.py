@@ -91,7 +91,7 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
     draw = template("drawings.svg.j2").module.strip
     words = (
         "{0.image}: {0.tiles} tie points, each in a window of ±{0.half_px:.0f} px whose rows are epipolar lines. "
-        "With correct cameras a feature lies on the same line in all windows; shifts along it come from heights."
+        "Where cameras are correct a feature lies on the same row in both images; shifts along it come from heights."
     )
     told = [(one, words.format(one)) for one in files.strips]
     return [(draw(one, said, WIDTH, WIDTH * one.size[1] / one.size[0]), said) for one, said in told]

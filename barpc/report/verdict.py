@@ -150,12 +150,15 @@ def _common_scale(found: Adjustment) -> float:
 def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
     common = _common_scale(found)
     if common > PRIOR_WIDENED and any(is_stated(view, found.options) for view in run.views):
+        alone, perhaps = _by_cameras_alone(run, found), found.prior.perhaps_odd
+        first = listed([] if perhaps is None else [found.names[v] for v in np.flatnonzero(perhaps)], NAMED)
         either = " Tie points of two images cannot show which camera is wrong." * (len(run.views) == 2)
-        alone = _by_cameras_alone(run, found)
-        position, add = ", and so is the scene's position" * alone, ", or add GCPs or a DEM" * alone
+        either += f" Errors of {first} alone explain them about as well." * bool(first)
+        more = " or more" * bool(np.max(found.prior.scale) > 1.1 * common)
         yield (
-            f"All cameras are at least {common:.1f} times less accurate than stated{position}.{either} "
-            f"Check the RPCs and the stated accuracies{add}."
+            "The corrections are larger than the stated accuracies of the cameras allow. These were multiplied by "
+            f"{common:.1f}{more}{', and the sigma of the position with them' * alone}.{either} Check the RPCs and the "
+            f"stated accuracies{f', first of {first}' * bool(first)}{', or add GCPs or a DEM' * alone}."
         )
     yield from _of_image_model(run, found)
     if found.apart is not None and not found.apart.clear:

@@ -204,7 +204,7 @@ def test_many_views_that_are_far_off_are_all_named() -> None:
     np.testing.assert_array_equal(prior.scale[~prior.odd], 1.0)
 
 
-def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple[np.ndarray, np.ndarray]:
+def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple[np.ndarray, ...]:
     """Widened where one odd view, the first, has one evidence and all together have another."""
 
     def odd(self: Variances, around: Any, wide: Any, usual: np.ndarray, rival: float | None = None) -> Any:
@@ -221,15 +221,18 @@ def evidences(monkeypatch, v: Variances, alone: float, together: float) -> tuple
 def test_of_two_explanations_the_clearly_likelier_one_is_taken_and_else_both(monkeypatch) -> None:
     v = variances(3)
     common = np.sqrt((4 + 606) / (4 + 9))
-    scale, odd = evidences(monkeypatch, v, 3.1, 0.0)  # more than twenty times as likely
+    scale, odd, perhaps = evidences(monkeypatch, v, 3.1, 0.0)  # more than twenty times as likely
     assert odd.tolist() == [True, False, False]
+    assert perhaps is None
     np.testing.assert_allclose(scale, [9.0, 1.0, 1.0])
     for alone in (2.9, 0.0, -4.9):
-        scale, odd = evidences(monkeypatch, v, alone, 0.0)
+        scale, odd, perhaps = evidences(monkeypatch, v, alone, 0.0)
         assert not odd.any()
+        assert perhaps.tolist() == [True, False, False]
         np.testing.assert_allclose(scale, [max(9.0, common), common, common])
-    scale, odd = evidences(monkeypatch, v, -5.1, 0.0)
+    scale, odd, perhaps = evidences(monkeypatch, v, -5.1, 0.0)
     assert not odd.any()
+    assert perhaps is None
     np.testing.assert_allclose(scale, common)
 
 

@@ -79,7 +79,8 @@ def test_every_room_of_barpc_stands_in_the_plan_of_the_house():
 def test_the_page_of_the_summary_is_what_its_records_say():
     page = script("generate_summary").page()
     assert (DOCS / "summary.md").read_text(encoding="utf-8") == page
-    assert "- `rmse_after`: RMS reprojection error through the new cameras; none for a check [px]." in page
+    of_after = "RMS reprojection error through the new cameras; none where cameras were only checked"
+    assert f"- `rmse_after`: {of_after} [px]." in page
     assert "- `kind` (`adjust`/`check`/`match`): " in page
     assert "- `size` (2 values): " in page
     assert page.count(": Median signed distance from the epipolar line [px].") == 1

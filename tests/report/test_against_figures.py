@@ -363,7 +363,7 @@ def _(s, model):
     assert model == s.scene.model.replace("+", " and ")
 
 
-@says(r"No additional parameters of the images were selected\.")
+@says(r"No further parameters of the images were selected\.")
 def _(s):
     assert not s.scene.explanations
 
@@ -398,11 +398,15 @@ def _(s, assumed, names):
 
 
 @says(
-    rf"All cameras are at least {NUM} times less accurate than stated(, and so is the scene's position)?\.( Tie points "
-    r"of two images cannot show which camera is wrong\.)? Check the RPCs and the stated accuracies(, or add GCPs or a "
-    r"DEM)?\."
+    r"The corrections are larger than the stated accuracies of the cameras allow\. These were multiplied by "
+    rf"{NUM}( or more)?(, and the sigma of the position with them)?\.( Tie points of two images cannot show which "
+    r"camera is wrong\.)?(?: Errors of (.*) alone explain them about as well\.)? Check the RPCs and the stated "
+    r"accuracies(?:, first of (.*?))?(, or add GCPs or a DEM)?\."
 )
-def _(summary, times, position, either, add):
+def _(summary, times, more, position, either, alone, first, add):
+    assert alone == first
+    assert not alone or {*alone.split(", ")} <= {view.name for view in summary.views}
+    assert bool(more) == (max(view.prior_scale for view in summary.views) > 1.1 * float(times))
     assert bool(position) == bool(add)
     assert not (position and summary.gcps)
     assert bool(either) == (len(summary.views) == 2)
@@ -446,7 +450,7 @@ def _(s, times):
     near(times, s.scene.prior_shared)
 
 
-@says(r"No part of an image has larger residuals of check tie points than the rest\.")
+@says(r"No part of an image has significantly larger residuals of check tie points than the rest\.")
 def _(s):
     assert s.scene.held_out_places == ()
     errors = [view.held_out_px for view in s.views if view.num_observations]
@@ -469,7 +473,7 @@ def _(s, num, beyond, critical, expected, w, point, image):
 # --- answers of sections ----------------------------------------------------------------------------------
 
 
-@says(r"(\d+) of (\d+) images?(, after review)?\.( Residuals measure .*)?")
+@says(r"(\d+) of (\d+) images?(, after review)?\.( Residuals of tie points measure .*)?")
 def _(s, good, num, review, agree):
     assert (int(good), int(num)) == (sum(not view.advice for view in s.views), len(s.views))
     assert bool(review) == (int(good) > 0 and not s.passed)
@@ -482,7 +486,7 @@ def _(s):
 
 
 @says(
-    r"(All images are connected|The images form (\d+) separate groups), with (\d+) tie points?(: .*?)?\."
+    r"(All images are connected|The images form (\d+) separate groups), with (\d+) matched tie points?(: .*?)?\."
     r"(?: Connected to one .*?\.)?"
 )
 def _(s, how, groups, num, lengths):

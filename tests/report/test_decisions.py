@@ -94,7 +94,7 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
 
 def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_selected(record):
     plain = said(with_views(record, *[{"systematic_p": 0.3}] * 9), held_out_places=())
-    assert "No additional parameters of the images were selected." in plain
+    assert "No further parameters of the images were selected." in plain
     assert "than the rest" in plain
     for cause in ("systematic", "held_out", "wrong_matches", "left"):
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
@@ -102,7 +102,7 @@ def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_
         assert "None of the additional parameters that were tested explains the inconsistent residuals." in text
         assert "than the rest" not in text
     odd = with_views(record, {"cause": "odd", "advice": "look"})
-    assert "No additional parameters of the images were selected." in said(odd, held_out_places=())
+    assert "No further parameters of the images were selected." in said(odd, held_out_places=())
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
     assert "than the rest" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
@@ -203,7 +203,7 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
 
 
 def test_where_nothing_won_it_is_said_why(record):
-    assert "No additional parameters of the images were selected." in said(record)
+    assert "No further parameters of the images were selected." in said(record)
     left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
     text = said(record, left=(left,))
     assert "None of the additional parameters that were tested explains the inconsistent residuals." in text
@@ -230,7 +230,7 @@ def test_what_was_taken_and_what_stands_out_are_tables(record):
 
 
 def test_what_took_no_part_is_said_to_agree(record):
-    agrees = "No part of an image has larger residuals of check tie points than the rest."
+    agrees = "No part of an image has significantly larger residuals of check tie points than the rest."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
     one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)

@@ -36,7 +36,9 @@ def texts(table) -> list[list[str]]:
 
 def test_residuals_of_adjusted_images_are_no_accuracy():
     section = asked("images", pairs=[a_pair()])
-    agreement = "Residuals measure how well the images agree with each other, not their accuracy on the ground."
+    agreement = (
+        "Residuals of tie points measure how well the images agree with each other, not their accuracy on the ground."
+    )
     assert section.answer == f"3 of 3 images. {agreement}"
     (table,) = section.tables
     assert table.columns[:3] == ["image", "verdict", "used"]
@@ -105,8 +107,8 @@ def test_how_images_hang_together():
     def answer(pairs, num=4):
         tracks = TracksEntry(10, 26, {"2": 8, "3": 0, "5": 2})
         found = asked("map", [a_view(name) for name in "ABCD"[:num]], pairs, tracks=tracks).answer
-        assert pairs == [] or ", with 10 tie points: 8 in 2 images, 2 in 5 images." in found
-        return found.replace(", with 10 tie points: 8 in 2 images, 2 in 5 images", "")
+        assert pairs == [] or ", with 10 matched tie points: 8 in 2 images, 2 in 5 images." in found
+        return found.replace(", with 10 matched tie points: 8 in 2 images, 2 in 5 images", "")
 
     ring = [a_pair("A", "B"), a_pair("B", "C"), a_pair("C", "D"), a_pair("A", "D")]
     assert answer(ring) == "All images are connected."
@@ -115,7 +117,7 @@ def test_how_images_hang_together():
     assert answer(ring[:1], 2) == "All images are connected."
     assert answer([]) == "There are no tie points in use."
     pair = asked("map", VIEWS[:2], ring[:1], tracks=TracksEntry(10, 20, {"2": 10}))
-    assert pair.answer == "All images are connected, with 10 tie points."
+    assert pair.answer == "All images are connected, with 10 matched tie points."
 
 
 def pushed(view: int, cells: int, of: int):
@@ -194,10 +196,11 @@ def test_pairs_are_told_by_the_worst_offset():
         "1.4",
         "+0.300 ± 0.200",
         "+0.000 ± 0.100",
+        "0.100",
     ]
     kept = OffsetEntry(0.0, 0.08, 0.09, 50)  # of those in use: ranked by
     section = asked("pairs", pairs=[replace(pairs[0], epipolar_kept=kept)])
-    assert texts(section.tables[0])[0][-2:] == ["+0.000 ± 0.100", "+0.000 ± 0.080"]
+    assert texts(section.tables[0])[0][-2:] == ["+0.000 ± 0.100", "0.090"]
     assert "0.090 px (RMS; " in section.answer
     assert asked("pairs") is None
 

@@ -61,6 +61,8 @@ class PriorTest:
     failed: bool = False  # the matrix could not be factorised: nothing was estimated
     # factors on the standard deviations of the drift, by degree, and of rotations about the lines of sight
     wide: tuple[float, ...] = (1.0,)
+    # (N,) views of which one alone explains the ratio about as well as wider priors on all; None: none does
+    perhaps_odd: BoolArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +265,7 @@ class Variances:
         now, params = problem.camera_prior, minimum.state.params
         covariance = minimum.covariance(problem.free)
         scale, wide, odd = np.ones(len(params)), np.ones(1 + self._degrees), np.zeros(len(params), dtype=bool)
+        perhaps: BoolArray | None = None
         prior = self._prior(scale, wide)
         if around.small and self.learns:
             _, params, covariance = around.under(prior)
@@ -282,7 +285,7 @@ class Variances:
             other, least = (before, STANDS) if around.small else (now, SAME_PRIOR)
             stands |= same_prior(prior, other, least, slice(self.constants, self.constants + 3 * self._degrees))
             if stands and self.learns and self._too_large(params, known, scale):
-                scale, odd = self._widened(around, params, known, wide)
+                scale, odd, perhaps = self._widened(around, params, known, wide)
                 prior = self._prior(scale, wide)
             if not around.small or same_prior(prior, before, STANDS):
                 break
@@ -300,6 +303,7 @@ class Variances:
             float(shared.max()),
             self._showing(params, known),
             wide=tuple(wide.tolist()),
+            perhaps_odd=perhaps,
         )
         return replace(prior, sigma=sigma), tested
 
@@ -407,8 +411,10 @@ class Variances:
         total, freedom = (total / scale**2).sum() + squares / float(np.min(scale)) ** 2, freedom.sum() + free
         return freedom > _MIN_FREEDOM and float(chdtrc(freedom, total)) < LEVEL
 
-    def _widened(self, around: QuadraticProblem, params: Array, known: Array, wide: Array) -> tuple[Array, BoolArray]:
-        """Return the factors (N,) on the prior of each view, and the mask of odd views.
+    def _widened(
+        self, around: QuadraticProblem, params: Array, known: Array, wide: Array
+    ) -> tuple[Array, BoolArray, BoolArray | None]:
+        """Return the factors (N,) on the prior of each view, the mask of odd views, and `PriorTest.perhaps_odd`.
 
         Two explanations are compared by their evidence: wider priors on all views, or on a few odd views alone. Each is
         evaluated at its most likely factors. If neither is significantly better, the factors are the larger of both.
@@ -426,17 +432,19 @@ class Variances:
                 break
         careful = np.full(n, self._common(total, freedom, self.cautious))
         if n <= 2:
-            return careful, np.zeros(n, dtype=bool)
+            return careful, np.zeros(n, dtype=bool), None
         both, beyond, together = self._odd(around, wide, careful)
         if self.cautious:
             together = max(together, around.under(self._prior(usual, wide))[0])
         # rotations of all views would explain the error of an odd one: they are not widened here
         few, odd, alone = self._odd(around, np.append(wide[:-1], 1.0), np.ones(n), together)
         if alone >= together + _LIKELIER:
-            return few, odd
+            return few, odd, None
         # the factor of the other views is estimated without the odd ones
         both = np.where(beyond, both, self._common(total[~beyond], freedom[~beyond], self.cautious))
-        return (np.maximum(few, both) if alone >= together - SURE else both), beyond  # wide enough for both
+        if alone < together - SURE:
+            return both, beyond, None
+        return np.maximum(few, both), beyond, odd  # wide enough for both
 
     def _common(self, total: Array, freedom: Array, careful: bool) -> float:
         """Return the common factor on the priors of views, at least 1, from squares and degrees of freedom (n,)."""

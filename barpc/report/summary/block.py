@@ -11,7 +11,8 @@ from barpc.report.summary.words import Count, Vector
 
 AXES = "columns", "rows"
 DATUM = (
-    "Uncertainty (1 sigma) of the scene's position, and of its shape at its edge; share of each source but tie points"
+    "Uncertainty (1 sigma) of the scene's position and shape; of it the share that each source determines, beside tie "
+    "points"
 )
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
@@ -51,7 +52,12 @@ class DatumEntry(Record):
     """Sources of a motion of the scene, as shares of its information. Tie points have none."""
 
     part: str = column("Motion of the scene", head="motion", enum=MODES)
-    sigma_m: Number = column("Posterior standard deviation (of turns: at the edge)", "m", "sigma", ".2f")
+    sigma_m: Number = column(
+        "Posterior standard deviation; of tilt, turn, scale, twist and bending the shift at the edge",
+        "m",
+        "sigma",
+        ".2f",
+    )
     cameras: Number = column("Accuracies of the cameras as delivered", head="delivered cameras", form=".0%")
     earlier_run: Number = column("The earlier run", head="earlier run", form=".0%")
     fixed_views: Number = column("Fixed views", head="fixed views", form=".0%")

@@ -38,7 +38,7 @@ class GcpEntry(KnownPoint):
     residual_enu_m: Vector = column("Position predicted without it, minus given", "m", ("east", "north", "up"), "+.3f")
     used: bool = column("Whether it constrains the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = column(
-        "contradicts: used, residual above 4 sigma; rejected: the others contradict it; undecided: no majority",
+        "contradicts: used, but with a residual above 4 sigma; rejected: others contradict it; undecided: no majority",
         head="verdict",
         default="used",
     )
@@ -49,7 +49,9 @@ class GcpEntry(KnownPoint):
     redundancy: Number = column("Redundancy number, 0 to 1: how far the others control it", default=None)
     residual_px: Number = column("RMS of the residual in its images", "px", "in images", ".2f", default=None)
 
-    image_w: Number = column("The same of its residuals in the images", "", "w in images", ".1f", default=None)
+    image_w: Number = column(
+        "Largest Baarda's w of its residuals in the images", "", "w in images", ".1f", default=None
+    )
     image_w_view: str | None = column("Image of the largest w", head="largest in", default=None)
 
     @classmethod

@@ -43,17 +43,16 @@ class PairEntry(Record):
             adjusted=True,
             text="New cameras, all verified matches",
         ),
-        "kept": Column(
-            "after, used [px]",
-            lambda pair: _offset_cell(pair.epipolar_kept),
+        "rms": Column(
+            "RMS [px]",
+            lambda pair: pair.offset_rms[0] if pair.epipolar_after is None else pair.offset_rms[1],
             ".3f",
-            adjusted=True,
-            text="New cameras, matches in use",
+            text="RMS of the matches in use with the new cameras; of all with those as given where none are new",
         ),
     }
     CAPTION: ClassVar = "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)"
     PAGE: ClassVar = (
-        "pair num_matches tied_by decoy_share convergence_deg base_to_height height_m_per_px before after kept"
+        "pair num_matches tied_by decoy_share convergence_deg base_to_height height_m_per_px before after rms"
     )
     AGAIN: ClassVar = "pair tied_by num_matches beaten"
     TERMINAL: ClassVar = "pair num_matches convergence_deg base_to_height before after"
@@ -67,7 +66,7 @@ class PairEntry(Record):
     b: str = column("Second view")
     num_matches: Count = column("Common tie points in use", head="used")
     convergence_deg: Number = column("Angle between the lines of sight", "deg", "angle", ".1f")
-    base_to_height: Number = column("Ratio of base to height, along the lines of sight", head="B/H", form=".2f")
+    base_to_height: Number = column("Base-to-height ratio by the angle of the lines of sight", head="B/H", form=".2f")
     height_m_per_px: Number = column("Height of one pixel of parallax", "m", "height per px", ".3g")
     epipolar_before: OffsetEntry | None = column(
         "Epipolar offset through the delivered cameras, of all verified matches"
@@ -78,7 +77,7 @@ class PairEntry(Record):
         "Matcher that succeeded, and whether its thresholds were relaxed", head="matched by", default=None
     )
     decoy_share: Number = column(
-        "Share of false matches, estimated by search where no true ones are",
+        "Estimated share of false matches, from matches found where none can be true",
         head="false matches",
         form=".1%",
         default=None,

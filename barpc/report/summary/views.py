@@ -30,7 +30,7 @@ class EllipseEntry(Record):
 class SourceEntry(Record):
     """Source of a camera."""
 
-    format: str = column("Kind of file from which it was read", head="RPC read from")
+    format: str = column("Format of the file or tag that it was read from", head="RPC read from")
     path: str = column("File with the camera")
     notes: tuple[str, ...] = column("Remarks")
 
@@ -48,9 +48,11 @@ class CorrectionEntry(Record):
     shift_px: Pixel | None = column("Models in the image: shift col, row", "px", default=None)
     slope: tuple[Pixel, ...] | None = column("Models in the image: by (col, row)", "px/px", default=None)
     rotation_urad: Vector | None = column("Rotation vector R, ECEF axes", "urad", default=None)
-    angle_urad: Number = column("Angle of the rotation R", "urad", "rotation", ".2f", default=None)
+    angle_urad: Number = column("Angle by which the camera was rotated (R)", "urad", "rotation", ".2f", default=None)
     translation_m: Vector | None = column("Translation T, ECEF", "m", default=None)
-    translation_norm_m: Number = column("Length of the translation T", "m", "translation", ".2f", default=None)
+    translation_norm_m: Number = column(
+        "Distance by which the camera was moved (T)", "m", "translation", ".2f", default=None
+    )
     drift_urad: tuple[Vector, ...] | None = column("Drift, for each power of the row", "urad", default=None)
     jitter_px: Number = column("RMS of the spline over the rows", "px", "jitter", ".2f", default=None)
     jitter_rows: Number = column("Rows between its knots", "px", default=None)
@@ -84,7 +86,7 @@ class FitEntry(Record):
         "Largest change of a pixel by localisation and projection; none where that fails", "px", "round trip", ".1e"
     )
     coverage: Number = column("Share of the image covered by the fit's points", head="covered", form=".0%")
-    method: str = column("Solver", head="solver")
+    method: str = column("Method of the fit", head="method")
     num_check_points: Count = column("Check points", head="points")
 
 
@@ -165,7 +167,11 @@ class ViewEntry(Record):
     tie_coverage: Share = column("Share of the cells of an 8 x 8 grid with a tie point", head="covered", form=".0%")
     rmse_before: Number = column("RMS reprojection error through the delivered cameras", "px", "before", ".3f")
     rmse_after: Number = column(
-        "RMS reprojection error through the new cameras; none for a check", "px", "after", ".3f", adjusted=True
+        "RMS reprojection error through the new cameras; none where cameras were only checked",
+        "px",
+        "after",
+        ".3f",
+        adjusted=True,
     )
     systematic_px: Number = column("RMS of systematic residuals, noise subtracted", "px", "systematic", ".3f")
     prior_scale: Number = column(
@@ -180,20 +186,30 @@ class ViewEntry(Record):
     status: Literal["adjusted", "consistent", "tied", "weak", "doubtful", "failed"] = column("Verdict on the image")
     advice: str = column("Reservation and remedy; empty without reservation")
     cause: str | None = column("Name of the reservation; null without one", default=None, enum=CAUSES)
-    num_moving: Count = column("Excluded observations of tie points that move together", head="excluded", default=0)
-    num_check: Count = column("Observations of check tie points", head="check", default=0)
+    num_moving: Count = column(
+        "Observations excluded because tie points move together, as on clouds", head="excluded", default=0
+    )
+    num_check: Count = column("Observations of check tie points, kept out of the adjustment", head="check", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "after, check", ".3f", default=None)
     stated_ce90_m: Number = column(
-        "CE90 of the delivered camera, by the accuracies that its file states", "m", "CE90 stated", ".1f", default=None
+        "CE90 of the delivered camera by its file, whose accuracies are those of rotation and translation each",
+        "m",
+        "CE90 stated",
+        ".1f",
+        default=None,
     )
     systematic_p: Number = column(
-        "Probability of systematic_px by noise alone (F test)", "", "F test p", ".1e", default=None
+        "Probability of systematic residuals as large by noise alone (F test)", "", "F test p", ".1e", default=None
     )
     neighbour_correlated_px: Number = column(
         "Error correlated between neighbours in row or column", "px", "correlated", ".3f", default=None
     )
     control_w: Number = column(
-        "Largest residual of its control over its standard deviation (Baarda's w)", "", "largest w", ".1f", default=None
+        "Largest Baarda's w of the control points in the image: a residual over its standard deviation",
+        "",
+        "largest w",
+        ".1f",
+        default=None,
     )
     control_w_point: str | None = column("Control point of that w", head="largest at", default=None)
     date: str | None = column("Acquisition date, where its metadata state it", default=None)
