@@ -30,7 +30,7 @@ def decisions(summary: Summary) -> list[str]:
     if (test := summary.control_test) is not None:
         found.append(
             f"Of {counted(test.num, 'residual')} of control points in the images, {test.num_beyond} "
-            f"{'has' if test.num_beyond == 1 else 'have'} Baarda's w above {test.critical:.3g} "
+            f"{'has' if test.num_beyond == 1 else 'have'} Baarda's w above {test.critical:.3g} in column or row "
             f"({two_digits(test.expected)} expected by chance). The largest w is {known(test.largest_w):.1f} "
             f"({test.point} in {test.image})."
         )
@@ -128,8 +128,8 @@ def _priors(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
         named = len(widened) == 1 or most > _WIDENED * least  # the priors of two images are widened alike
         times = f"by up to {most:.1f} ({name})" if named else f"by {most:.1f}"
         yield (
-            "The corrections are larger than the prior sigmas of the cameras allow. The prior sigmas of "
-            f"{counted(len(widened), 'image')} were multiplied {times}."
+            "The corrections are larger than the prior sigmas of the cameras allow. The prior sigmas of position and "
+            f"attitude of {counted(len(widened), 'image')} were multiplied {times}."
         )
     if (scene.prior_shared or 1.0) > _WIDENED:
         yield f"The prior sigmas of an error common to all images were multiplied by {scene.prior_shared:.1f}."

@@ -100,10 +100,12 @@ def _improve(summary: Summary) -> Iterator[StepEntry]:
     options, found, words = summary.options or {}, list[ExpectedEntry](), list[str]()
     lower = "would lower the uncertainty"
     if not (summary.reference and summary.reference.used) and not (scene.dem and scene.dem.num_held):
-        then = _sigma_with(covariance, *_dem_observations(options))
+        level = _dem_observations(options)
+        then = _sigma_with(covariance, *level)
         if now[2] > LEAST_GAIN * then[2]:
             found.append(ExpectedEntry("dem", (None, None, float(then[2]))))
-            words.append(f"A DEM (--dem FILE --geoid NAME) {lower} of the height to {metres(then[2])}.")
+            a_dem = f"A DEM good to {metres(np.sqrt(level[1][0]))} (--dem FILE --geoid NAME)"
+            words.append(f"{a_dem} {lower} of the height to {metres(then[2])}.")
     up = now[2] * _height_ratio(summary, scene)
     if now[2] > LEAST_GAIN * up:
         found.append(ExpectedEntry("image", (None, None, float(up))))

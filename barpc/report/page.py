@@ -117,7 +117,7 @@ _TABLE_CAPTIONS: dict[str, tuple[str, type[Record], str]] = {
         ViewEntry.CORRECTIONS,
     ),
     "places": (
-        "Horizontal uncertainty of the ground point at each image centre, if its altitude were known",
+        "Horizontal uncertainty where the line of sight of each image centre meets a given altitude",
         ViewEntry,
         ViewEntry.PLACES,
     ),

@@ -153,12 +153,12 @@ def _of_cameras(run: Run, found: Adjustment) -> Iterator[str]:
         alone, perhaps = _by_cameras_alone(run, found), found.prior.perhaps_odd
         first = listed([] if perhaps is None else [found.names[v] for v in np.flatnonzero(perhaps)], NAMED)
         either = " Tie points of two images cannot show which camera is wrong." * (len(run.views) == 2)
-        either += f" Errors of {first} alone explain them about as well." * bool(first)
+        either += f" Errors of {first} alone explain the corrections about as well." * bool(first)
         more = " or more" * bool(np.max(found.prior.scale) > 1.1 * common)
         yield (
-            "The corrections are larger than the stated accuracies of the cameras allow. These were multiplied by "
-            f"{common:.1f}{more}{', and the sigma of the position with them' * alone}.{either} Check the RPCs and the "
-            f"stated accuracies{f', first of {first}' * bool(first)}{', or add GCPs or a DEM' * alone}."
+            "The corrections are larger than the stated accuracies of the cameras allow. The stated sigmas were "
+            f"multiplied by {common:.1f}{more}{', and that of the position with them' * alone}.{either} Check the RPCs "
+            f"and the stated accuracies{f', first of {first}' * bool(first)}{', or add GCPs or a DEM' * alone}."
         )
     yield from _of_image_model(run, found)
     if found.apart is not None and not found.apart.clear:

@@ -319,7 +319,7 @@ def _(s, start, names, more, a, b, per_pixel):
     assert a is None or not any(view.advice for view in s.views if view.name in (a, b))
 
 
-@says(r"(A DEM .*|A third image .*|GCPs at .*)\.")
+@says(r"(A DEM good to .*|A third image .*|GCPs at .*)\.")
 def _(s, gains):
     (step,) = [step for step in s.next if step.expected]
     to = re.findall(r"would lower the uncertainty of the (?:height|position) to (.*?)\.(?: |$)", f"{gains}.")
@@ -398,10 +398,10 @@ def _(s, assumed, names):
 
 
 @says(
-    r"The corrections are larger than the stated accuracies of the cameras allow\. These were multiplied by "
-    rf"{NUM}( or more)?(, and the sigma of the position with them)?\.( Tie points of two images cannot show which "
-    r"camera is wrong\.)?(?: Errors of (.*) alone explain them about as well\.)? Check the RPCs and the stated "
-    r"accuracies(?:, first of (.*?))?(, or add GCPs or a DEM)?\."
+    r"The corrections are larger than the stated accuracies of the cameras allow\. The stated sigmas were multiplied "
+    rf"by {NUM}( or more)?(, and that of the position with them)?\.( Tie points of two images cannot show which "
+    r"camera is wrong\.)?(?: Errors of (.*) alone explain the corrections about as well\.)? Check the RPCs and the "
+    r"stated accuracies(?:, first of (.*?))?(, or add GCPs or a DEM)?\."
 )
 def _(summary, times, more, position, either, alone, first, add):
     assert alone == first
@@ -416,8 +416,8 @@ def _(summary, times, more, position, either, alone, first, add):
 
 
 @says(
-    r"The corrections are larger than the prior sigmas of the cameras allow\. The prior sigmas of (\d+) images? were "
-    rf"multiplied by (?:up to )?{NUM}(?: \((.*)\))?\."
+    r"The corrections are larger than the prior sigmas of the cameras allow\. The prior sigmas of position and "
+    rf"attitude of (\d+) images? were multiplied by (?:up to )?{NUM}(?: \((.*)\))?\."
 )
 def _(s, num, times, name):
     wide = {view.name: view.prior_scale for view in s.views if (view.prior_scale or 1.0) > 1.005}
@@ -459,8 +459,8 @@ def _(s):
 
 
 @says(
-    rf"Of (\d+) residuals? of control points in the images, (\d+) ha(?:s|ve) Baarda's w above {NUM} \({NUM} expected "
-    rf"by chance\)\. The largest w is {NUM} \((\S+) in (\S+)\)\."
+    rf"Of (\d+) residuals? of control points in the images, (\d+) ha(?:s|ve) Baarda's w above {NUM} in column or row "
+    rf"\({NUM} expected by chance\)\. The largest w is {NUM} \((\S+) in (\S+)\)\."
 )
 def _(s, num, beyond, critical, expected, w, point, image):
     test = s.control_test

@@ -119,8 +119,8 @@ def test_priors_hold_or_were_widened(record):
         ((3.2, 3.2), "2 images were multiplied by 3.2"),  # as of a pair, which does not show whose is wrong
     ):
         text = said(with_views(held, *({"prior_scale": scale} for scale in scales)), prior_ratio=9.0)
-        start = "The corrections are larger than the prior sigmas of the cameras allow. The prior sigmas of"
-        assert f"{start} {widened}." in text.splitlines()
+        start = "The corrections are larger than the prior sigmas of the cameras allow. The prior sigmas of "
+        assert f"{start}position and attitude of {widened}." in text.splitlines()
     assert "prior sigmas of the cameras" not in said(with_views(held, {"prior_scale": 3.2}), prior_ratio=None)
     assert "common to all" not in text
     shared = said(held, prior_ratio=0.7, prior_shared=1.84)
@@ -173,8 +173,8 @@ def test_jitter_is_said_with_what_was_left_without_it(record):
 def test_a_test_of_control_says_what_chance_does(record):
     test = ControlTestEntry(200, 3.29, 1, 0.4, 4.6, "B", "P3")
     assert decisions(replace(record, control_test=test))[-1] == (
-        "Of 200 residuals of control points in the images, 1 has Baarda's w above 3.29 (0.4 expected by chance). "
-        "The largest w is 4.6 (P3 in B)."
+        "Of 200 residuals of control points in the images, 1 has Baarda's w above 3.29 in column or row (0.4 expected "
+        "by chance). The largest w is 4.6 (P3 in B)."
     )
     assert "residuals of control" not in said(replace(record, control_test=None))
 

@@ -292,7 +292,7 @@ def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
     found = reasons(adjusted(prior=prior))
     assert bool(found) == said_of
     if said_of:
-        assert "These were multiplied by 2.1 or more, and the sigma of the position with them. Check" in found[0]
+        assert "The stated sigmas were multiplied by 2.1 or more, and that of the position with them. Check" in found[0]
         assert "two images" not in found[0]
         two = block_verdict(run_of(adjusted(prior=prior), views=run_of().views[:2]), views()[:2])["reasons"]
         assert two[0].split(". ")[2] == "Tie points of two images cannot show which camera is wrong"
@@ -304,8 +304,9 @@ def test_with_gcps_the_position_is_not_as_uncertain_as_the_cameras():
         next(verdicts._of_cameras(run_of(adjusted(prior=prior), gcps=gcps), adjusted(prior=prior)))
         for gcps in (None, object())
     )
-    start = "The corrections are larger than the stated accuracies of the cameras allow. These were multiplied by 7.0"
-    assert alone.startswith(f"{start}, and the sigma of the position with them. ")
+    start = "The corrections are larger than the stated accuracies of the cameras allow. The stated sigmas were "
+    start += "multiplied by 7.0"
+    assert alone.startswith(f"{start}, and that of the position with them. ")
     assert alone.endswith(", or add GCPs or a DEM.")
     assert held == f"{start}. Check the RPCs and the stated accuracies."
 
@@ -314,7 +315,8 @@ def test_an_image_that_alone_explains_what_all_may_is_named():
     prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.full(3, 7.0), perhaps_odd=np.array([False, True, False]))
     said_of = next(verdicts._of_cameras(run_of(adjusted(prior=prior)), adjusted(prior=prior)))
     assert (
-        " Errors of B alone explain them about as well. Check the RPCs and the stated accuracies, first of B" in said_of
+        " Errors of B alone explain the corrections about as well. Check the RPCs and the stated accuracies, first of B"
+        in said_of
     )
 
 

@@ -11,8 +11,7 @@ from barpc.report.summary.words import Count, Vector
 
 AXES = "columns", "rows"
 DATUM = (
-    "Uncertainty (1 sigma) of the scene's position and shape; of it the share that each source determines, beside tie "
-    "points"
+    "Uncertainty (1 sigma) of the scene's position and shape; shares of the sources that determine it, tie points apart"
 )
 MODES = {
     "east": "the whole scene may lie {0} farther east or west",
@@ -53,7 +52,7 @@ class DatumEntry(Record):
 
     part: str = column("Motion of the scene", head="motion", enum=MODES)
     sigma_m: Number = column(
-        "Posterior standard deviation; of tilt, turn, scale, twist and bending the shift at the edge",
+        "Posterior standard deviation: of position, or of the shift at the scene's edge",
         "m",
         "sigma",
         ".2f",

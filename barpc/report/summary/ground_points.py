@@ -38,7 +38,7 @@ class GcpEntry(KnownPoint):
     residual_enu_m: Vector = column("Position predicted without it, minus given", "m", ("east", "north", "up"), "+.3f")
     used: bool = column("Whether it constrains the block", default=True)
     status: Literal["used", "contradicts", "rejected", "undecided", "not seen"] = column(
-        "contradicts: used, but with a residual above 4 sigma; rejected: others contradict it; undecided: no majority",
+        "contradicts: used, its residual exceeds 4 sigma; rejected by the others; undecided: no majority, not used",
         head="verdict",
         default="used",
     )
@@ -50,7 +50,7 @@ class GcpEntry(KnownPoint):
     residual_px: Number = column("RMS of the residual in its images", "px", "in images", ".2f", default=None)
 
     image_w: Number = column(
-        "Largest Baarda's w of its residuals in the images", "", "w in images", ".1f", default=None
+        "Largest Baarda's w of its single image observations", "", "w in images", ".1f", default=None
     )
     image_w_view: str | None = column("Image of the largest w", head="largest in", default=None)
 

@@ -47,7 +47,7 @@ class PairEntry(Record):
             "RMS [px]",
             lambda pair: pair.offset_rms[0] if pair.epipolar_after is None else pair.offset_rms[1],
             ".3f",
-            text="RMS of the matches in use with the new cameras; of all with those as given where none are new",
+            text="Root mean square: new cameras, matches in use; in a check all verified matches",
         ),
     }
     CAPTION: ClassVar = "Pairs: offset from the epipolar line, median ± spread (1.4826 MAD)"
@@ -77,7 +77,7 @@ class PairEntry(Record):
         "Matcher that succeeded, and whether its thresholds were relaxed", head="matched by", default=None
     )
     decoy_share: Number = column(
-        "Estimated share of false matches, from matches found where none can be true",
+        "Estimated share of false matches: as many as a search in wrong places finds",
         head="false matches",
         form=".1%",
         default=None,

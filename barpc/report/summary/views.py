@@ -192,7 +192,7 @@ class ViewEntry(Record):
     num_check: Count = column("Observations of check tie points, kept out of the adjustment", head="check", default=0)
     held_out_px: Number = column("RMS of check tie points", "px", "after, check", ".3f", default=None)
     stated_ce90_m: Number = column(
-        "CE90 of the delivered camera by its file, whose accuracies are those of rotation and translation each",
+        "CE90 that the delivered camera's file states; rotation and translation have it each as prior",
         "m",
         "CE90 stated",
         ".1f",
@@ -202,7 +202,7 @@ class ViewEntry(Record):
         "Probability of systematic residuals as large by noise alone (F test)", "", "F test p", ".1e", default=None
     )
     neighbour_correlated_px: Number = column(
-        "Error correlated between neighbours in row or column", "px", "correlated", ".3f", default=None
+        "Part of the residuals that neighbouring tie points share", "px", "correlated", ".3f", default=None
     )
     control_w: Number = column(
         "Largest Baarda's w of the control points in the image: a residual over its standard deviation",
