@@ -194,6 +194,19 @@ def test_what_is_said_of_views_does_not_depend_on_how_many_there_are(n: int, wro
             assert prior.scale[view] > 3.0 * others[0]
 
 
+@pytest.mark.parametrize(("n", "wrong", "pixels"), [(3, 1, 30.0), (4, 1, 50.0), (5, 2, 30.0)])
+def test_a_view_that_alone_may_be_wrong_is_named_where_all_may_be(n: int, wrong: int, pixels: float) -> None:
+    """Of few views an error of one is hardly likelier than larger errors of all; without an error none is named."""
+    for seed in (0, 1):
+        assert told(n, 1.0, {}, seed).perhaps_odd is None
+        prior = told(n, 1.0, {wrong: pixels}, seed)
+        assert not prior.odd.any()
+        assert prior.scale.min() > 1.5
+        assert prior.perhaps_odd is not None
+        assert prior.perhaps_odd[wrong]
+        assert prior.perhaps_odd.sum() <= n // 3 + 2
+
+
 @pytest.mark.slow
 def test_many_views_that_are_far_off_are_all_named() -> None:
     """Those of a large block that share no points are found at once, one beside another after it."""
