@@ -106,10 +106,11 @@ class _Text:
 
     def places(self, word: bytes) -> Iterator[int]:
         """Yield where a word begins."""
-        place = self._lower.find(word) if word in self._letters else -1
-        while place >= 0:
+        place = -len(word)
+        for _ in range(self._letters.count(word)):  # behind the last one nothing is searched
+            if (place := self._lower.find(word, place + len(word))) < 0:
+                return
             yield place
-            place = self._lower.find(word, place + len(word))
 
 
 @dataclass(frozen=True)
