@@ -9,6 +9,7 @@ of the last step, at which time grows as a power of the size: wanted is 1.15 at 
 - reference: three images, 2000 tie points, and points of an orthoimage;
 - edges: three images whose detector has so many edges, given as options;
 - cameras: images with the side file of a vendor each, read by names relative to their folder (needs ../shared/data);
+- cameras, whole XML: the same with all of Maxar's metadata, 0.9 MB an image, nearly all of it orbit and attitudes;
 - one pass: images with parallel lines of sight, of which none is a band of another;
 - sets: the search for GCPs that agree alone: 2 % off, a third in another datum, and all less accurate than stated.
 
@@ -25,7 +26,7 @@ import re
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,19 +103,20 @@ def sets(**how: float) -> Callable[[int], Made]:
 
 
 SIDE_FILES = {
-    "{}.XML": "rpc_WV2.xml",
-    "{}.RPB": "md_dg.RPB",
-    "{}_RPC.TXT": "20191015_073816_ssc1d3_0011_basic_l1a_panchromatic_dn_RPC.TXT",
+    "{}.XML": "rpc_formats/rpc_WV2.xml",
+    "{}.RPB": "rpc_formats/md_dg.RPB",
+    "{}_RPC.TXT": "rpc_formats/20191015_073816_ssc1d3_0011_basic_l1a_panchromatic_dn_RPC.TXT",
 }
+WHOLE_XML = {"{}.XML": "physical_maxar/1040010074793300.xml"}
 
 
-def with_side_files(count: int) -> Made:
+def with_side_files(count: int, files: Mapping[str, str] = SIDE_FILES) -> Made:
     """Return the reading of images whose cameras are vendors' files, each with other numbers."""
-    formats = Path(__file__).resolve().parents[2] / "shared/data/rpc_formats"
+    data = Path(__file__).resolve().parents[2] / "shared/data"
     folder = tempfile.TemporaryDirectory()
-    for n, (name, given) in zip(range(count), itertools.cycle(SIDE_FILES.items()), strict=False):
-        stem, text = f"image_{n:05d}", (formats / given).read_text()
-        width, height = np.rint(2.0 * read_rpc(formats / given).image_offset).astype(int).tolist()
+    for n, (name, given) in zip(range(count), itertools.cycle(files.items()), strict=False):
+        stem, text = f"image_{n:05d}", (data / given).read_text()
+        width, height = np.rint(2.0 * read_rpc(data / given).image_offset).astype(int).tolist()
         shape = {"driver": "GTiff", "count": 1, "dtype": "uint8", "sparse_ok": True, "tiled": True}
         with rasterio.open(f"{folder.name}/{stem}.tif", "w", width=width, height=height, **shape):
             pass
@@ -146,6 +148,7 @@ SUBJECTS: dict[str, tuple[Callable[[int], Made], tuple[int, ...]]] = {
     "reference": (with_reference, GCPS),
     "edges": (with_edges, (1, 4, 16)),
     "cameras": (with_side_files, (100, 300, 1000)),
+    "cameras, whole XML": (lambda count: with_side_files(count, WHOLE_XML), (100, 300, 1000)),
     "one pass": (one_pass, (100, 300, 1000, 3000)),
     "sets, 2 % wrong": (sets(wrong=0.02), (*GCPS, 17_000)),
     "sets, a third in another datum": (sets(datum=0.3), GCPS),

@@ -15,13 +15,14 @@ import re
 import stat
 import unicodedata
 from array import array
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, TextIO
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 from barpc.base import identity
 from barpc.base.errors import BarpcError, ImageError, InputError, RpcFormatError, plain, visible
@@ -184,7 +185,10 @@ def _utf8(file: BinaryIO, path: Path | str, kind: Kind, newline: str | None = No
 def read_bytes(path: Path | str, kind: Kind) -> bytes:
     """Read all bytes of a file (see `opened`)."""
     with opened(path, kind) as file:
-        data = file.read() if kind.most is None else file.read(kind.most + 1)
+        most = -1 if kind.most is None else kind.most + 1
+        data = file.read(min(MB, most) if most >= 0 else MB)  # 32 MB at once are new memory for every small file
+        if len(data) == MB:
+            data += file.read(max(most - MB, 0) if most >= 0 else -1)
         kind.check(path, len(data))  # it may have grown, and /proc knows no sizes
         return data
 
@@ -308,49 +312,78 @@ MAX_ELEMENTS = 2_000_000
 """Of an XML or HDF5 file."""
 
 
-class _Builder(ElementTree.TreeBuilder):
-    """Refuses trees that are too large, and a document type that the encoding hides from a search of the bytes."""
+class _Builder:
+    """Makes the tree of a document: its root, and of the other elements all, or those called `only` with all in them.
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._depth = self._count = 0
+    Others are gone through alone: of a vendor's metadata all but some lines are orbit and attitude. Refuses trees that
+    are too large, and a document type that the encoding hides from a search of the bytes.
+    """
 
-    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+    def __init__(self, strip_namespaces: bool, only: Container[str]) -> None:
+        self._strip, self._only = strip_namespaces, only
+        self._depth = self._count = self._kept = 0  # the last: levels of elements that are kept with all in them
+        self._tree = ElementTree.TreeBuilder()
+        self._parser = expat.ParserCreate(namespace_separator="}")
+        self._parser.buffer_text = True
+        self._parser.StartElementHandler, self._parser.EndElementHandler = self._start, self._end
+        self._parser.StartDoctypeDeclHandler = self._doctype
+
+    def parse(self, data: bytes) -> ElementTree.Element:
+        self._parser.Parse(data, True)  # at once: expat before 2.6 looks at an unfinished token again with every part
+        return self._tree.close()
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth, self._count = self._depth + 1, self._count + 1
         if self._depth > MAX_DEPTH or self._count > MAX_ELEMENTS:
-            raise ElementTree.ParseError(f"{self._count} elements, {self._depth} deep: too many")
-        return super().start(tag, attrs)
+            raise ValueError(f"{self._count} elements, {self._depth} deep: too many")
+        tag = name.rpartition("}")[2] if self._strip else _universal(name)
+        if self._kept:
+            self._kept += 1
+        elif not self._only or tag in self._only:
+            self._kept, self._parser.CharacterDataHandler = 1, self._tree.data
+        if self._kept or self._depth == 1:
+            self._tree.start(tag, attributes and {_universal(key): value for key, value in attributes.items()})
 
-    def end(self, tag: str) -> ElementTree.Element:
+    def _end(self, name: str) -> None:
+        if self._kept or self._depth == 1:
+            self._tree.end(name)
         self._depth -= 1
-        return super().end(tag)
+        if self._kept:
+            self._kept -= 1
+            if not self._kept:
+                self._parser.CharacterDataHandler = None
 
-    def doctype(self, name: str, _public: str | None, _system: str | None) -> None:
-        raise ElementTree.ParseError("it declares a DOCTYPE")
+    def _doctype(self, *_: object) -> NoReturn:
+        raise ValueError("it declares a DOCTYPE")
+
+
+def _universal(name: str) -> str:
+    """Return a name as ElementTree has it: ``{namespace}name``."""
+    return f"{{{name}" if "}" in name else name
 
 
 def parse_xml(
-    source: bytes | Path, *, name: str | None = None, max_bytes: int = MAX_XML, strip_namespaces: bool = False
+    source: bytes | Path,
+    *,
+    name: str | None = None,
+    max_bytes: int = MAX_XML,
+    strip_namespaces: bool = False,
+    only: Container[str] = (),
 ) -> ElementTree.Element:
     """Return the root element of an XML document, of bytes or a file; messages call it `name`, or by its path.
 
     No document type: an entity cannot be declared without one, so neither "billion laughs" nor a reference to another
-    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. RpcFormatError where it cannot be
-    read, has more than `max_bytes`, or is not well-formed.
+    file can be written. `strip_namespaces` drops the ``{namespace}`` of every tag. Of elements `only`, the root has
+    these alone, each directly in it. RpcFormatError where it cannot be read, has more than `max_bytes`, or is not
+    well-formed.
     """
     name = name or (str(source) if isinstance(source, Path) else "XML document")
     data = read_bytes(source, replace(XML, most=max_bytes)) if isinstance(source, Path) else source
     if len(data) > max_bytes:
         raise RpcFormatError(f"{name}: {len(data)} bytes of XML, at most {max_bytes} are read")
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+    if b"!" in data and (b"<!DOCTYPE" in data or b"<!ENTITY" in data):
         raise RpcFormatError(f"{name}: refused, it declares a DOCTYPE; remove the declaration")
-    parser = ElementTree.XMLParser(target=_Builder())  # noqa: S314 - no DOCTYPE, so no entities
     try:
-        parser.feed(data)  # at once: expat before 2.6 looks at an unfinished token again with every part
-        root: ElementTree.Element = parser.close()
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        return _Builder(strip_namespaces, only).parse(data)
+    except (expat.ExpatError, LookupError, ValueError) as error:
         raise RpcFormatError(f"{name}: not an XML document that can be read ({error})") from error
-    if strip_namespaces:
-        for element in root.iter():
-            element.tag = element.tag.rpartition("}")[2]
-    return root

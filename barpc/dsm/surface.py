@@ -72,7 +72,9 @@ BANDS = (
 )
 CHANGE = "height minus that of the other images [m]"
 SHARED = "SIGMA_SHARED_BY_ALL_CELLS_M"
-_RELIEF_SIDE = BLOCK_SIZE // 2  # cells a side in the report: they are matched again, with the delivered cameras
+# cells a side in the report: they are matched again, with the delivered cameras, in about a second. Matches of the
+# corrected ones, intersected with these, would have heights in 99.9 % of the cells where SGBM finds none
+_RELIEF_SIDE = BLOCK_SIZE // 2
 _SHADING_DIRECTION = np.array([-0.5, 0.5, np.sqrt(0.5)])  # from the north-west, 45 degrees up
 
 

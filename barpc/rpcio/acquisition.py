@@ -97,19 +97,22 @@ class _Text:
     """A text and the places of words (lower case) in it.
 
     All but some lines of the metadata of an image, 1 MB, are orbit and attitude, in digits: words are first looked for
-    in the text without digits. To search 1 MB takes 5 ms so, and 130 ms by patterns alone.
+    in the text without digits, once among its parts that differ. To search 1 MB takes 1 ms so, and 100 ms by patterns.
     """
 
     def __init__(self, whole: bytes) -> None:
         self.whole, self._lower = whole, whole.lower()
         self._letters = self._lower.translate(None, b"0123456789.+- \t\r\n")
+        self._parts = b">".join(set(self._letters.split(b">")))
 
     def places(self, word: bytes) -> Iterator[int]:
         """Yield where a word begins."""
-        place = self._lower.find(word) if word in self._letters else -1
-        while place >= 0:
+        place = -len(word)
+        count = self._letters.count(word) if word in self._parts else 0
+        for _ in range(count):  # behind the last one nothing is searched
+            if (place := self._lower.find(word, place + len(word))) < 0:
+                return
             yield place
-            place = self._lower.find(word, place + len(word))
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,7 @@ def decode_text(data: bytes) -> str:
         text = data.decode(encoding_of(data))
     except UnicodeDecodeError:
         text = data.decode("latin-1")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 
 
 def _numbered_lines(fields: Fields, separator: str, indices: Sequence[str]) -> list[str]:

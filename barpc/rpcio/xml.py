@@ -35,9 +35,9 @@ from barpc.sensor.rpc import RPC
 _HEIGHT_DEFAULT = "HEIGHT_DEFAULT"  # of GDAL's RPC domain: the altitude of the scene's ground [m]
 
 
-def _xml_root(text: str, name: str, *, strip_namespaces: bool = True) -> Element:
+def _xml_root(text: str, name: str, *, strip_namespaces: bool = True, only: tuple[str, ...] = ()) -> Element:
     body = re.sub(r"\A\s*+<\?xml[^<>]*\?>", "", text, count=1)  # the encoding it declares is no longer its own
-    return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces)
+    return parse_xml(body.encode(), name=name, strip_namespaces=strip_namespaces, only=only)
 
 
 def _element_numbers(parent: Element, path: str, name: str) -> list[float]:
@@ -59,7 +59,7 @@ def _element(parent: Element, paths: Iterable[str], name: str) -> Element:
 
 def read_maxar(text: str, name: str, options: ReadOptions) -> RPC:
     """Read Maxar's image support data: `<RPB><IMAGE>`, twenty numbers in one element a list."""
-    root = _xml_root(text, name)
+    root = _xml_root(text, name, only=("RPB",))
     rpb = root if root.tag == "RPB" else _element(root, ("RPB",), name)
     spec = rpb.findtext("SPECID", "RPC00B").strip()
     image = _element(rpb, ("IMAGE",), name)
@@ -95,8 +95,7 @@ def read_dimap(text: str, name: str, options: ReadOptions) -> RPC:
     The first pixel's centre is (1, 1) in v1 and v2 and (0, 0) in v3. ERR_BIAS_ROW and _COL are the error of the
     vendor's own fit [px], no geolocation accuracy: they are left out.
     """
-    root = _xml_root(text, name)
-    model = _element(root, ("Global_RFM",), name)
+    model = _element(_xml_root(text, name, only=("Global_RFM",)), ("Global_RFM",), name)
     if model.find(".//F_COL") is not None:
         return _read_dimap_v1(model, name, options)
     inverse = _element(model, ("Inverse_Model", "GroundtoImage_Values"), name)
@@ -154,7 +153,7 @@ _RADARSAT = dict(zip(KEYS, _RADARSAT_WORDS.split(), strict=True))
 
 def read_radarsat(text: str, name: str, options: ReadOptions) -> RPC:
     """Read `<rationalFunctions>` of RADARSAT-2's and RCM's product.xml."""
-    functions = _element(_xml_root(text, name), ("rationalFunctions",), name)
+    functions = _element(_xml_root(text, name, only=("rationalFunctions",)), ("rationalFunctions",), name)
     fields = {
         key: _element_numbers(functions, word, name)
         for key, word in _RADARSAT.items()

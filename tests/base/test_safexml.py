@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree.ElementTree import tostring
 
 import pytest
 
@@ -23,6 +24,30 @@ def test_namespaces_are_dropped_when_asked() -> None:
     document = b'<l:a xmlns:l="http://x"><l:b>1</l:b></l:a>'
     assert parse_xml(document).findtext("b") is None
     assert parse_xml(document, strip_namespaces=True).findtext("b") == "1"
+
+
+def test_of_wanted_elements_alone_the_root_has_all_that_is_in_them() -> None:
+    document = b'<l:a xmlns:l="http://x">0<l:b>1<l:c k="2">3</l:c>4<l:b>5</l:b></l:b>6<l:d><l:b/>7<l:e/></l:d></l:a>'
+    root = parse_xml(document, strip_namespaces=True, only=("b",))
+    assert tostring(root) == b'<a><b>1<c k="2">3</c>4<b>5</b></b><b /></a>'
+    assert tostring(parse_xml(b"<b><c>1</c></b>", only=("b",))) == b"<b><c>1</c></b>"
+
+
+@pytest.mark.parametrize("only", [(), ("RPB",)], ids=["all", "a part"])
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        (b"<a><RPB/><b></a>", "mismatched tag: line 1, column 14"),
+        (b"<a><RPB/><b>", "no element found: line 1, column 12"),
+        (b"<a><RPB/>&x;</a>", "undefined entity"),
+        (b"<a><RPB/>" + b"<b>" * 100, "102 elements, 101 deep: too many"),
+        ("<!DOCTYPE a><a><RPB/></a>".encode("utf-16"), "it declares a DOCTYPE"),
+    ],
+    ids=["mismatched", "truncated", "entity", "deep", "DOCTYPE"],
+)
+def test_what_is_not_kept_is_still_looked_through(document: bytes, words: str, only: tuple[str, ...]) -> None:
+    with pytest.raises(RpcFormatError, match=words):
+        parse_xml(document, only=only)
 
 
 @pytest.mark.parametrize(
