@@ -80,7 +80,8 @@ def test_pixels_are_never_searched_whatever_the_image_is_called(
 
 def test_words_are_found_in_any_case_and_between_many_numbers(tmp_path: Path) -> None:
     lines = "".join(f"<P>{i} -{i}.5e-07 {i * i}.125</P>\n" for i in range(20_000))
-    stated = "<SATID>WV03</SATID><S1UN>sat 1D bandid</S1UN><mIsSiOnX>9</mIsSiOnX><BANDID>P</BANDID><MEANSUNEL>29.4</MEANSUNEL>"
+    stated = "<SATID>WV03</SATID><S1UN>sat 1D bandid</S1UN><mIsSiOnX>9</mIsSiOnX><BANDID>P</BANDID>"
+    stated += "<MEANSUNEL>29.4</MEANSUNEL>"
     (tmp_path / "a.xml").write_text(
         f"<isd>{lines}{stated}<TLCTIME>2022-04-17T22:51:49.05Z</TLCTIME>{lines}<meansunaz>187</meansunaz></isd>"
     )
