@@ -17,7 +17,7 @@ from scipy.special import gammainccinv
 from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, linearise
 from barpc.ba.evidence.mixture import COOLED, Group, Mixture, MixtureFit, moving
-from barpc.ba.robust.heldout import seen_in
+from barpc.ba.robust.heldout import problem_of_block
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
@@ -231,7 +231,7 @@ def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> 
     """Return the observations (K,) of a block that belong to a group found at camera unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
-    part, points = seen_in(problem, params, block)
+    part, points = problem_of_block(problem, params, block)
     state = State(params, points)
     low, high = block.alt_range
     linear = linearise(part, state, np.ones(len(block.view), dtype=bool), block.sigma, high - low)
