@@ -35,7 +35,7 @@ class TrackGroup:
     rows: IntArray  # (T, n) indices of the observations
     view: IntArray  # (T, n) their views
     subsets: Array  # (S, n) possible sets of inliers of a track: 1 for an inlier, else 0
-    point_bases: Array  # (T, 3 S, 2n) basis (3, 2n) of each subset's residuals that the ground point absorbs
+    point_bases: Array  # (T, 3 S, 2n) basis of residuals that the ground point absorbs, three rows per subset
     log_volume: Array  # (T, S) log of the ground point's posterior volume over its prior volume
     by_unknown: Array  # (T, n, 2, q) derivatives of the residuals by the unknowns of their view
 
@@ -253,7 +253,10 @@ def _subsets(n: int) -> BoolArray:
 
 
 def _ground_bases(ground: Array, subsets: BoolArray, information: Array) -> tuple[Array, Array]:
-    """Return L^-1 J' (T, 3 S, 2n) and -log det L (T, S); J: `ground` of a subset, L L' = J' J + `information`."""
+    """Return `TrackGroup.point_bases` and -log det L (T, S), from derivatives `ground` (T, 2n, 3) by the points.
+
+    With J for those of a subset, the bases are L^-1 J' and L L' = J' J + prior `information` (6, T).
+    """
     count, size = ground.shape[:2]
     point_bases, log_volume = np.empty((count, len(subsets), 3, size)), np.empty((count, len(subsets)))
     for k, subset in enumerate(subsets):

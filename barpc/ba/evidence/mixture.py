@@ -166,12 +166,12 @@ class _TrackPosteriors:
     """Posterior probabilities of tracks. In lists the first element is for still tracks, the second for moved ones."""
 
     log: Array  # (T,) log-likelihood of each track
-    right: Array  # (M,) probability of being an inlier, the only one of its track included
+    right: Array  # (M,) probability of being an inlier; it may be the only one of its track
     shares: list[Array]  # (S,) probability that the inliers are those of a subset
     subsets: list[_SubsetLikelihoods]
 
     def moved(self, subsets: Subsets) -> Array:
-        """Return the probability (T,) that a track moved, given that it has inliers."""
+        """Return the probability (T,) that a track moved, given that it has two inliers or more."""
         still, moved = (np.add.reduceat(share, subsets.begins[1]) for share in self.shares)
         return np.asarray(moved / np.maximum(still + moved, 1e-300))
 
@@ -248,8 +248,8 @@ class _WeightedResiduals:
     weight: tuple[Array, ...]  # (T, S) these probabilities, for each `TrackGroup`
     right: Array  # (K,) probability of being an inlier together with others of its track
     pull: Array  # (2, K) weighted residuals with the ground points estimated
-    squares: float  # weighted sum of their squares
-    freedom: float  # its degrees of freedom
+    squares: float  # weighted sum of the squared residuals
+    freedom: float  # degrees of freedom of this sum
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +333,7 @@ class Mixture:
         self.noise = max(self.noise, far)
 
     def run(self, most: int = ITERATIONS, cooled: float = COOLED) -> MixtureFit:
-        """Iterate to convergence, at most `most` times. `cooled` replaces `COOLED`. Another call continues it."""
+        """Iterate to convergence, at most `most` times; a later call continues. `cooled` replaces `COOLED`."""
         linear, last, fitted, ends, overshot = self.linear, -np.inf, 0.0, False, False
         self.cooled = cooled
         for left in range(most, 0, -1):

@@ -21,7 +21,7 @@ from barpc.sensor.image_corrections import sine_and_cosine
 
 _SHORTEST = 32.0  # rows: the window of a matcher averages shorter periods
 _MIN_PERIODS = 1.5  # least number of periods in an image; also the half width of a peak of the spectrum
-_FREQUENCY_OVERSAMPLING = 4  # tested frequencies per cycle per image
+_FREQUENCY_OVERSAMPLING = 4  # number of tested frequencies in a step of one cycle per image
 _BIN = _SHORTEST / _FREQUENCY_OVERSAMPLING  # rows of a bin: it reduces the shortest period's amplitude by a tenth
 
 

@@ -195,7 +195,7 @@ class ImageRegion:
     far: float  # share of outliers with the same displacement
     off: float  # median residual of these outliers; if there are none, mean residual of the inliers [px]
     chance: float  # upper bound of the p-value over all regions
-    moved: float  # mean displacement over an eighth of the rows or columns that contains it [px]; 0 for a cell
+    moved: float  # mean displacement of the eighth of all rows or columns around the region [px]; 0 for a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +233,7 @@ def worst_regions(checks: CheckTies, size: Array, limit: float, least: float, sh
 def _regions() -> IntArray:
     """Return (4, P) of P regions: number of parts of the columns, index of the part, and both for the rows.
 
-    One part is all columns, or all rows. There are about as many cells as rows or columns of the least size.
+    One part means all columns, or all rows. There are about as many cells as rows or columns of the least size.
     """
     halved = [2**n for n in range(1, _FINEST.bit_length())]
     lines = [(n, k, 1, 0) for n in halved for k in range(n)]
@@ -327,11 +327,11 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
     along = along - along.mean(axis=1, keepdims=True)
     scale = (1.0 / here - 1.0 / count)[:, None] * (along**2).mean(axis=1)
 
-    def squared_means(values: Array) -> Array:
+    def standardised_squared_means(values: Array) -> Array:
         return np.asarray(((of_near @ values.T / here[:, None]) ** 2 / scale).sum(axis=1))
 
-    found = squared_means(along)
-    drawn = [squared_means(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
+    found = standardised_squared_means(along)
+    drawn = [standardised_squared_means(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
     return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 

@@ -263,8 +263,8 @@ class Rounds:
     def _scatter(self, fit: SmoothFit | None = None) -> Array:
         """Return the residuals (2, K) [px] without the smooth part of each view.
 
-        A smooth error of one view moves the points, and therefore changes the residuals of the other views. Unless they
-        are small, smooth parts and points are therefore estimated alternately (backfitting).
+        A smooth error of one view moves the points, and so changes the residuals of the other views. Smooth parts that
+        are not small are therefore estimated alternately with the points (backfitting).
         """
         residual, counted, sigma = self.residual, self.counted, self.observations.sigma
         part = self.smooth.part(residual, counted, fit)

@@ -49,7 +49,7 @@ class NoiseCorrelation:
     of_reference: BoolArray  # (K,) mask of the observations of reference points
     place: Array  # (2, K) east, north of reference points [m]
     width: float  # of their templates [m]
-    share: Array  # (K,) number of independent observations that are equivalent to one, at most 1
+    share: Array  # (K,) effective number of independent observations of each, at most 1
     precision: Array  # (K,) weight: `share` times the variance of the view's tie points over that of the observation
 
     @classmethod
@@ -93,13 +93,11 @@ class NoiseCorrelation:
 class SmoothTest:
     """The smooth part of the residuals of each view, and its significance."""
 
-    # (N,) RMS length of the smooth part over the observations [px], without the expected contribution of noise; 0 for a
-    # view with too few observations
+    # (N,) RMS length of the smooth part [px], less the contribution of noise; 0 for a view with too few observations
     rms: Array
     # (N,) p-value of an F test of the smooth part; 1 for a view with too few observations
     significance: Array
-    # (N,) share of the sum of squares of the smooth part that the splines over the rows explain; NaN for a view without
-    # a fit
+    # (N,) share of its sum of squares that the splines over the rows explain; NaN for a view without a fit
     by_row: Array
     # (N,) RMS of the error that neighbours along the columns or the rows share [px]; the larger of both, 0 if it is not
     # significant. Jitter and steps that are too fine for the smooth part are included
