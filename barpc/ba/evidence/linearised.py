@@ -21,7 +21,7 @@ from barpc.scene import BoolArray, IntArray
 class Pairs:
     """Pairs of observations i <= j of the same track, grouped by their pair of views."""
 
-    order: IntArray  # (M,) number of each pair in a list of the pairs track by track
+    order: IntArray  # (M,) index of each pair in the list of pairs track by track, as of `TrackGroup`
     first: IntArray  # (M,) observations i
     second: IntArray  # (M,) observations j
     bounds: IntArray  # (P + 1,) first pair of each pair of views; the last element is M
@@ -243,7 +243,7 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
 
 
 def array_elements(count: IntArray) -> float:
-    """Return the size of all `TrackGroup.point_bases` of tracks with `count` (T,) observations."""
+    """Return the memory [array elements] of the `TrackGroup.point_bases` of tracks with `count` (T,) observations."""
     return float((6.0 * (count + 1.0) * count).sum())
 
 

@@ -168,18 +168,18 @@ def share_log_ratios(bins: Array) -> Array:
     `bins` (2, N, `BINS`) are the numbers of observations and of wrong observations.
     """
 
-    def max_log_likelihood(k: Array, n: Array) -> Array:
+    def binomial_log_likelihood(k: Array, n: Array) -> Array:
         good = np.maximum(n - k, 0.0)
         return np.asarray(xlogy(k, k) + xlogy(good, good) - xlogy(n, n))
 
     total, all_bad = bins.sum(axis=2)
-    whole, gain = max_log_likelihood(all_bad, total), np.zeros((len(_STARTS), bins.shape[1]))
+    whole, gain = binomial_log_likelihood(all_bad, total), np.zeros((len(_STARTS), bins.shape[1]))
     may_differ = whole < -SURE  # else no interval can be significant
     total, all_bad = total[may_differ], all_bad[may_differ]
     count, bad = _interval_sums(bins[:, may_differ]).swapaxes(0, 1)
     outside, bad_outside = total - count, all_bad - bad
     more = bad * np.maximum(outside, 1e-9) > bad_outside * count
-    parted = max_log_likelihood(bad, count) + max_log_likelihood(bad_outside, outside)
+    parted = binomial_log_likelihood(bad, count) + binomial_log_likelihood(bad_outside, outside)
     gain[:, may_differ] = np.where(more, parted - whole[may_differ], 0.0)
     return gain
 
@@ -285,7 +285,7 @@ def _worst(one: CheckTies, size: Array, limit: float, least: float, share: float
         alike = ~near & (np.hypot(*(standard - center)) <= limit)
         together[place] = alike & inside[place]
         found = int(together[place].sum())
-        if found > share * count[place]:  # one outlier is the median itself: it is not counted below
+        if found > share * count[place]:  # the outlier at the median is not counted below
             tail = hypergeometric_tail(found - 1, int(count[place]) - 1, int(alike.sum()) - 1, len(near) - 1)
             chances[0, place] = min(1.0, tail * int(of_place.sum()))
     of_near = (inside & near).astype(np.float64)
@@ -327,11 +327,11 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
     along = along - along.mean(axis=1, keepdims=True)
     scale = (1.0 / here - 1.0 / count)[:, None] * (along**2).mean(axis=1)
 
-    def standardised_squared_means(values: Array) -> Array:
+    def squared_means_over_variances(values: Array) -> Array:
         return np.asarray(((of_near @ values.T / here[:, None]) ** 2 / scale).sum(axis=1))
 
-    found = standardised_squared_means(along)
-    drawn = [standardised_squared_means(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
+    found = squared_means_over_variances(along)
+    drawn = [squared_means_over_variances(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
     return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
 
 

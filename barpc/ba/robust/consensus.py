@@ -120,7 +120,7 @@ def _epipolar_offsets(residual: Array, by_point: Array, first: IntArray, second:
     offset = np.empty(len(first))
     for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
-        rays = cross(one[0], one[1]), cross(two[0], two[1])  # a shift along one ray: seen in the other image
+        rays = cross(one[0], one[1]), cross(two[0], two[1])  # a shift of the point along a ray does not move its image
         of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
         normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
         four = np.concatenate([residual.take(first[part], axis=1), residual.take(second[part], axis=1)])
@@ -140,7 +140,7 @@ def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> Bool
     planes = np.linalg.solve(matrices[good], offset[triples[good]][..., None])[..., 0]
     flat = np.column_stack([offset[triples[:, 0]], np.zeros((TRIALS, 2))])
     planes = np.concatenate([flat, planes])
-    spread = 2.0 * OUTLIER * spread  # drift and relief deviate from a plane
+    spread = 2.0 * OUTLIER * spread  # tolerance: drift and relief deviate from a plane
     near = np.abs(planes @ design - offset) < spread
     best: BoolArray = near[int(near.sum(axis=1).argmax())]
     for _ in range(STEPS):

@@ -133,7 +133,7 @@ class Rounds:
         self.state, self.residual, self.counted, self.noise, self.projected = self._sampled(start) or _robust(
             start, self.observations, given, self.use, self.smooth
         )
-        # outliers count here: the misfit reduces the weight of a view with many
+        # outliers are included: they raise the misfit, which reduces the weight of their view
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:

@@ -49,7 +49,7 @@ class Observations:
         self.is_tie = is_tie
         self.told = told  # (N,) information of the tie points of each view in an earlier block [1/px^2]
         waves = problem.cameras.unknowns.waves
-        # number of parts of an image, between knots of splines, with independent common errors of neighbours
+        # number of parts of an image between spline knots: the common error of neighbours is another one in each
         self.stretches = 1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
