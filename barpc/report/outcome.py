@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
+from barpc.ba.evidence.scan import CheckTies, ImageRegion, worst_regions
 from barpc.ba.interior import Calibration
 from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
 from barpc.base.options import RunOptions
@@ -204,9 +204,9 @@ class Run:
         # of a track's coordinates three go into its point
         free = np.maximum(2.0 * seen - 3.0, 1.0) / np.maximum(seen, 1)
         deviation = noise[tracks.view[rows]] * tracks.sigma[rows] * np.sqrt(free)
-        unused = Unused(tracks.view[rows], tracks.xy[rows].T, found.residuals[rows].T, deviation)
+        unused = CheckTies(tracks.view[rows], tracks.xy[rows].T, found.residuals[rows].T, deviation)
         size = np.array([view.size for view in self.views], dtype=np.float64).T
-        return met_worse(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)
+        return worst_regions(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)
 
     @cached_property
     def beside(self) -> dict[int, int]:

@@ -227,7 +227,7 @@ def test_ties_that_the_others_do_not_explain_lie_anywhere_in_their_images(monkey
         return None if rows is None else (SimpleNamespace(tracks=rows), "state")
 
     def fitted(linear: Any) -> Any:
-        assert linear.area == linear.image == pytest.approx(5e4)
+        assert linear.area == linear.image_area == pytest.approx(5e4)
         return SimpleNamespace(evidence=50.0)
 
     monkeypatch.setattr(foreign_camera, "linearised_among", looked)

@@ -121,11 +121,11 @@ def test_the_prior_is_of_differences_alone() -> None:
 def test_the_score_is_that_of_every_place_by_itself() -> None:
     seen = residuals_of(step(0.5, 1, 0.4, 1.0, axis=0), tracks=60)
     col, gain = score(seen)
-    linear, left = seen.linear, seen.linear.left(seen.base.step)
+    linear, left = seen.linear, seen.linear.residual_after(seen.base.step)
     for n in (0, len(col) // 3, len(col) // 2, len(col) - 1):
         pull, known = np.zeros(2), np.eye(2)
         for tracks in linear.tracks:
-            for rows, follow in zip(tracks.rows, tracks.follow[:, :3], strict=True):
+            for rows, follow in zip(tracks.rows, tracks.point_bases[:, :3], strict=True):
                 settled = np.eye(2 * len(rows)) - follow.T @ follow  # the ground point taken off
                 off = settled @ left[:, rows].T.ravel()
                 beyond = np.kron(((seen.place[0, rows] > col[n]) / linear.sigma[rows])[:, None], np.eye(2))

@@ -18,7 +18,7 @@ from barpc.ba.robust.heldout import (
     is_better,
     keep_out,
     measure,
-    scatter,
+    noise_ratios,
     split_points,
     splitmix64,
 )
@@ -256,7 +256,7 @@ def test_wrong_matches_do_not_change_how_right_ones_scatter(freedom: float, wron
         squared = 9.0 * rng.chisquare(freedom, 400) / freedom  # three times as large as stated
         far = rng.uniform(size=400) < wrong
         squared[far] = (200.0 * rng.uniform(size=far.sum()) ** (1.0 / freedom)) ** 2
-        found += scatter(squared, np.full(400, freedom), np.zeros(400, dtype=int)).tolist()
+        found += noise_ratios(squared, np.full(400, freedom), np.zeros(400, dtype=int)).tolist()
     assert np.mean(found) == pytest.approx(3.0, rel=0.05)
     assert np.std(found) < 0.3
 
@@ -265,10 +265,10 @@ def test_errors_that_half_of_the_ties_share_are_no_wrong_matches() -> None:
     rng = np.random.default_rng(9)
     squared = (rng.normal(size=400) + np.repeat([0.0, 2.5], 200)) ** 2
     none, view = np.zeros(20), np.repeat([0, 1], [400, 20])
-    of_ties, of_nothing = scatter(np.append(squared, none), np.ones(420), view)  # views do not tell of each other
+    of_ties, of_nothing = noise_ratios(np.append(squared, none), np.ones(420), view)  # views do not tell of each other
     assert of_ties > 1.6
     assert of_nothing < 1e-5
-    assert of_ties == scatter(squared, np.ones(400), view[:400])[0]
+    assert of_ties == noise_ratios(squared, np.ones(400), view[:400])[0]
 
 
 def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
@@ -297,7 +297,7 @@ def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
                 break
         expected.append(np.sqrt(variance))
     order = np.lexsort((rng.random(len(view)), view))
-    np.testing.assert_allclose(scatter(squared[order], freedom[order], view[order]), expected, rtol=1e-9)
+    np.testing.assert_allclose(noise_ratios(squared[order], freedom[order], view[order]), expected, rtol=1e-9)
 
 
 def test_known_points_are_where_they_project_and_where_rays_meet() -> None:

@@ -11,7 +11,7 @@ import pytest
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.evidence import linearised, mixture
 from barpc.ba.evidence.linearised import Linear, TrackGroup, linearise
-from barpc.ba.evidence.mixture import MixtureFit, fit_mixture, log_likelihoods, off_from_right
+from barpc.ba.evidence.mixture import MixtureFit, fit_mixture, log_likelihoods, residuals_from_inliers
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import SLIGHT
@@ -39,7 +39,7 @@ def projector(tracks: TrackGroup) -> Array:
     """What takes away what the ground point follows (T, 2n, 2n), all views right."""
     weight = np.zeros((len(tracks.rows), len(tracks.subsets)))
     weight[:, 0] = 1.0
-    return tracks.weight(weight)
+    return tracks.projectors(weight)
 
 
 def test_all_views_or_all_but_one_may_be_right_and_two_at_least() -> None:
@@ -68,17 +68,17 @@ def test_a_track_s_likelihood_is_the_integral_over_its_ground_point(linear: Line
     residual = linear.residual * 0.0
     residual[:, tracks.rows[0]] = rng.normal(size=(2, n))
     r = residual[:, tracks.rows[0]].T.ravel()
-    found, subsets = mixture._expect(linear, residual, noise, eps), linear.subsets
+    found, subsets = mixture._track_posteriors(linear, residual, noise, eps), linear.subsets
     at = len(subsets.views) - len(tracks.rows)  # the first of the last group
     full = projector(tracks)[0]
     # what is left over of the identity is the space that the point spans
     ground = np.linalg.svd(np.eye(2 * n) - full)[0][:, :3] * 1e4
     marginal = multivariate_normal(np.zeros(2 * n), noise**2 * np.eye(2 * n) + ground @ ground.T).logpdf(r)
     flat = marginal + 0.5 * np.linalg.slogdet(2.0 * np.pi * (ground.T @ ground))[1]
-    expected = flat + tracks.volume[0, 0] + np.log1p(-eps)[tracks.view[0]].sum()
+    expected = flat + tracks.log_volume[0, 0] + np.log1p(-eps)[tracks.view[0]].sum()
     square = r @ full @ r
     said = (
-        np.log1p(-eps)[tracks.view[0]].sum() + tracks.volume[0, 0] - square / (2 * noise**2)
+        np.log1p(-eps)[tracks.view[0]].sum() + tracks.log_volume[0, 0] - square / (2 * noise**2)
         - 0.5 * (2 * n - 3) * np.log(2 * np.pi * noise**2)
     )  # fmt: skip
     assert said == pytest.approx(expected, abs=1e-4)
@@ -128,7 +128,7 @@ def test_what_was_put_in_comes_out_warm_or_cold(linear: Linear) -> None:
 
 def test_a_track_s_likelihood_falls_where_it_is_displaced(linear: Linear) -> None:
     found = fit_mixture(linear)
-    left = linear.left(found.step)
+    left = linear.residual_after(found.step)
     away = left.copy()
     away[:, linear.view == 0] += 20.0
     change = log_likelihoods(linear, away, found) - log_likelihoods(linear, left, found)
@@ -146,9 +146,9 @@ def test_what_is_wrong_is_seen_from_where_the_right_ones_put_the_point(linear: L
     """Noise of one standard deviation, of right and wrong ones alike, and an offset that only the others can tell."""
     rng = np.random.default_rng(3)
     noise = rng.normal(size=linear.residual.shape)
-    wrong = linear.taking_part & (linear.view == 1)
+    wrong = linear.in_tracks & (linear.view == 1)
     right = (~wrong).astype(np.float64)
-    off, known = off_from_right(linear, noise, right)
+    off, known = residuals_from_inliers(linear, noise, right)
     tracks = {tracks.rows.shape[1]: tracks for tracks in linear.tracks}
     pairs, triples = tracks[2].rows, tracks[3].rows
     assert not known[pairs].any()  # one other does not tell a point
@@ -157,17 +157,17 @@ def test_what_is_wrong_is_seen_from_where_the_right_ones_put_the_point(linear: L
     of_wrong = triples[tracks[3].view == 1]
     assert off[:, of_wrong].std() == pytest.approx(1.0, abs=0.12)
     moved = noise + 8.0 * wrong
-    seen, _ = off_from_right(linear, moved, right)
+    seen, _ = residuals_from_inliers(linear, moved, right)
     assert np.median((seen - off)[:, of_wrong]) > 5.0
     others = triples[tracks[3].view != 1]
     np.testing.assert_allclose(seen[:, others], off[:, others], atol=1e-3)  # nothing of it is theirs
-    all_alike, _ = off_from_right(linear, moved, np.ones_like(right))
+    all_alike, _ = residuals_from_inliers(linear, moved, np.ones_like(right))
     assert np.median(np.abs(all_alike - off)[:, others]) > 1.0
     with_point = linear.tracks[-1]
     project = projector(with_point)  # with all of them right: what the mixture takes away
     left = (project @ noise.T[with_point.rows].reshape(len(project), -1, 1))[..., 0]
     spread = np.sqrt(np.maximum(np.diagonal(project, axis1=1, axis2=2), 0.1))
-    whole, _ = off_from_right(linear, noise, np.ones_like(right))
+    whole, _ = residuals_from_inliers(linear, noise, np.ones_like(right))
     np.testing.assert_allclose(whole.T[with_point.rows].reshape(left.shape), left / spread, atol=1e-4)
 
 
@@ -175,8 +175,8 @@ def test_what_is_wrong_is_seen_from_where_the_right_ones_put_the_point(linear: L
 def test_the_evidence_is_of_the_curvature_at_the_end(linear: Linear, monkeypatch, most: int) -> None:
     """However many iterations: the last sum is that of the last expectations, and few are summed in all."""
     seen, summed = [], []
-    expected, curvature = mixture.Mixture._expected, mixture.Mixture._curvature
-    monkeypatch.setattr(mixture.Mixture, "_expected", lambda self: seen.append(expected(self)) or seen[-1])
+    expected, curvature = mixture.Mixture._expectations, mixture.Mixture._curvature
+    monkeypatch.setattr(mixture.Mixture, "_expectations", lambda self: seen.append(expected(self)) or seen[-1])
     monkeypatch.setattr(
         mixture.Mixture,
         "_curvature",
@@ -200,7 +200,7 @@ def test_noise_that_falls_does_not_stand(linear: Linear) -> None:
     one = mixture.Mixture(linear, None, None, None)
     one.cooled, noises, stands = mixture.COOLED, [one.noise], list[bool]()
     for _ in range(30):
-        stands.append(one._update_noise(one._expected(), 0.0))
+        stands.append(one._update_noise(one._expectations(), 0.0))
         noises.append(one.noise)
     falls = np.array(noises[1:]) / noises[:-1]
     assert falls[0] == pytest.approx(mixture.COOLED)
@@ -221,13 +221,13 @@ def test_a_first_guess_has_the_least_sum_of_distances(linear: Linear, wrong: int
     new[0, 0] = new[1, 1] = (linear.view == 1) & (np.arange(len(linear.view)) % 2 == 0)
     base = replace(base, extra=np.array([0.2]))
     precision = np.array([7.0, 0.5, 0.25])
-    left = moved.left(base.step) + old[:, 0] * 0.2 / linear.sigma
+    left = moved.residual_after(base.step) + old[:, 0] * 0.2 / linear.sigma
     parts = []
     for tracks in linear.tracks:
         project = projector(tracks)
         for k in np.flatnonzero((tracks.view == wrong).any(axis=1) & (tracks.rows.shape[1] > 2)):
             subset = (tracks.subsets == (tracks.view[k] != wrong)).all(axis=1)
-            project[k] = tracks.weight(np.tile(subset.astype(float), (len(tracks.rows), 1)))[k]
+            project[k] = tracks.projectors(np.tile(subset.astype(float), (len(tracks.rows), 1)))[k]
         for row, one in zip(tracks.rows, project, strict=True):
             columns = (new / linear.sigma)[:, :, row].transpose(2, 0, 1).reshape(-1, 2)
             if columns.any():
@@ -268,7 +268,7 @@ def test_a_wrong_match_lies_in_an_image_or_along_an_epipolar_line() -> None:
     far = max(np.quantile(np.hypot(*left), 0.99), 5.0)
     for span in (800.0, 0.5):
         found = linearise(problem, state, block.use, block.sigma, span)
-        assert found.image == pytest.approx(image, rel=1e-3)
+        assert found.image_area == pytest.approx(image, rel=1e-3)
         assert found.area == pytest.approx(2 * far * max(2 * far, np.median(shifts) * max(span, 1.0)), rel=1e-3)
         assert found.choices == 4
         np.testing.assert_allclose(found.precision, problem.camera_prior.sigma.ravel() ** -2.0)
@@ -285,5 +285,5 @@ def test_a_track_moves_by_the_share_of_what_is_right_of_it_that_moves() -> None:
     nothing, stands = np.zeros(3), np.array([0.4, 0.2, 0.3, 0.0, 0.0, 0.0])
     moves = np.array([0.05, 0.05, 0.0, 0.0, 0.2, 0.0])
     subsets = SimpleNamespace(begins=(nothing, np.array([0, 2, 4])))
-    gone = mixture._Expected(nothing, nothing, [stands, moves], []).moved(subsets)
+    gone = mixture._TrackPosteriors(nothing, nothing, [stands, moves], []).moved(subsets)
     np.testing.assert_allclose(gone, [0.1 / 0.7, 0.0, 1.0])

@@ -94,7 +94,7 @@ def test_the_spectrum_is_half_of_what_least_squares_take_away() -> None:
     row = rng.integers(0, 150, n) * 8.0 + 1.0
     right, off = rng.uniform(0.3, 1.0, n), rng.normal(size=(2, n)) * [[1.0], [2.0]]
     off[1] += 0.5 * off[0] + 0.8 * np.sin(row / 30.0)
-    one = periods._Rows(row, rows, right, off)
+    one = periods._Periodogram(row, rows, right, off)
     found = one._spectrum(off)
     assert len(found) == 150  # of 37.5 waves
     centred = off - (off @ right / right.sum())[:, None]
@@ -116,6 +116,6 @@ def test_the_level_beside_a_peak_is_one_of_noise_and_more_where_rows_wander() ->
     swing = np.sin(2.0 * np.pi * row / period)
     walk = np.interp(row, np.linspace(0.0, rows, 400), np.cumsum(rng.normal(size=400)))
     for size, wander, least, most in ((0.0, 0.0, 1.0, 1.3), (3.0, 0.0, 1.0, 1.3), (3.0, 0.3, 2.0, 40.0)):
-        one = periods._Rows(row, rows, right, noise + size * swing + wander * walk)
+        one = periods._Periodogram(row, rows, right, noise + size * swing + wander * walk)
         k = int(np.argmin(np.abs(one.cycles - rows / period)))
         assert least <= one._level(k, period) < most

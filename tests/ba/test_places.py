@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from barpc.ba.evidence import scan
-from barpc.ba.evidence.scan import ImageRegion, Unused, met_worse
+from barpc.ba.evidence.scan import CheckTies, ImageRegion, worst_regions
 from barpc.base.statistics import CHANCE
 from tests.distributions import hypergeom
 from tests.lanes import diagonal
@@ -16,7 +16,7 @@ NOISE = 0.1
 LIMITS = 4.0, 0.06, 0.3  # far off [standard deviations], what may be shared [px], what may be far off [share]
 
 
-def observed(seed: int, each: int, wrong: float, images: int = 1) -> tuple[Unused, np.random.Generator]:
+def observed(seed: int, each: int, wrong: float, images: int = 1) -> tuple[CheckTies, np.random.Generator]:
     """Observations of images seen in many: noise, and wrong ones anywhere within 15 px."""
     rng = np.random.default_rng(seed)
     view = np.repeat(np.arange(images), each)
@@ -24,11 +24,11 @@ def observed(seed: int, each: int, wrong: float, images: int = 1) -> tuple[Unuse
     residual = rng.normal(0, NOISE, (2, len(view)))
     bad = rng.random(len(view)) < wrong
     residual[:, bad] += rng.uniform(-15, 15, (2, bad.sum()))
-    return Unused(view, xy, residual, np.full(len(view), np.sqrt(2) * NOISE)), rng
+    return CheckTies(view, xy, residual, np.full(len(view), np.sqrt(2) * NOISE)), rng
 
 
-def worst(unused: Unused) -> list[ImageRegion]:
-    return met_worse(unused, SIZE[:, : unused.view.max() + 1], *LIMITS)
+def worst(unused: CheckTies) -> list[ImageRegion]:
+    return worst_regions(unused, SIZE[:, : unused.view.max() + 1], *LIMITS)
 
 
 @pytest.mark.few(2)
@@ -90,7 +90,7 @@ def test_of_two_views_residuals_on_a_line_are_tested_along_it(turned: float) -> 
             along = rng.normal(0, NOISE * np.sqrt(0.5), 300) + move * (xy[1] < 1500.0)
             along[rng.random(300) < 0.05] += 9.0
             residual = along * np.array([np.cos(angle), np.sin(angle)])
-            unused = Unused(np.zeros(300, dtype=np.int64), xy, residual, np.full(300, NOISE * np.sqrt(0.5)))
+            unused = CheckTies(np.zeros(300, dtype=np.int64), xy, residual, np.full(300, NOISE * np.sqrt(0.5)))
             assert bool(worst(unused)) == told
 
 
@@ -145,11 +145,11 @@ def test_images_of_twenty_observations_are_among_those_that_a_place_is_chosen_fr
 def test_few_observations_and_exact_ones_say_nothing_wrong() -> None:
     assert worst(observed(1, 19, 0.0)[0]) == []
     unused, _ = observed(1, 300, 0.0)
-    exact = Unused(unused.view, unused.xy, np.zeros((2, 300)), np.full(300, 1e-6))
+    exact = CheckTies(unused.view, unused.xy, np.zeros((2, 300)), np.full(300, 1e-6))
     assert worst(exact) == []
-    far = Unused(unused.view, unused.xy, unused.residual + 50.0, unused.deviation)  # nothing is near: no place is worse
+    far = CheckTies(unused.view, unused.xy, unused.residual + 50.0, unused.deviation)  # nothing is near
     assert worst(far) == []
-    outside = Unused(unused.view, unused.xy - 3e4, unused.residual, unused.deviation)
+    outside = CheckTies(unused.view, unused.xy - 3e4, unused.residual, unused.deviation)
     assert worst(outside) == []
 
 
@@ -175,7 +175,7 @@ def test_a_place_has_the_chance_of_as_many_alike_times_the_tests() -> None:
     alike = np.append(inside[::2], elsewhere[:20])
     residual[:, alike] += [[3.0], [2.0]]
     residual[:, inside[1:7:2]] += rng.uniform(5.0, 15.0, (2, 3))  # far off, each by itself
-    (one,) = worst(Unused(np.zeros(400, dtype=int), xy, residual, deviation))
+    (one,) = worst(CheckTies(np.zeros(400, dtype=int), xy, residual, deviation))
     assert (one.columns, one.rows) == (None, (0.0, SIZE[1, 0] / 8))
     among = len(inside[::2])
     assert one.far == pytest.approx(among / len(inside))
@@ -195,7 +195,7 @@ def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
 
 def test_a_small_part_of_an_image_has_one_observation_the_first() -> None:
     xy = np.array([[0.0, 31.0, 40.0, 1600.0, 20.0, 1599.9], [0.0, 31.0, 10.0, 3200.0, 150.0, 3199.0]])
-    unused = Unused(np.zeros(6, dtype=int), xy, xy, np.arange(6.0))
+    unused = CheckTies(np.zeros(6, dtype=int), xy, xy, np.arange(6.0))
     found = scan._thinned(unused, np.array([1600.0, 3200.0]))  # parts of 50 by 100
     assert sorted(found.deviation.tolist()) == [0.0, 3.0, 4.0]
 

@@ -76,7 +76,7 @@ def told(smooth: Smooth, residual: np.ndarray) -> tuple[bool, float, float]:
 def without(smooth: Smooth) -> Smooth:
     """The same that knows nothing of resemblance."""
     bare = object.__new__(Smooth)
-    bare.__dict__.update(smooth.__dict__, alike=None)
+    bare.__dict__.update(smooth.__dict__, noise=None)
     return bare
 
 
@@ -138,7 +138,7 @@ def test_what_points_have_in_common_is_what_their_templates_cover_together(view)
     rng = np.random.default_rng(1)
     reference, _, _ = registered(view, 11, 1.0, rng)
     smooth = smooth_of(view, reference)
-    alike = smooth.alike
+    alike = smooth.noise
     assert alike is not None
     n = len(reference.points.names)
     per_row = int((reference.points.xy[:, 1] == 0).sum())
@@ -148,6 +148,6 @@ def test_what_points_have_in_common_is_what_their_templates_cover_together(view)
     assert alike.correlation(np.array([0]), np.array([n - 1]))[0] == pytest.approx(1.0 / MAX_INDEPENDENT_ERRORS)
     # in the middle of a lattice three templates each way cover a place
     assert 1.0 / alike.share[0] == pytest.approx(9.0 + n / (NUM_TERMS * MAX_INDEPENDENT_ERRORS), rel=0.25)
-    lonely = smooth_of(view, replace(reference, width=0.0)).alike
+    lonely = smooth_of(view, replace(reference, width=0.0)).noise
     assert lonely is not None
     assert 1.0 / lonely.share[0] == pytest.approx(1.0 + n / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))

@@ -372,7 +372,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     assert (first.goes_on, first.is_known, first.noise, first.misfit, first.passes) == (False, False, 1.0, 0.0, 0)
     np.testing.assert_array_equal(first.counted, tied(use & block.use))
     assert first.problem.camera_prior is problem.camera_prior
-    assert first.smooth._tells.all()
+    assert first.smooth._usable.all()
 
 
 @pytest.mark.parametrize("waves", [0.0, 6.0])

@@ -30,8 +30,8 @@ def seen(n: int = 30, views: int = 2, choices: int = 5) -> Residuals:
     part = np.tile((np.arange(n) + 0.5) / n, views)
     place = np.stack([part[::-1] * size[0, view], part * size[1, view]])
     linear: Any = SimpleNamespace(
-        view=view, sigma=np.full(len(view), 0.25), choices=choices, taking_part=np.ones(len(view), dtype=bool),
-        left=lambda step: np.zeros((2, len(view))) + step[0, 0],
+        view=view, sigma=np.full(len(view), 0.25), choices=choices, in_tracks=np.ones(len(view), dtype=bool),
+        residual_after=lambda step: np.zeros((2, len(view))) + step[0, 0],
     )  # fmt: skip
     nothing: Any = None
     base = fitted(len(view))
@@ -242,7 +242,7 @@ def test_a_single_tie_gains_what_its_track_is_likelier_displaced(axis: int) -> N
         rows = rows[np.argsort(s.place[axis, rows])]
         np.testing.assert_array_equal(place, s.place[axis, rows])
         for k in (0, 40, len(rows) - 1):
-            left = s.linear.left(found.step) + others / s.linear.sigma
+            left = s.linear.residual_after(found.step) + others / s.linear.sigma
             before = log_likelihoods(s.linear, left, found)[rows[k]]
             rate = one.where[4]  # type: ignore[index]
             size = np.exp(-max((place[k] - 3000.0) * rate, 0.0)) if rate else 1.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.scan import Unused, met_worse
+from barpc.ba.evidence.scan import CheckTies, worst_regions
 from barpc.base.statistics import CRITICAL
 from barpc.report import Run, summarize
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT
@@ -105,5 +105,5 @@ def test_residuals_are_compared_in_standard_deviations_of_what_their_tracks_leav
     assert set(seen) == {2, 3}
     view, size = tracks.view[rows], np.array([one.size for one in run.views], dtype=np.float64).T
     sigma = found.held_out_noise[view] * tracks.sigma[rows] * np.where(seen == 2, 0.5, 1.0) ** 0.5
-    unused = Unused(view, tracks.xy[rows].T, found.residuals[rows].T, sigma)
-    assert changed.met_worse == met_worse(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)
+    unused = CheckTies(view, tracks.xy[rows].T, found.residuals[rows].T, sigma)
+    assert changed.met_worse == worst_regions(unused, size, CRITICAL, SMOOTH_LEFT, MANY_REJECTED)

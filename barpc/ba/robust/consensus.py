@@ -24,7 +24,7 @@ from barpc.sensor.curve import cross
 
 @dataclass(frozen=True)
 class TwoGroups:
-    """A pair of views whose epipolar offsets have two modes; the pair does not determine which is right."""
+    """A pair of views whose epipolar offsets have two modes. The pair does not determine the right one."""
 
     views: tuple[int, int]  # the pair
     share: float  # part of the matches in the smaller group
@@ -47,7 +47,7 @@ def two_groups(structure: Structure, residual: Array, by_point: Array, use: Bool
         maybe = (cube**2 / square**3 + 1.0) >= 4.0 / 9.0 * fourth / square**2
     for pair in np.flatnonzero(maybe & (count >= MANY)):
         share, apart, gain = two_normals(z[bounds[pair] : bounds[pair + 1]])
-        if share > LEVEL and gain > 3.0 * SURE:  # nats over one group: two are likelier by a factor of three million
+        if share > LEVEL and gain > 3.0 * SURE:  # [nats] a likelihood ratio of three million against one group
             first, second = structure.pair_view[pair].tolist()
             found.append(TwoGroups((first, second), share, apart))
     return tuple(found)
@@ -57,14 +57,14 @@ def two_normals(z: Array) -> tuple[float, float, float]:
     """Fit two normal distributions of equal width to values z (n,), by expectation maximisation.
 
     Returned are the share of the smaller one, the distance of the centres, and the gain of log-likelihood over one
-    normal [nats]. Share and distance are 0 where the centres are less than two standard deviations apart; all is 0
-    where one distribution has all values.
+    normal [nats]. Share and distance are 0 where the centres are less than two standard deviations apart; all
+    three are 0 where one distribution has all values.
     """
     z = z - z.mean()
     whole = float((z**2).mean())
     (low, high), square, part = np.quantile(z, [0.1, 0.9]), 0.25 * whole, 0.5
     for _ in range(ITERATIONS):
-        # of one width: the ratio of their densities is an exponential of a line
+        # of equal width: the log ratio of their densities is linear in z
         second = expit((high - low) * (z - 0.5 * (low + high)) / square - np.log(part / (1.0 - part)))
         part = 1.0 - float(second.mean())
         if not 0.0 < part < 1.0:
@@ -72,14 +72,14 @@ def two_normals(z: Array) -> tuple[float, float, float]:
         high = float(second @ z) / len(z) / (1.0 - part)
         low = -high * (1.0 - part) / part
         rest = whole - part * low**2 - (1.0 - part) * high**2
-        before, square = square, max(rest, np.finfo(float).eps * whole)  # below it is rounding
+        before, square = square, max(rest, np.finfo(float).eps * whole)  # smaller values are rounding errors
         if abs(square - before) < CONVERGED**2 * whole:
             break
     sigma, apart = np.sqrt(square), float(high - low)
     groups = ((part, low), (1.0 - part, high))
     both = np.logaddexp(*(np.log(share) - 0.5 * (z - center) ** 2 / square for share, center in groups))
     gain = float((both + 0.5).sum() + 0.5 * len(z) * np.log(whole / square))
-    if apart < 2.0 * sigma:  # nearer centres make one mode
+    if apart < 2.0 * sigma:  # the density has one mode only
         return 0.0, 0.0, gain
     return min(part, 1.0 - part), apart, gain
 
@@ -87,10 +87,10 @@ def two_normals(z: Array) -> tuple[float, float, float]:
 def agreeing(
     structure: Structure, xy: Array, residual: Array, projected: Projected, sigma: Array, use: BoolArray
 ) -> BoolArray:
-    """Return `use` (K,) without the observations that disagree with the most other observations of their points.
+    """Return the mask `use` (K,) without observations that contradict others of their points.
 
-    Two observations of a point disagree if their epipolar offset is not on the plane of their pair of views. The worst
-    observations of each point are removed repeatedly, until no two observations disagree.
+    Two observations of a point disagree if their epipolar offset is not on the plane of their pair of views. Of each
+    point the observations with the most disagreements are removed, repeatedly, until no two observations disagree.
     `xy` (2, K) are observed col, row; the residuals (2, K) are at approximate points; `sigma` (K,) is stated. All [px].
     """
     first, second = structure.first, structure.second
@@ -116,11 +116,11 @@ def agreeing(
 
 
 def _epipolar_offsets(residual: Array, by_point: Array, first: IntArray, second: IntArray) -> Array:
-    """Return the epipolar offsets (Q,) [px] of pairs of observations: they do not depend on the ground point."""
+    """Return the epipolar offsets (Q,) [px] of pairs of observations. They do not depend on the ground point."""
     offset = np.empty(len(first))
     for part in parts(len(first)):
         one, two = by_point.take(first[part], axis=2), by_point.take(second[part], axis=2)
-        rays = cross(one[0], one[1]), cross(two[0], two[1])  # a point moved along one ray moves only in the other image
+        rays = cross(one[0], one[1]), cross(two[0], two[1])  # a shift of the point along a ray does not move its image
         of_first, of_second = (one * rays[1]).sum(axis=1), (two * rays[0]).sum(axis=1)
         normal = np.stack([of_first[1], -of_first[0], of_second[1], -of_second[0]])
         four = np.concatenate([residual.take(first[part], axis=1), residual.take(second[part], axis=1)])
@@ -140,7 +140,7 @@ def _on_one_plane(place: Array, offset: Array, spread: Array, seed: int) -> Bool
     planes = np.linalg.solve(matrices[good], offset[triples[good]][..., None])[..., 0]
     flat = np.column_stack([offset[triples[:, 0]], np.zeros((TRIALS, 2))])
     planes = np.concatenate([flat, planes])
-    spread = 2.0 * OUTLIER * spread  # a plane cannot follow all of a drift and of relief
+    spread = 2.0 * OUTLIER * spread  # tolerance: drift and relief deviate from a plane
     near = np.abs(planes @ design - offset) < spread
     best: BoolArray = near[int(near.sum(axis=1).argmax())]
     for _ in range(STEPS):

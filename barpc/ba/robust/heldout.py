@@ -25,8 +25,8 @@ from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.geometry import triangulate
 
-_CHECK_SHARE = 0.1
-_STEPS_PER_PIXEL = 4.0  # coordinates are rounded to quarters of a pixel: changes of their last digits alter few draws
+_CHECK_SHARE = 0.1  # of all tracks
+_STEPS_PER_PIXEL = 4.0  # of coordinates rounded for the hash: changes of their last digits alter few draws
 _MIN_VARIANCE = float(np.finfo(np.float64).tiny)  # reached if all residuals are zero
 
 
@@ -35,23 +35,24 @@ class HeldOut:
     """Residuals of check tie points, and the noise of each view estimated from them."""
 
     residual: Array  # (2, H) projected - observed [px]; the points are triangulated by the cameras
-    index: IntArray  # (Q,) numbers of their points
-    points: Array  # (Q, 3) these points, ECEF [m]
+    index: IntArray  # (Q,) point numbers of the check tie points
+    points: Array  # (Q, 3) the triangulated points, ECEF [m]
     noise: Array  # (N,) observed over stated standard deviation in each view; NaN with too few observations
     rms: Array  # (N,) expected RMS residual of right matches with this noise [px]
 
     @property
     def error(self) -> float:
-        """Root mean square of `noise` over the views; NaN if it is known for no view."""
-        return _mean_square(self.noise)
+        """Root mean square of `noise` over the views, without a unit; NaN if it is known for no view."""
+        return _finite_rms(self.noise)
 
     @property
     def whole_rms(self) -> float:
         """Root mean square of `rms` over the views [px]; NaN if it is known for no view."""
-        return _mean_square(self.rms)
+        return _finite_rms(self.rms)
 
 
-def _mean_square(values: Array) -> float:
+def _finite_rms(values: Array) -> float:
+    """Return the root mean square of the finite values (n,); NaN if none is finite."""
     known = values[np.isfinite(values)]
     return float(np.sqrt((known**2).mean())) if len(known) else np.nan
 
@@ -80,10 +81,10 @@ def splitmix64(numbers: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
     return numbers ^ (numbers >> np.uint64(31))
 
 
-def seen_in(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
-    """Return the problem with only the observations of `block`, and the triangulated points (Q, 3) of `block`.
+def problem_of_block(problem: Problem, params: Array, block: Block) -> tuple[Problem, Array]:
+    """Return the problem with the observations of `block` alone, and the points (Q, 3) triangulated from these.
 
-    The points are triangulated by cameras with unknowns (N, q). They have no prior.
+    `params` (N, q) are the unknowns of the cameras. The points have no prior.
     """
     index, structure = block.own_points
     cameras = problem.cameras.seeing(block.xy)
@@ -99,9 +100,9 @@ def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -
     the points `first`.
     """
     xy, counted = problem.xy, np.ones(len(sigma))
-    projected = problem.project_points(params, first)  # close to the solution: the projection is linear from here
+    projected = problem.project_points(params, first)  # `first` is near the solution, where the projection is linear
     points = problem.triangulate(first, projected, 1.0 / sigma)
-    for _ in range(STEPS):  # the loss can reject one of three views
+    for _ in range(STEPS):  # enough to reject one of three observations
         residual = projected.image - xy
         residual += (projected.by_point * problem.structure.of_points(points - first)).sum(axis=1)
         counted = geman_mcclure((residual**2).sum(axis=0) / (CRITICAL * sigma) ** 2)[1]
@@ -110,13 +111,13 @@ def robust_points(problem: Problem, params: Array, first: Array, sigma: Array) -
 
 
 def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
-    """Measure the check tie points of `block` by cameras with unknowns (N, q)."""
+    """Measure the residuals and the noise of the check tie points of `block` by cameras with unknowns (N, q)."""
     views = len(block.views)
     if not len(block.view):
         unknown = np.full(views, np.nan)
         return HeldOut(np.zeros((2, 0)), block.point, np.zeros((0, 3)), unknown, unknown)
     index = block.own_points[0]
-    part, first = seen_in(problem, params, block)
+    part, first = problem_of_block(problem, params, block)
     observations = Observations(part, block.sigma, 0.0, np.ones(len(block.view), dtype=bool))
     points, counted = robust_points(part, params, first, block.sigma)
     residual = part.residuals(params, points)
@@ -126,12 +127,12 @@ def measure(problem: Problem, params: Array, block: Block) -> HeldOut:
     many = count >= FEWEST
     many_rows = many[block.view]
     number = (np.cumsum(many) - 1)[block.view[many_rows]]
-    noise[many] = scatter(squared[many_rows], expected[many_rows] / block.sigma[many_rows] ** 2, number)
+    noise[many] = noise_ratios(squared[many_rows], expected[many_rows] / block.sigma[many_rows] ** 2, number)
     rms = noise * np.sqrt(np.bincount(block.view, expected, views) / np.maximum(count, 1))
     return HeldOut(residual, index, points, noise, rms)
 
 
-def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
+def noise_ratios(squared: Array, freedom: Array, view: IntArray) -> Array:
     """Return the observed over stated standard deviation (N,) of right matches in each view.
 
     Up to half of the matches may be wrong. Squared residuals of right matches are chi-square distributed; residuals of
@@ -142,7 +143,7 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     Parameters
     ----------
     squared : (K,)
-        Squared residuals over their expectation under the stated standard deviations.
+        Squared residuals, divided by their expectations from the stated standard deviations.
     freedom : (K,)
         Degrees of freedom of each observation.
     view : (K,)
@@ -156,10 +157,8 @@ def scatter(squared: Array, freedom: Array, view: IntArray) -> Array:
     low = ordered[starts + np.floor(at).astype(np.int64)]
     middle = low + (at % 1.0) * (ordered[starts + np.ceil(at).astype(np.int64)] - low)
     far = np.maximum(ordered[starts + count.astype(np.int64) - 1], _MIN_VARIANCE)
-    variance, wrong = (
-        np.maximum(middle / BEST, _MIN_VARIANCE),
-        np.full(len(count), WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1]),
-    )
+    variance = np.maximum(middle / BEST, _MIN_VARIANCE)
+    wrong = np.full(len(count), WRONG_SHARE_PRIOR[0] / WRONG_SHARE_PRIOR[1])
     log_far, constant = half * np.log(half * far[view]) - gammaln(half + 1.0), half * squared
     moves = np.ones(len(count), dtype=bool)  # views that have not converged
     for _ in range(ITERATIONS):

@@ -39,15 +39,15 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_SMOOTH_SEEN = 0.3  # RMS, in sigmas, above which smooth parts and points are estimated in turns
-_MIN_NOISE_RATIO = 0.5  # least noise of the robust steps, over the stated standard deviations
+_SMOOTH_SEEN = 0.3  # RMS of smooth parts [sigmas] above which they and the points are estimated alternately
+_MIN_NOISE_RATIO = 0.5  # least noise in the robust steps, observed over stated standard deviation
 _MANY_REJECTED = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
 _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(Minimum):
-    """The result of the passes: the last minimum, its observations and residuals."""
+    """Result of `Rounds`: the last minimum, its observations and residuals."""
 
     problem: Problem  # with the final priors on the points
     residual: Array  # (2, K) projected - observed [px]
@@ -58,18 +58,18 @@ class Outcome(Minimum):
     told: Array  # (N,) information of the tie points of each view: sum of their squared weights [1/px^2]
     prior: PriorTest  # comparison of the corrections with the given priors, and the estimated priors
     smooth: SmoothTest  # of the final residuals
-    by_point: Array  # (2, 3, K) derivatives of the image points by the points at the end [px/m]
-    # cache: noise floor [px] -> significant intervals of the images
+    by_point: Array  # (2, 3, K) derivatives of the image points by the final ground points [px/m]
+    # cache of `select.anomalies.standing_out`: noise floor [px] -> significant intervals of the images
     standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:
-    """Robust steps, rejection and the final least squares, from the observations `use` (K,).
+    """Robust steps, rejection and the final least squares, from observations `use` (K,) and a start `state`.
 
-    Observations are rejected by their residuals without the smooth part of their view: a systematic error of a camera
-    does not make its tie points wrong. `known` is the outcome of an adjustment with fewer unknowns. If it is given, the
-    passes start from its inliers, without robust steps. These would reject observations that the added unknowns
-    explain.
+    `heights` are the constraints on points. Observations are rejected by their residuals without the smooth part of
+    their view, because a systematic error of a camera is no error of tie points. `known` is the outcome of an
+    adjustment with fewer unknowns. If it is given, the passes start from its inliers, without robust steps. Robust
+    steps would reject observations that only the added unknowns explain.
     """
 
     def __init__(
@@ -92,15 +92,15 @@ class Rounds:
         earlier = problem.joint_prior
         told = 0.0 if earlier is None else earlier.told
         self.observations = Observations(self.problem, sigma, options.noise_floor, is_tie, of_reference, told)
-        # joint prior of an earlier block, and the observations that are in it
+        # joint prior of an earlier block, and the mask of the observations in that block
         self.earlier, self.again = (None if block.known is None else earlier), block.known
-        alike = NoiseCorrelation.of(block)
-        self.smooth = Smooth(problem.structure, problem.xy, unknowns, alike, tells=downweighted == 1.0)
+        noise = NoiseCorrelation.of(block)
+        self.smooth = Smooth(problem.structure, problem.xy, unknowns, noise, usable=downweighted == 1.0)
         given, control = problem.camera_prior, heights.has_control
         shown = None if earlier is None else earlier.shown
         self.variances = Variances.of(given, unknowns, options, control, block.views, shown, heights.widest)
         self.learnt: PriorTest | None = None  # test by which the present priors were estimated
-        # the known outcome has the same unknowns: its inliers, priors and misfit are kept
+        # `known` has the same unknowns: its inliers, priors and misfit are kept
         self.goes_on = known is not None and known.problem.cameras.unknowns is unknowns
         if known is not None and self.goes_on:
             self.problem, use = (replace(self.problem, camera_prior=known.problem.camera_prior), use & known.inlier)
@@ -133,7 +133,7 @@ class Rounds:
         self.state, self.residual, self.counted, self.noise, self.projected = self._sampled(start) or _robust(
             start, self.observations, given, self.use, self.smooth
         )
-        # include the observations that will be rejected: they reduce the weight of a view with many outliers
+        # outliers are included: they raise the misfit, which reduces the weight of their view
         self.misfit = self.smooth.test(self.residual, self.use).misfit()
 
     def _sampled(self, start: Problem) -> tuple[State, Array, Array, float, Projected | None] | None:
@@ -145,7 +145,7 @@ class Rounds:
         estimated from so few observations.
         """
         structure, use = start.structure, self.use
-        if structure.num_views < _SAMPLED_VIEWS or self.smooth.alike is not None or start.joint_prior is not None:
+        if structure.num_views < _SAMPLED_VIEWS or self.smooth.noise is not None or start.joint_prior is not None:
             return None
         drawn = np.random.default_rng(0).permutation(structure.num_points)[structure.point]
         order = np.lexsort((drawn, ~use, structure.view))
@@ -213,7 +213,7 @@ class Rounds:
                 told=self.observations.tie_information(self.use / (self.observations.sigma * self.noise)),
                 prior=tested,
                 smooth=smooth,
-                by_point=self._by_points().by_point.copy(),  # the next projection overwrites it
+                by_point=self._projection().by_point.copy(),  # the next projection overwrites it
             )
         self.problem, self.learnt = replace(self.problem, camera_prior=prior), tested
         return None
@@ -256,22 +256,22 @@ class Rounds:
         self.misfit = tested.misfit()
         return tested
 
-    def _by_points(self) -> Projected:
+    def _projection(self) -> Projected:
         """Return the projection of the state, with derivatives by the points."""
         return self.projected or self.problem.project_points(self.state.params, self.state.points)
 
     def _scatter(self, fit: SmoothFit | None = None) -> Array:
-        """Return the residuals (2, K) [px] without the smooth parts of all views.
+        """Return the residuals (2, K) [px] without the smooth part of each view.
 
-        A smooth error of one view also moves the points, and so the residuals of the other views. Smooth parts that are
-        not small are therefore estimated in turns with the points (backfitting).
+        A smooth error of one view moves the points, and so changes the residuals of the other views. Smooth parts that
+        are not small are therefore estimated alternately with the points (backfitting).
         """
         residual, counted, sigma = self.residual, self.counted, self.observations.sigma
         part = self.smooth.part(residual, counted, fit)
         size = float(np.sqrt((counted * (part / sigma) ** 2).sum() / max(counted.sum(), 1.0)))
         if size < _SMOOTH_SEEN:
             return residual - part
-        settled = self.problem.projected_off_points(self._by_points(), counted**0.5 / sigma)
+        settled = self.problem.projected_off_points(self._projection(), counted**0.5 / sigma)
         for _ in range(BACKFITTING):
             part += self.smooth.part(settled(residual - part), counted)
         return settled(residual - part)
@@ -280,9 +280,9 @@ class Rounds:
 def downweighting(block: Block, heights: PointConstraints) -> Array:
     """Return the factors (P,) on the standard deviations of the observations of each point.
 
-    The factor is `GROSS` for unused control points, else 1. The total weight of the tie points of a view is limited.
-    Without the factor, many unused points with the same marking error would therefore move the view. Points in an image
-    without tie points keep their weight: they alone connect the image.
+    The factor is `GROSS` for unused control points, else 1. The total weight of the tie points of a view is limited,
+    that of unused control points is not: with factor 1, their common marking error would move the view. In an image
+    without tie points the factor is 1, because these points alone connect the image.
     """
     alone = np.bincount(block.view[block.point < block.num_tracks], minlength=len(block.views)) == 0
     downweighted = np.zeros(block.num_points, dtype=bool)
@@ -300,13 +300,13 @@ def _robust(
     use: BoolArray,
     smooth: Smooth,
 ) -> tuple[State, Array, Array, float, Projected | None]:
-    """Take reweighted steps while the scale of the loss shrinks to three standard deviations of the noise.
+    """Take robust steps while the scale of the loss shrinks to three standard deviations of the noise.
 
     Returned are the state, its residuals (2, K), the robust weights (K,), the noise, and the projection of the state.
     The noise is estimated from the weighted median of the squared residuals. It has two lower limits: the noise of the
     best fifth of the residuals, and half of the stated noise. Without these limits, only a few observations that fit by
-    chance would keep their weight. Control points are left out of the estimate if there are other observations, because
-    free points fit too well.
+    chance would keep their weight. Control points are excluded from the estimate if there are other observations: their
+    residuals are too small as long as no control fixes their positions.
     """
     state, residual, projected = start
     counted, scale, noise = use.astype(np.float64), np.inf, 1.0
@@ -323,14 +323,14 @@ def _robust(
         counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
         state = gauss_newton(problem, state, observations.weight(use, noise) * np.sqrt(counted), projected)
         residual, projected = problem.prepare(state.params, state.points)
-        near = scale <= SURELY / SHRINK * noise  # the last step but one
+        near = scale <= SURELY / SHRINK * noise  # the next scale is the final one
         s = observations.squared(residual - smooth.part(residual, counted) if near else residual, counted)
         counted = _observation_weights(observations, use, s, geman_mcclure(s / scale**2)[1])
     return state, residual, counted, noise, projected
 
 
 def _observation_weights(observations: Observations, use: BoolArray, squared: Array, by_loss: Array) -> Array:
-    """Return the robust weights (K,): 0 for unused observations, 1 for spared ones, else that of the loss."""
+    """Return the robust weights (K,): 0 if not in use, 1 if exempt (`Observations.is_spared`), else `by_loss`."""
     return np.where(observations.is_spared(squared), use.astype(np.float64), use * by_loss)
 
 

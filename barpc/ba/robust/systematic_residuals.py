@@ -23,15 +23,15 @@ from barpc.scene import BoolArray, IntArray
 from barpc.sensor.image_corrections import bsplines
 
 SmoothFit = dict[int, tuple[slice, Array]]
-"""View -> slice of its observations, coefficients (2, NUM_TERMS) of their smooth part."""
+"""View number -> slice of its observations, and coefficients (2, NUM_TERMS) of their smooth part."""
 
 SPLINES = 14
 """Number of cubic B-splines over the rows of an image. They represent changes over a tenth of the rows or more."""
 
-NUM_TERMS = SPLINES + 4  # splines, and col, col^2, col^3, row col
+NUM_TERMS = SPLINES + 4  # number of terms: splines, and col, col^2, col^3, row col
 _PER_TERM = 10  # least number of observations per term; views with fewer have no smooth part
-# weight of the second differences of spline coefficients, relative to the mean weight of a coefficient by the
-# observations; it determines the spline over rows without observations
+# The squared second differences of spline coefficients are penalised, for rows without observations: weight over the
+# mean weight that observations give a coefficient, and matrix of the squares.
 _BEND = 1e-2
 _BENDING = np.diff(np.eye(SPLINES), n=2, axis=0).T @ np.diff(np.eye(SPLINES), n=2, axis=0)
 
@@ -46,11 +46,11 @@ class NoiseCorrelation:
     points of a view count as at most `MAX_INDEPENDENT_ERRORS` independent observations.
     """
 
-    of_reference: BoolArray  # (K,) observations of reference points
+    of_reference: BoolArray  # (K,) mask of the observations of reference points
     place: Array  # (2, K) east, north of reference points [m]
     width: float  # of their templates [m]
-    share: Array  # (K,) number of independent observations to which each is equivalent, at most 1
-    precision: Array  # (K,) `share` times the variance of the tie points of the view over that of the observation
+    share: Array  # (K,) effective number of independent observations of each, at most 1
+    precision: Array  # (K,) weight: `share` times the variance of the view's tie points over that of the observation
 
     @classmethod
     def of(cls, block: Block) -> NoiseCorrelation | None:
@@ -68,7 +68,7 @@ class NoiseCorrelation:
         for view in np.unique(block.view[rows]):
             own = np.flatnonzero(rows & (block.view == view))
             ties = ~rows & (block.view == view)
-            sampled = own[:: -(-len(own) // MANY)]  # the points lie on a grid
+            sampled = own[:: -(-len(own) // MANY)]  # points of a grid: some are representative of all
             alike = found.overlap(sampled[:, None], own[None]).sum(axis=1).mean()
             share[own] = 1.0 / (alike + len(own) / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
@@ -76,7 +76,7 @@ class NoiseCorrelation:
         return found
 
     def overlap(self, first: IntArray, second: IntArray) -> Array:
-        """Return the share (...) by which the templates of two reference observations overlap."""
+        """Return the overlap (...) of the templates of two reference observations, as a share of their area."""
         apart = np.abs(self.place[:, first] - self.place[:, second])
         if self.width == 0:
             return np.asarray((apart == 0).all(axis=0), np.float64)
@@ -93,18 +93,16 @@ class NoiseCorrelation:
 class SmoothTest:
     """The smooth part of the residuals of each view, and its significance."""
 
-    # (N,) RMS length of the smooth part over the observations [px]; its expectation for noise alone is subtracted from
-    # its square; 0 for a view with too few observations
+    # (N,) RMS length of the smooth part [px], less the contribution of noise; 0 for a view with too few observations
     rms: Array
     # (N,) p-value of an F test of the smooth part; 1 for a view with too few observations
     significance: Array
-    # (N,) share of the sum of squares of the smooth part that the splines over the rows explain; NaN for a view without
-    # a fit
+    # (N,) share of its sum of squares that the splines over the rows explain; NaN for a view without a fit
     by_row: Array
-    # (N,) RMS error shared by neighbouring observations [px]: the larger of that in order of columns and that in order
-    # of rows. It contains jitter and steps too fine for the smooth part. 0 if it is not significant
+    # (N,) RMS of the error that neighbours along the columns or the rows share [px]; the larger of both, 0 if it is not
+    # significant. Jitter and steps that are too fine for the smooth part are included
     shared: Array
-    # (N,) share of the square of a camera error that appears in the residuals; points and heights absorb the rest
+    # (N,) share of a squared camera error that remains in the residuals; ground points absorb the rest
     redundancy: Array | float = 1.0
 
     def of_cameras(self) -> Array:
@@ -119,15 +117,15 @@ class SmoothTest:
         return np.where(self.found(0.0), self.rms, 0.0)
 
     def found(self, least: float, level: float = 1e-4) -> BoolArray:
-        """Return the views (N,) with a significant smooth part above `least` [px]."""
+        """Return the mask (N,) of views with a significant smooth part (p-value below `level`) above `least` [px]."""
         return np.asarray((self.rms > least) & (self.significance < level))
 
 
 class Smooth:
     """Model of the smooth parts of the residuals of all views, for observations at `xy` (2, K) [px].
 
-    `alike` is the correlation of the noise of the observations. Observations outside the mask `tells` (K,) are not
-    used.
+    `noise` is the correlation of the noise of the observations; None: they are independent. Only the observations in
+    the mask `usable` (K,) are used.
     """
 
     def __init__(
@@ -135,27 +133,29 @@ class Smooth:
         structure: Structure,
         xy: Array,
         unknowns: Unknowns,
-        alike: NoiseCorrelation | None = None,
-        tells: BoolArray | None = None,
+        noise: NoiseCorrelation | None = None,
+        usable: BoolArray | None = None,
     ) -> None:
-        self.structure, self.alike = structure, alike
-        self._tells = np.ones(xy.shape[1], dtype=bool) if tells is None else tells
+        self.structure, self.noise = structure, noise
+        self._usable = np.ones(xy.shape[1], dtype=bool) if usable is None else usable
         col, row = unknowns.normalized(xy, structure.view).clip(-1.0, 1.0)
         self._place = xy
         self._col, self._row = col, row
         self._kept = self._all_terms() if len(col) <= KEPT else None
 
     def _basis(self, rows: slice) -> Array:
-        """Return the terms (NUM_TERMS, n) at some observations."""
+        """Return the terms (NUM_TERMS, n) at some observations, computed now or kept."""
         return self._terms(rows) if self._kept is None else self._kept[:, rows]
 
     def _all_terms(self) -> Array:
+        """Compute the terms (NUM_TERMS, K) at all observations."""
         out = np.empty((NUM_TERMS, len(self._col)))
         for part in parts(len(self._col)):
             out[:, part] = self._terms(part)
         return out
 
     def _terms(self, rows: slice) -> Array:
+        """Compute the terms (NUM_TERMS, n) at some observations."""
         col, row = self._col[rows], self._row[rows]
         return np.vstack([bsplines(row, SPLINES), col, col * col, col * col * col, row * col])
 
@@ -176,11 +176,11 @@ class Smooth:
         """
         n = self.structure.num_views
         rms, significance, by_row = np.zeros(n), np.ones(n), np.full(n, np.nan)
-        use = use & self._tells
+        use = use & self._usable
         weight = use.astype(np.float64)
         residual = np.where(use, residual, 0.0)
         share, precision = (
-            (weight, weight) if self.alike is None else (weight * self.alike.share, weight * self.alike.precision)
+            (weight, weight) if self.noise is None else (weight * self.noise.share, weight * self.noise.precision)
         )
         terms = 2.0 * NUM_TERMS
         for v, (rows, coefficients) in (self.fit(residual, weight) if fit is None else fit).items():
@@ -205,7 +205,7 @@ class Smooth:
 
         `shared` is the square root of the mean product of the residuals of neighbours, in views with a smooth part.
         """
-        kept = np.flatnonzero(use & self._tells & np.isfinite(tested.by_row)[self.structure.view])
+        kept = np.flatnonzero(use & self._usable & np.isfinite(tested.by_row)[self.structure.view])
         shared, view = np.zeros_like(tested.rms), self.structure.view[kept]
         last = view[1:]
         pairs = (last == view[:-1]).astype(np.float64)  # of neighbours in one view
@@ -215,7 +215,7 @@ class Smooth:
             order = kept[np.argsort(apart + place, kind="stable")]
             ordered, num_pairs = residual[:, order], count
             product = (ordered[:, 1:] * ordered[:, :-1]).sum(axis=0)
-            if self.alike is not None:
+            if self.noise is not None:
                 product, num_pairs = self._beyond_noise(product, (ordered**2).sum(axis=0), order, pairs)
             mean = self._sums(last, product * pairs) / count
             scatter = np.sqrt(self._sums(last, (product - mean[last]) ** 2 * pairs) / count)
@@ -224,27 +224,29 @@ class Smooth:
         return replace(tested, shared=shared, redundancy=redundancy)
 
     def _sums(self, view: IntArray, values: Array) -> Array:
+        """Return the sums (N,) of values (n,) over those of each view."""
         return np.asarray(np.bincount(view, values, self.structure.num_views))
 
     def _beyond_noise(self, product: Array, square: Array, order: IntArray, pairs: Array) -> tuple[Array, Array]:
-        """Subtract the expectation for correlated noise from the products (n - 1,) of the residuals of neighbours.
+        """Return the products (n - 1,) of neighbours' residuals, less their expectation for correlated noise.
 
-        Also returned are the numbers (N,) of independent pairs to which the pairs of each view are equivalent.
+        `square` (n,) are the squared residuals. `pairs` (n - 1,) is 1 for neighbours in one view, else 0. Also returned
+        is the equivalent number (N,) of independent pairs in each view.
         """
-        assert self.alike is not None
+        assert self.noise is not None
         first, second = order[:-1], order[1:]
-        view, same = self.structure.view[second], self.alike.correlation(first, second)
-        weight = np.sqrt(self.alike.precision[first] * self.alike.precision[second])
+        view, same = self.structure.view[second], self.noise.correlation(first, second)
+        weight = np.sqrt(self.noise.precision[first] * self.noise.precision[second])
         beyond = weight * (product - same * 0.5 * (square[1:] + square[:-1]))
         size = self._sums(view, weight * (1.0 - same) * pairs) / np.maximum(self._sums(view, pairs), 1.0)
-        return beyond / np.maximum(size, 1e-12)[view], self._sums(view, self.alike.share[second] * pairs)
+        return beyond / np.maximum(size, 1e-12)[view], self._sums(view, self.noise.share[second] * pairs)
 
     def fit(self, residual: Array, weight: Array) -> SmoothFit:
-        """Fit the smooth part of residuals (2, K) [px] with weights (K,), in views with enough observations."""
-        weight = weight * self._tells
+        """Fit the smooth part of residuals (2, K) [px] with weights (K,), in each view with enough observations."""
+        weight = weight * self._usable
         counts = self.structure.sum_views(weight[None])[:, 0]
         views = np.flatnonzero(counts >= _PER_TERM * NUM_TERMS)
-        counted = weight if self.alike is None else weight * self.alike.precision
+        counted = weight if self.noise is None else weight * self.noise.precision
         with np.errstate(invalid="ignore"):
             target = np.where(weight > 0, residual, 0.0)
         parts = [slice(*self.structure.bounds[v : v + 2].tolist()) for v in views]

@@ -16,13 +16,12 @@ from barpc.base.geodesy import Array
 from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
-MEDIAN = 0.55  # median of |r|^2 over its mean, for a chi-square of 1 (two views) to 2 (many) degrees of freedom
+MEDIAN = 0.55  # median of a squared residual over its mean; 1 (two views) to 2 (many) degrees of freedom
 _LARGEST_MISFIT = 3.0  # px: upper limit; a larger misfit would take all weight from the view that causes it
 _LITTLE_NOISE = 0.04
 """Standard deviation of tie points [px] below which the noise floor is reduced in proportion to it.
 
-With a noise floor of 0.02 px, the common error is then half of the standard deviation. In real images it is about a
-fifth, at 0.1 px.
+A noise floor of 0.02 px is half of this. In real images it is a fifth of the standard deviation, which is 0.1 px.
 """
 
 
@@ -32,7 +31,10 @@ def geman_mcclure(s: Array) -> tuple[Array, Array]:
 
 
 class Observations:
-    """Weights of observations: stated sigmas, the observed noise, and the cap on a view's information."""
+    """Weights of observations: stated `sigma` (K,) [px], observed noise, and a limit on the information of a view.
+
+    `is_tie` and `of_reference` (K,) are the masks of tie points and of reference points.
+    """
 
     def __init__(
         self,
@@ -47,13 +49,13 @@ class Observations:
         self.is_tie = is_tie
         self.told = told  # (N,) information of the tie points of each view in an earlier block [1/px^2]
         waves = problem.cameras.unknowns.waves
-        # number of intervals of the splines, over columns and rows: common errors of neighbours differ between them
+        # number of parts of an image between spline knots: the common error of neighbours is another one in each
         self.stretches = 1.0 if waves is None else waves.stretches(2.0 * float(problem.cameras.unknowns.half[1].max()))
         self.has_prior = np.zeros(self.structure.num_points, dtype=bool)
         if problem.point_prior is not None:
             self.has_prior[problem.point_prior.index] = True
         self.of_reference = np.zeros_like(is_tie) if of_reference is None else of_reference
-        # control points are tested point by point
+        # control points: the other observations with a prior on their points
         self.is_control = ~is_tie & ~self.of_reference & self.has_prior[self.structure.point]
 
     def is_spared(self, squared: Array) -> BoolArray:
@@ -66,8 +68,8 @@ class Observations:
     def is_near(self, squared: Array, scale: float) -> BoolArray:
         """Return the mask (K,) of observations within `scale` standard deviations.
 
-        `squared` (K,) are squared normalised residuals. The limit of reference points is always `OUTLIER`, and that of
-        control points `GROSS` or more.
+        `squared` (K,) are squared normalised residuals. Reference points always have the limit `OUTLIER`, control
+        points the limit `GROSS`, if that is larger than `scale`.
         """
         near = np.where(self.of_reference, squared <= OUTLIER**2, squared <= scale * scale)
         return np.asarray(near | (self.is_control & (squared < GROSS**2)))
@@ -75,8 +77,7 @@ class Observations:
     def freedom(self, counted: Array) -> Array:
         """Return the degrees of freedom (K,) of observations after their points are estimated: 1/2 (two views) to 2.
 
-        `counted` (K,) are robust weights, 0 to 1. An observation of weight 0 does not add to the number of views of its
-        point.
+        `counted` (K,) are robust weights, 0 to 1. An observation of weight 0 is not counted among those of its point.
         """
         structure = self.structure
         largest = np.zeros(structure.num_points)
@@ -94,21 +95,21 @@ class Observations:
         return np.where(count > 0, total / np.maximum(count, 1.0), 2.0)
 
     def squared(self, residual: Array, counted: Array) -> Array:
-        """Return the squared residuals (K,) over their expectation under the stated sigmas."""
+        """Return the squared residuals (K,), divided by their expectations from the stated sigmas."""
         s: Array = (residual**2).sum(axis=0) / self.sigma**2 / self.freedom(counted)
         return np.where(np.isfinite(s), s, np.inf)
 
     def weight(self, use: BoolArray, noise: float, misfit: Array | float = 0.0) -> Array:
         """Return the weights 1 / sigma (K,) [1/px]; 0 of observations not in use.
 
-        The total weight of the tie points of a view is limited, because they have common errors. One has the standard
-        deviation `noise_floor`, or less where the tie points scatter little. The other is the `misfit` (N,) [px] of the
-        camera model of the view, taken as `SPLINES` independent errors.
+        The total weight of the tie points of a view is limited by two errors that they share. The standard deviation of
+        the first is `noise_floor`, or less if the noise is low. The second is the `misfit` (N,) [px] of the camera
+        model of the view, which counts as `SPLINES` independent errors.
         """
         weight: Array = use / (self.sigma * noise)
         own, ties = self._of_ties(weight), self._of_ties(use.astype(np.float64))
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
-        # at least a tenth of the noise floor, also for copies of an image
+        # at least a tenth of the noise floor, because copies of an image have no noise
         common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2
         floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
@@ -122,7 +123,7 @@ class Observations:
         return np.maximum(self._of_ties(weight), self.told)
 
     def _of_ties(self, weight: Array) -> Array:
-        """Return the sums (N,) of the squared weights (K,) of each view's tie points."""
+        """Return the sums (N,) of the squared weights of the tie points of each view."""
         return np.asarray(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0])
 
     def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
@@ -140,7 +141,7 @@ class Observations:
         return max(float(np.sqrt((whitened**2).sum() / freedom)), 1e-6)
 
     def tied(self, use: BoolArray) -> BoolArray:
-        """Return `use` without single observations of points that have no prior."""
+        """Return the mask `use` (K,) without points that have one observation and no prior."""
         structure = self.structure
         count = np.bincount(structure.point[use], minlength=structure.num_points)
         return use & ((count >= 2) | self.has_prior)[structure.point]

@@ -14,7 +14,7 @@ from operator import itemgetter
 import numpy as np
 
 from barpc.ba.evidence.linearised import Linear
-from barpc.ba.evidence.mixture import LIKELIHOOD_TOLERANCE, MixtureFit, fit_mixture, off_from_right
+from barpc.ba.evidence.mixture import LIKELIHOOD_TOLERANCE, MixtureFit, fit_mixture, residuals_from_inliers
 from barpc.ba.evidence.periods import Period, find_periods
 from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.select.anomalies import correlated_log_ratio
@@ -200,13 +200,13 @@ def _of_one_image(one: Term, other: Term) -> bool:
 
 def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
     """Return the residuals (2, K) of a fit with terms of columns `extra`, in stated standard deviations."""
-    return np.asarray(linear.left(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma)
+    return np.asarray(linear.residual_after(found.step) + np.einsum("cek,e->ck", extra, found.extra) / linear.sigma)
 
 
 def _noise_evidence(seen: Residuals) -> float:
     """Return the evidence for correlated noise beside the terms taken [nats], without moving tracks."""
     found, linear = seen.base, seen.linear
-    off, _ = off_from_right(linear, _residuals(found, linear, seen.extra), found.right)
+    off, _ = residuals_from_inliers(linear, _residuals(found, linear, seen.extra), found.right)
     track = np.full(len(linear.view), -1)
     for n, tracks in enumerate(linear.tracks):
         track[tracks.rows] = len(linear.view) * n + np.arange(len(tracks.rows))[:, None]
@@ -304,9 +304,9 @@ class TermSearch:
 
     def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         seen, linear = self.seen, self.seen.linear
-        rows = linear.taking_part
+        rows = linear.in_tracks
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
-        all_residuals, known = off_from_right(linear, _residuals(found, linear, extra), found.right)
+        all_residuals, known = residuals_from_inliers(linear, _residuals(found, linear, extra), found.right)
         off, weight = all_residuals[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
         out = [one for one in scan(view, place, seen.size, wrong, off, weight, floor) if one.gain > SURE]
@@ -330,7 +330,7 @@ class TermSearch:
         """Return moving groups, searched for once, and displaced parts of images with the same observations."""
         self.group = self.group or list[Term](MovingObjects.of(self.seen))
         found = self._with_fits([], self.group)
-        rows = self.seen.linear.taking_part
+        rows = self.seen.linear.in_tracks
         members = [(one, row[1]) for row in found if row[2] > SURE for one in self._parts_with_members(row[1], rows)]
         fits = [(one, self._fit(one, base=still)) for one, still in members]  # cameras of the still tracks
         return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
@@ -355,7 +355,7 @@ class TermSearch:
     def _most_promising(self, offered: list[Term]) -> list[Term]:
         """Return the terms whose gain, by a sample of tracks, is at least a `RIVALS`-th of the best."""
         few, linear = self.seen.few, self.seen.linear
-        if 2 * np.count_nonzero(few.taking_part) > np.count_nonzero(linear.taking_part) or len(offered) < 3:
+        if 2 * np.count_nonzero(few.in_tracks) > np.count_nonzero(linear.in_tracks) or len(offered) < 3:
             return offered  # the sample saves too little
         base = fit_mixture(few, self.seen.extra, self.seen.sigma, self.seen.base)
         gains = [self._fit(one, few, base).evidence - base.evidence - one.price for one in offered]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from barpc.ba.constraints.block import Block
-from barpc.ba.robust.heldout import measure, seen_in
+from barpc.ba.robust.heldout import measure, problem_of_block
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solution import Solution
 from barpc.base.geodesy import Array
@@ -51,7 +51,7 @@ class Bands:
     def offsets(self, found: Solution) -> Array:
         """Return the offsets (5 M,) [px] of all bands under the cameras of a solution."""
         ties, cameras = self.ties, found.final.params
-        problem, points = seen_in(found.problem, cameras, ties)
+        problem, points = problem_of_block(found.problem, cameras, ties)
         projected = problem.project_points(cameras, points)
         residual, by_point = projected.image - ties.xy, np.moveaxis(projected.by_point, -1, 0)
         ray = np.cross(by_point[:, 0], by_point[:, 1])

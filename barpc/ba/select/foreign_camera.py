@@ -254,4 +254,4 @@ def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
         return -ties * float(np.log(area))
     linear, _ = known
     covered = sum(tracks.rows.size for tracks in linear.tracks)
-    return fit_mixture(replace(linear, area=area, image=area)).evidence - (ties - covered) * float(np.log(area))
+    return fit_mixture(replace(linear, area=area, image_area=area)).evidence - (ties - covered) * float(np.log(area))

@@ -61,7 +61,7 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
         return Selection()
     linear, state = found
     rows, ground = np.flatnonzero(np.isin(block.view, views)), GroundMotion.of(outcome.problem, state)
-    linear, ground = linear.among(views), ground.part(rows)
+    linear, ground = linear.of_views(views), ground.part(rows)
     nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
     number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
     number[views] = np.arange(len(views))

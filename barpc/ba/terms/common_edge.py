@@ -72,14 +72,14 @@ def score(residuals: Residuals) -> tuple[Array, Array]:
     the L1 norm.
     """
     linear, base = residuals.linear, residuals.base
-    left = linear.left(base.step) + np.einsum("cek,e->ck", residuals.extra, base.extra) / linear.sigma
+    left = linear.residual_after(base.step) + np.einsum("cek,e->ck", residuals.extra, base.extra) / linear.sigma
     cols, sums, matrices = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
     for tracks in linear.tracks:
         count, n = tracks.rows.shape
         order = np.argsort(residuals.place[0][tracks.rows], axis=1)
         rows = np.take_along_axis(tracks.rows, order, axis=1)
         scale = 1.0 / linear.sigma[rows]
-        basis = tracks.follow[:, :3].reshape(count, 3, n, 2)
+        basis = tracks.point_bases[:, :3].reshape(count, 3, n, 2)
         off = left[:, tracks.rows].transpose(1, 2, 0)
         off = off - np.einsum("tcni,tc->tni", basis, np.einsum("tcni,tni->tc", basis, off))
         weight = 1.0 / np.sqrt((off**2).sum(axis=(1, 2)) + base.noise**2)

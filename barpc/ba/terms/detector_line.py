@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from barpc.ba.evidence.mixture import MixtureFit, off_from_right
+from barpc.ba.evidence.mixture import MixtureFit, residuals_from_inliers
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA
 from barpc.ba.terms.step import Step, open_ended
@@ -78,16 +78,16 @@ def change_points(
     cameras follow, is removed until all are significant.
     """
     linear, price = residuals.linear, Step.at(residuals, view, (0, 0.0, 1.0, 0.0, 0.0)).price + SURE
-    left = linear.left(found.step) + others / linear.sigma
-    off, known = off_from_right(linear, left, found.right)
+    left = linear.residual_after(found.step) + others / linear.sigma
+    off, known = residuals_from_inliers(linear, left, found.right)
     right = found.right > 0.5
-    rows = (linear.view == view) & linear.taking_part & (known | right if own is None else right)
+    rows = (linear.view == view) & linear.in_tracks & (known | right if own is None else right)
     order = np.flatnonzero(rows)[np.argsort(residuals.place[0, rows], kind="stable")]
     col, plain = residuals.place[0, order], _limited(off[:, order].T / found.noise)
     values = plain
     if own is not None:  # of a large displacement, different shares are absorbed by points of two and of three images
         moved = own / linear.sigma
-        off, _ = off_from_right(linear, left + moved, found.right)
+        off, _ = residuals_from_inliers(linear, left + moved, found.right)
         values = _limited((off - moved)[:, order].T / found.noise)
     edges = _segmented(_cumulative_sums(values), 0, len(order), price)
     smooth, at = np.vander(2.0 * col / residuals.size[0, view] - 1.0, DRIFTS), np.arange(len(order))

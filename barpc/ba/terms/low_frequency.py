@@ -30,7 +30,7 @@ class LowFrequency(Term):
         view, linear = interval.view, residuals.linear
         rows = np.flatnonzero(linear.view == view)
         u = 2.0 * residuals.place[1, rows] / residuals.size[1, view] - 1.0
-        each = int(np.median(np.bincount(linear.view[linear.taking_part]))) // FEW
+        each = int(np.median(np.bincount(linear.view[linear.in_tracks]))) // FEW
         basis = AdditionalParameters(min(max(each, MIN_SPLINES), SPLINES)).splines(u)
         sigma = np.full(2 * len(basis), FIRST_SIGMA)
         cost = float(np.log(linear.choices)) + SIZE_PRICE

@@ -17,7 +17,7 @@ from scipy.special import gammainccinv
 from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, linearise
 from barpc.ba.evidence.mixture import COOLED, Group, Mixture, MixtureFit, moving
-from barpc.ba.robust.heldout import seen_in
+from barpc.ba.robust.heldout import problem_of_block
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
@@ -127,7 +127,7 @@ def _any_group(linear: Linear, ground: GroundMotion) -> Group:
 def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
     """Return the most likely moving group beside a fit `base` with terms `extra`, as a start; None without tracks."""
     few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
-    cell, rows = group.cell, few.taking_part
+    cell, rows = group.cell, few.in_tracks
     if not rows.any():
         return None
     starts = [replace(group, share=share) for share in _start_shares(linear, group, base, extra, sigma)]
@@ -151,7 +151,7 @@ def price_of_group(linear: Linear, cell: IntArray) -> float:
 def _start_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, sigma: Array) -> Iterator[Array]:
     """Yield start values (K,) of the probability that tracks move: of rejected ones, then of the likeliest regions."""
     cut = np.where(base.right < 0.5, 1.0 - LEVEL, LEVEL)
-    if (cut[linear.taking_part] > 0.5).any():
+    if (cut[linear.in_tracks] > 0.5).any():
         yield cut
     gains = _region_gains(linear, group, base, extra, sigma)
     for region in _distinct(_REGIONS, gains):
@@ -208,7 +208,7 @@ def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
 
 def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureFit) -> MovingGroup:
     """Return the moving group of a fit, with its largest motion between two views."""
-    rows = linear.taking_part
+    rows = linear.in_tracks
     member = rows & (found.moving > 0.5)
     moved = np.vstack([np.zeros(2), found.move.reshape(-1, 2)]) * ground.pixel
     seen = np.flatnonzero(np.bincount(linear.view[member], minlength=linear.views))
@@ -231,7 +231,7 @@ def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> 
     """Return the observations (K,) of a block that belong to a group found at camera unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
-    part, points = seen_in(problem, params, block)
+    part, points = problem_of_block(problem, params, block)
     state = State(params, points)
     low, high = block.alt_range
     linear = linearise(part, state, np.ones(len(block.view), dtype=bool), block.sigma, high - low)

@@ -46,7 +46,7 @@ class ImagePart(Term):
         axis, _, _, *decay = self.where  # type: ignore[misc]
         rows = np.flatnonzero(linear.view == self.view)
         rows = rows[np.argsort(residuals.place[axis, rows], kind="stable")]
-        left = linear.left(found.step) + others / linear.sigma
+        left = linear.residual_after(found.step) + others / linear.sigma
         displaced, place = left.copy(), residuals.place[axis, rows]
         everywhere = profile(place, -np.inf, np.inf, *decay)  # type: ignore[arg-type]
         displaced[:, rows] += found.extra[-len(self.sigma) :, None] * everywhere / linear.sigma[rows]
