@@ -112,7 +112,8 @@ def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start,
     assert one.gain > 100.0
     assert 0.0 < one.gap < (0.2 if axis else 0.9) * one.gain
     # an endless decay is a step to the end of its image, and no other; then rows, or detectors, of another image
-    assert one.runner_up == ("decay" if stop > 1.0 else "step" if axis else "detector_line")
+    rivals = {"decay"} if stop > 1.0 else {"step"} if axis else {"step", "detector_line"}
+    assert one.runner_up in rivals
     assert (found.right > 0.5).mean() > 0.98  # those that were displaced, too
     assert found.step.shape == (3, seen.linear.residual.size and found.step.shape[1])
 
