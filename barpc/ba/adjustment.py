@@ -24,7 +24,7 @@ from barpc.ba.result import Adjustment, height_derivatives
 from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
-from barpc.ba.select.anomalies import left_over
+from barpc.ba.select.anomalies import unexplained_intervals
 from barpc.ba.select.champion import largest_offset
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver
 from barpc.ba.select.models import SelectedModel, select_model
@@ -237,7 +237,7 @@ def _adjustment(
         asked=found.asked,
         findings=tuple(_reported_findings(found, parts, points)),
         moving=parts.block.in_order(parts.group > 0)[ties],
-        left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
+        left=(*unexplained_intervals(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_neighbour_correlation(block, outcome, is_tie),
         in_space_rms=model.in_space_rms,
         changed=model.changed,

@@ -192,7 +192,7 @@ def test_terms_of_all_images_compete_with_splines_and_detectors(monkeypatch, kin
     terms: Any = [SimpleNamespace(kind=kind, view=v, where=(axis,), moved=None, gain=9.0) for v, kind in kinds.items()]
     for name, value in (
         ("_layout_of", None), ("_at_selection", Ended("found", 9)), ("_solve_with", Ended("tried", 2)),
-        ("with_splines", Ended("whole", whole)), ("standing_out", []),
+        ("with_splines", Ended("whole", whole)), ("significant_intervals", []),
     ):  # fmt: skip
         monkeypatch.setattr(image_terms, name, lambda *_, value=value: value)
     monkeypatch.setattr(image_terms, "is_better", lambda one, other, outer: one < other)

@@ -60,7 +60,7 @@ class Outcome(Minimum):
     smooth: SmoothTest  # of the final residuals
     by_point: Array  # (2, 3, K) derivatives of the image points by the points at the end [px/m]
     # cache: noise floor [px] -> significant intervals of the images
-    standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
+    significant_intervals: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:

@@ -282,7 +282,7 @@ class TermSearch:
     def _candidates(self) -> list[_Candidate]:
         """Return the candidates for the next term, the best first; gains may be negative."""
         seen = self.seen
-        out, periods = self._standing_out(seen.base, seen.extra)
+        out, periods = self._significant(seen.base, seen.extra)
         # in pairs a fit with more wrong matches may hide an interval: those of the rejected observations are used then
         out = out or ([] if self.taken else self.first)
         made = self._with_fits([], self._most_promising(list(proposed(seen, out, periods))))
@@ -293,16 +293,16 @@ class TermSearch:
         least = self.floor * _LEAST_FLOORS
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
 
-    def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
+    def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K).
 
         They are cached: the fit of the best candidate is tested after its refinement, and again as the next state.
         """
         if id(found) not in self.tested:
-            self.tested[id(found)] = found, *self._significant(found, extra)
+            self.tested[id(found)] = found, *self._find_significant(found, extra)
         return self.tested[id(found)][1:]
 
-    def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
+    def _find_significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         seen, linear = self.seen, self.seen.linear
         rows = linear.taking_part
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
@@ -317,7 +317,7 @@ class TermSearch:
         if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
             return False
         one, found, _ = made[0]
-        return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
+        return not any(self._significant(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
 
     def _stands_still(self, candidate: _Candidate) -> bool:
         """Return whether no region of the ground moves beside a candidate, by a score test."""

@@ -11,7 +11,7 @@ from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalPar
 from barpc.ba.parameters.priors import JointPrior
 from barpc.ba.robust.heldout import is_admitted, is_better
 from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
-from barpc.ba.select.anomalies import correlated_noise_gain, standing_out
+from barpc.ba.select.anomalies import correlated_noise_gain, significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
 from barpc.ba.solution import MUCH_BETTER, Solution, finished
@@ -64,9 +64,8 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     if not (in_all or in_most):
         return tried
     smooth = with_splines(found, parts, options)
-    left = [
-        sum(one.gain for one in standing_out(of.outcome, parts.inner, options.noise_floor)) for of in (smooth, tried)
-    ]
+    intervals = [significant_intervals(of.outcome, parts.inner, options.noise_floor) for of in (smooth, tried)]
+    left = [sum(one.gain for one in rows) for rows in intervals]
     fits = smooth is not found and left[0] <= left[1]
     # the model with fewer unknowns is kept unless the other is significantly better
     first, second = (tried, smooth) if in_all else (smooth, tried)

@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_better, measure
-from barpc.ba.select.anomalies import standing_out
+from barpc.ba.select.anomalies import significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
@@ -191,7 +191,7 @@ def _is_much_better(affine: Solution, found: Solution) -> bool:
 
 def _explains_all(found: Solution, parts: Parts, floor: float) -> bool:
     """Return whether no residuals are significant that terms of an image, or moving ground, might explain."""
-    return not (found.has_trend or found.has_waves or standing_out(found.outcome, parts.inner, floor))
+    return not (found.has_trend or found.has_waves or significant_intervals(found.outcome, parts.inner, floor))
 
 
 def _at_lower_degree(

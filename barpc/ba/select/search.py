@@ -11,7 +11,7 @@ from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, array_elements, linearise
 from barpc.ba.evidence.mixture import MixtureFit, fit_mixture
 from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
-from barpc.ba.select.anomalies import image_sizes, periods_of, standing_out
+from barpc.ba.select.anomalies import image_sizes, periods_of, significant_intervals
 from barpc.ba.select.beam import Selection, TermSearch
 from barpc.ba.solving.solve import State
 from barpc.ba.terms.moving_ground import GroundMotion
@@ -35,7 +35,7 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
     size, views = outcome.problem.free.size, np.arange(len(block.views))
     if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:
         return Selection()
-    suspects = [one.view for one in standing_out(outcome, block, floor)]
+    suspects = [one.view for one in significant_intervals(outcome, block, floor)]
     if not suspects or size > SMALL:
         suspects += [one.view for one in periods_of(outcome, block)]
     if size <= SMALL:
@@ -63,7 +63,7 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
     rows, ground = np.flatnonzero(np.isin(block.view, views)), GroundMotion.of(outcome.problem, state)
     linear, ground = linear.among(views), ground.part(rows)
     nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
-    number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
+    number, outs = np.full(len(block.views), -1), significant_intervals(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
         base, few = _base_fit(linear, outcome, rows), linear.thinned(SAMPLE)
