@@ -15,7 +15,7 @@ from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, search
 from barpc.ba.select.anomalies import log_ratio_by_image
-from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _SelectedTerm, _uncovered
+from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _SelectedTerm, _without_overlaps
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
 from barpc.ba.terms import TERMS
@@ -288,7 +288,7 @@ def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
     assert not _overlap(interval(*one), interval(*other, view=1))
     assert not _overlap(interval(*one), interval(*other, axis=0))
     rows = [interval(*one), interval(*other), interval(50, 60)]
-    assert _uncovered(rows) == ([rows[0], rows[2]] if same else rows)
+    assert _without_overlaps(rows) == ([rows[0], rows[2]] if same else rows)
 
 
 @pytest.mark.parametrize(("seed", "also"), [(2, (0,)), (1, ())])
@@ -315,7 +315,7 @@ def placed(kind: str, view: int = 0) -> Term:
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):
-        found = combined(*[("step", 0, 9.0)] * count).added([(placed(kind), base, 20.0)])
+        found = combined(*[("step", 0, 9.0)] * count).with_best_of([(placed(kind), base, 20.0)])
         assert (found.ended, found.gain) == (ended, 9.0 * count + 20.0)
     # as many more as the other has and two, none gaining more than the last
     for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):
@@ -325,13 +325,14 @@ def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_
         assert combined(("step", 0, 30.0), ("step", 0, 20.0)).may_exceed(noise) == may
     best, other = combined(("sinusoid", 1, 60.0)), combined(("decay", 0, 30.0))
     for beside, adds in ((30.0 - SURE + 0.1, True), (30.0 - SURE, False)):  # beside the best: no other way
-        assert other.adds_to(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
-    assert not other.adds_to(best, [(placed("decay", 1), base, 40.0)])
+        assert other.complements(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
+    assert not other.complements(best, [(placed("decay", 1), base, 40.0)])
     behind = combined(("step", 2, 50.0), ("decay", 0, 30.0))
-    assert not behind.adds_to(best, [(placed("decay"), base, 30.0)])  # what went before is another
-    assert behind.adds_to(combined(("step", 2, 50.0), ("sinusoid", 1, 60.0)), [(placed("decay"), base, 30.0)])
+    assert not behind.complements(best, [(placed("decay"), base, 30.0)])  # what went before is another
+    assert behind.complements(combined(("step", 2, 50.0), ("sinusoid", 1, 60.0)), [(placed("decay"), base, 30.0)])
     for rival, gap in ((0.5, 19.5), (-3.0, 20.0)):  # over nothing, where the runner-up is worse
-        assert combined().added([(placed("step"), base, 20.0), (placed("decay", 1), base, rival)]).taken[0].gap == gap
+        (row,) = combined().with_best_of([(placed("step"), base, 20.0), (placed("decay", 1), base, rival)]).taken
+        assert row.gap == gap
 
 
 # --- of a block that was solved ---------------------------------------------------------------------------------------

@@ -89,8 +89,8 @@ def correlated_log_ratio(
 ) -> float:
     """Return the log-likelihood ratio [nats] of correlated over independent noise in all images.
 
-    `off` (2, k) are residuals [standard deviations], `right` (k,) the inliers; the rest as for `log_ratio_by_image`. The
-    ratio is scaled by the share of degrees of freedom: a track of n views has 2 n residuals, but 2 n - 3 are free.
+    Residuals `off` (2, k) are in standard deviations, `right` (k,) are the inliers; else as `log_ratio_by_image`. The
+    ratio is scaled by the share of degrees of freedom: a track of n views has 2 n residuals, 2 n - 3 of them free.
     """
     right = right & (np.hypot(*off) < OUTLIER)
     free = 1.0 - 1.5 * len(np.unique(track[right])) / max(int(right.sum()), 1)
