@@ -282,7 +282,7 @@ def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> Non
         found("transient", 1, 9.0, 10.0, where=decay),
     ]
     layout = image_terms._layout_of(parts, 4)
-    waves, params = layout.waves, layout.start
+    waves, params = layout.additional, layout.start
     assert params is not None
     assert (waves.count, waves.edges.shape, waves.steps.shape) == (0, (4, 0), (4, 2, 5))
     np.testing.assert_array_equal(waves.steps[2], [rows, decay])
