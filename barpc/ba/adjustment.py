@@ -257,13 +257,13 @@ def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, 
     Points of check tracks and moving groups are triangulated with fixed cameras.
     """
     outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
-    moving = [measure(found.problem, params, parts.apart) for params in cameras]
+    moving = [measure(found.problem, params, parts.moving) for params in cameras]
     points = np.where(found.seen[:, None], found.final.points, np.nan)
     for one in (found.after, moving[1]):
         points[one.index] = one.points
     inner = found.before, found.outcome.residual
     before, after = (
-        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.apart.in_order(of_moving.residual.T)
+        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.moving.in_order(of_moving.residual.T)
         for one, out, of_moving in zip(inner, (found.start, found.after), moving, strict=True)
     )
     return points, before, after

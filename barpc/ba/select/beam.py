@@ -70,7 +70,7 @@ class _SearchState:
 
     @property
     def camera_fit(self) -> MixtureFit:
-        """The fit that gives the cameras, without a last term that is not estimated with them (`Term.FOLLOWED`)."""
+        """The fit with the final cameras: it leaves out a last term not estimated with them (`Term.FOLLOWED`)."""
         last = self.taken[-1]
         return self.seen.base if last.term.FOLLOWED else last.before.base
 
