@@ -209,7 +209,7 @@ def test_moving_ground_is_looked_for_where_a_region_shows_it(tracks: int, metres
         extra=nothing,
         sigma=np.zeros(0),
     )
-    assert MovingObjects.shows(seen) == shown
+    assert MovingObjects.may_move(seen) == shown
 
 
 def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:

@@ -288,7 +288,7 @@ class TermSearch:
         out = out or ([] if self.taken else self.first)
         made = self._with_fits([], self._most_promising(list(proposed(seen, out, periods))))
         made = self._refined(self._with_fits(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
-        moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
+        moves = out or self.group or (not self.taken and MovingObjects.may_move(seen))
         if moves and not (self._explains_all(made) and self._shows_no_motion(made[0])):
             made = self._sorted([row[:2] for row in (*made, *self._motion_candidates())])
         least = self.floor * _MIN_AMPLITUDE
@@ -325,7 +325,7 @@ class TermSearch:
         one, found, _ = candidate
         extra = np.concatenate([self.seen.extra, one.columns], axis=1)
         sigma = np.append(self.seen.sigma, one.sigma)
-        return not MovingObjects.shows(replace(self.seen, base=found, extra=extra, sigma=sigma))
+        return not MovingObjects.may_move(replace(self.seen, base=found, extra=extra, sigma=sigma))
 
     def _motion_candidates(self) -> list[_Candidate]:
         """Return the moving groups, and as their rivals displaced image parts that contain the same observations."""
