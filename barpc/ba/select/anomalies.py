@@ -44,9 +44,9 @@ def _find_significant(outcome: Outcome, block: Block, floor: float) -> list[Inte
 
 
 def unexplained_intervals(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return the significant intervals that correlated noise does not explain, with their median rejected residual.
+    """Return the significant intervals that correlated noise does not explain.
 
-    Rejected tracks are triangulated again from all of their observations.
+    Each has the median residual of its rejected tie points. Rejected tracks are triangulated from all observations.
     """
     found = significant_intervals(outcome, block, floor)
     if not all(one.by_share for one in found):  # correlated noise also displaces intervals

@@ -131,15 +131,15 @@ class _SearchState:
         return self
 
     def may_replace(self, best: _SearchState) -> bool:
-        """Return whether the state explains as much as `best` by as many terms, or by fewer and correlated noise."""
+        """Return whether the state gains as much as `best` with as many terms, or with fewer and correlated noise."""
         more = len(best.taken) - len(self.taken)
-        corrected = all(row.term.FOLLOWED for row in self.taken)  # a state with terms only reported replaces none
+        corrected = all(row.term.FOLLOWED for row in self.taken)  # terms that are only reported do not correct images
         if not corrected or best.has_motion or more < 0:
             return False
         return best.gain - self.gain <= (_noise_evidence(self.seen) if more else 0.0)
 
     def other_views(self, states: list[_SearchState]) -> list[tuple[int, ...]]:
-        """Return for each term the other views it may belong to: other states gain as much and differ in it alone."""
+        """Return for each term its alternative views, from states that differ only in this view and gain as much."""
         found: list[set[int]] = [set(row.or_of) for row in self.taken]
         for state in states:
             differ = [n for n, (a, b) in enumerate(zip(self.taken, state.taken, strict=False)) if a.name != b.name]
@@ -189,7 +189,7 @@ def _generalises(one: Term, other: Term) -> bool:
 
 
 def _gain_bound(row: _Candidate, best: Term, gain: float) -> float:
-    """Return a lower bound of the gain [nats] of a refined candidate, from that of a best term that it generalises."""
+    """Return a lower bound of the gain [nats] of a candidate after refinement: it may generalise the best term."""
     return max(row[2], gain + best.price - row[0].price) if _generalises(row[0], best) else row[2]
 
 

@@ -36,7 +36,7 @@ class Bands:
     ties: Block
     first: IntArray  # (M,) first observation of each pair: both are of one point
     second: IntArray  # (M,)
-    group: IntArray  # (5 M,) band of each offset: by column, by row in both images, and the whole pair
+    group: IntArray  # (5 M,) band of each offset: by columns and by rows of both images, and the whole pair
     count: IntArray  # (B,) number of offsets of each band
 
     @classmethod

@@ -63,7 +63,7 @@ class ForeignCamera:
 
     @property
     def may_be_distorted(self) -> bool:
-        """Whether terms of its rows and columns may explain it: the image shows the scene, but was not resected.
+        """Whether displaced rows or columns may explain it: the image shows the scene, but no single camera fits.
 
         False where few tie points identified the view: splines would fit these anywhere.
         """

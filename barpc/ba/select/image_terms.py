@@ -59,7 +59,7 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     # the search compared terms with row-wise errors of single images, but not with errors that all images have in
     # common: detector steps and platform jitter
     in_all = len({one.view for one in terms}) == len(parts.inner.views)
-    # a platform shakes in all images, but relative to one of them: then sinusoids appear in all but that one
+    # jitter of the platform is determined relative to one image, so its sinusoids may be absent from that one
     in_most = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
     if not (in_all or in_most):
         return tried

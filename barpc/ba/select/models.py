@@ -28,7 +28,7 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
-MAX_CAMERA_CHANGE = 0.06  # px, of epipolar offsets: a view of mostly rejected ties that changes others more is left out
+MAX_CAMERA_CHANGE = 0.06  # px: a view with mostly rejected tie points that changes the others by more is left out
 _AMBIGUOUS_VIEWS = 3  # in a block of so few views, any might be the wrong one
 
 
@@ -38,9 +38,7 @@ class SelectedModel:
 
     found: Solution
     parts: Parts
-    in_space_rms: float | None = (
-        None  # check RMS [px] of the geometric model; None: no affine in the images was selected
-    )
+    in_space_rms: float | None = None  # check RMS [px] of the geometric model, if an affine was selected
     foreign: ForeignCamera | None = None  # the view that was left out, or several candidates
     changed: float = 0.0  # largest median change of epipolar offsets from the plain model [px] (`Comparison`)
 
@@ -221,7 +219,7 @@ def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts
 
 
 def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
-    """Return the solution with the last moving group, or with the ground in its place where the priors favour it.
+    """Exchange the last moving group and the ground, if the priors of the cameras favour that.
 
     The smaller group was taken as moving, but in one block of twenty (`LEVEL`) clouds may cover most of the ground.
     Cameras that fit the clouds deviate more from their priors. With control nothing is exchanged.
@@ -255,7 +253,7 @@ def _without_moving_ground(
         if last is None or last.moved is None:
             findings = list(selected.findings)
             break
-        # the plain model has no terms, so an error may look like motion; or a larger term leaves an apparent motion
+        # an error may look like motion if the plain model has no term for it, or if a larger term leaves a remainder
         if options.is_plain or any(row.gain > last.gain for row in findings):
             break
         less = parts.with_group(found, last.moved)

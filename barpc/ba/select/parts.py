@@ -16,7 +16,7 @@ from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
-_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov statistic of the rows of two groups, if a tenth of each is in the other
+_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov distance of the rows of two groups: a tenth of each may be beyond one row
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
@@ -75,7 +75,7 @@ class Parts:
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
 
     def is_split_by_row(self) -> bool:
-        """Return whether in every image one row separates the last moving group from the ground, but for a tenth."""
+        """Return whether a row of every image separates the last moving group from the ground, but a tenth of each."""
         number = self.group.max(initial=0)
         ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
         for v in range(len(self.block.views)):
