@@ -37,7 +37,7 @@ class Decaying(Term):
         return replace(self, columns=np.concatenate([self.columns, slope], axis=1), sigma=np.tile(self.sigma, 2))
 
     def with_rate_of(self, found: MixtureFit) -> Self:
-        """Return the term with the rate of a fit `with_rate_derivatives`, but the old columns; a factor e at most."""
+        """Return the term with the rate of a fit with derivatives, within a factor of e; its columns are unchanged."""
         moved, slope = np.split(found.extra[-2 * len(self.sigma) :], 2)
         step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
         *place, rate = self.where  # type: ignore[misc]

@@ -191,7 +191,7 @@ _REGIONS = _regions()
 
 
 def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
-    """Return the best regions, without those of which more than half overlaps a better one (of their union)."""
+    """Return the `_STARTS` best regions, none of which shares more than half of their union with a better one."""
     found: list[BoolArray] = []
     for n in np.argsort(-gains, kind="stable"):
         one = regions[n]

@@ -109,7 +109,7 @@ class Term:
     def differs(self, other: Term) -> bool:
         """Return whether another term is a different hypothesis.
 
-        Terms of one kind at overlapping intervals of an axis of a view are not, nor is a term and a term of such parts.
+        Terms of one kind at overlapping intervals of an axis of a view are not, nor are a term and one of its parts.
         """
         if self.view == other.view and (self._is_part_of(other) or other._is_part_of(self)):
             return False
