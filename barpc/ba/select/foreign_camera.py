@@ -43,7 +43,7 @@ class ForeignCamera:
     """A view whose RPC contradicts the other views, or several candidates between which tie points do not decide."""
 
     views: tuple[int, ...]  # candidates, the likeliest first; with more than one no camera is changed
-    gain: float  # log-likelihood ratio [nats] of a higher outlier rate of this view; NaN: found by its prior
+    gain: float  # log-likelihood ratio [nats] of an own outlier rate over the usual one; NaN: found by its prior
     gap: float  # evidence [nats] over the runner-up, the view whose removal explains the tie points second best
     runner_up: int | None
     contradicted: float  # outlier rate of its tie points after resection; NaN: unknown
