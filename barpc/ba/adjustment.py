@@ -24,7 +24,7 @@ from barpc.ba.result import Adjustment, height_derivatives
 from barpc.ba.robust.consensus import two_groups
 from barpc.ba.robust.heldout import enu_offsets, keep_out, measure
 from barpc.ba.robust.rounds import Outcome
-from barpc.ba.select.anomalies import left_over
+from barpc.ba.select.anomalies import unexplained_intervals
 from barpc.ba.select.champion import largest_offset
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver
 from barpc.ba.select.models import SelectedModel, select_model
@@ -237,7 +237,7 @@ def _adjustment(
         asked=found.asked,
         findings=tuple(_reported_findings(found, parts, points)),
         moving=parts.block.in_order(parts.group > 0)[ties],
-        left=(*left_over(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
+        left=(*unexplained_intervals(outcome, block, options.noise_floor), *parts.mostly_moving(outcome.inlier)),
         alike=_neighbour_correlation(block, outcome, is_tie),
         in_space_rms=model.in_space_rms,
         changed=model.changed,
@@ -257,13 +257,13 @@ def _points_and_residuals(found: Solution, parts: Parts) -> tuple[Array, Array, 
     Points of check tracks and moving groups are triangulated with fixed cameras.
     """
     outer, cameras = parts.outer, (found.problem.camera_prior.mean, found.final.params)
-    moving = [measure(found.problem, params, parts.apart) for params in cameras]
+    moving = [measure(found.problem, params, parts.moving) for params in cameras]
     points = np.where(found.seen[:, None], found.final.points, np.nan)
     for one in (found.after, moving[1]):
         points[one.index] = one.points
     inner = found.before, found.outcome.residual
     before, after = (
-        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.apart.in_order(of_moving.residual.T)
+        parts.inner.in_order(one.T) + outer.in_order(out.residual.T) + parts.moving.in_order(of_moving.residual.T)
         for one, out, of_moving in zip(inner, (found.start, found.after), moving, strict=True)
     )
     return points, before, after

@@ -340,8 +340,8 @@ def test_a_view_is_its_own_where_a_solution_keeps_its_ties_and_none_move() -> No
         inlier[: 4 - kept] = False
         found: Any = SimpleNamespace(outcome=SimpleNamespace(inlier=inlier))
         group = np.where(np.arange(12) == 11, int(moves), 0)
-        assert Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 0) == own
-        assert Parts(block, np.zeros(12, dtype=bool), group).keeps(found, 1) == (not moves)
+        assert Parts(block, np.zeros(12, dtype=bool), group).fits_view(found, 0) == own
+        assert Parts(block, np.zeros(12, dtype=bool), group).fits_view(found, 1) == (not moves)
 
 
 @pytest.mark.parametrize(

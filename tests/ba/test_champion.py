@@ -182,12 +182,12 @@ def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: floa
         inside[rows] = (ties.xy[1, rows] >= edges[0]) & (ties.xy[1, rows] <= edges[1])
     inside ^= rng.random(len(inside)) < 0.05
     parts = models.Parts(ties, np.zeros_like(inside), inside.astype(np.int64))
-    assert parts.lies_across() == across
+    assert parts.is_split_by_row() == across
     few = rng.random(len(inside)) < 0.05  # nearly all others lie on one side of some row: that tells nothing
-    assert not models.Parts(ties, np.zeros_like(few), few.astype(np.int64)).lies_across()
+    assert not models.Parts(ties, np.zeros_like(few), few.astype(np.int64)).is_split_by_row()
     swapped = parts.exchanged()
     np.testing.assert_array_equal(swapped.group > 0, ~inside)
-    assert swapped.lies_across() == across
+    assert swapped.is_split_by_row() == across
 
 
 @pytest.mark.nightly
@@ -201,7 +201,7 @@ def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(m
     found = adjust_tracks(made.views, mixed)
     assert found.apart is None  # its wrong matches lie anywhere and are cut: the others stay as without it
     three = adjust_tracks(made.views[:3], tracks.select(tracks.view < 3))
-    monkeypatch.setattr(models, "MOST_BENT", 1e-9)
+    monkeypatch.setattr(models, "MAX_CAMERA_CHANGE", 1e-9)
     alone = adjust_tracks(made.views, mixed)
     assert alone.apart is not None
     assert (alone.apart.views, alone.apart.clear) == ((3,), True)

@@ -12,7 +12,7 @@ from barpc.ba import Adjustment, adjust_tracks
 from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import ALIKE_SIGMA, JointPrior
 from barpc.ba.terms import CommonEdge
-from barpc.ba.terms.common_edge import score
+from barpc.ba.terms.common_edge import edge_gains
 from barpc.report.measures.block import explanations
 from barpc.report.outcome import triangulate_tracks
 from barpc.simulate import simulate_block
@@ -120,7 +120,7 @@ def test_the_prior_is_of_differences_alone() -> None:
 
 def test_the_score_is_that_of_every_place_by_itself() -> None:
     seen = residuals_of(step(0.5, 1, 0.4, 1.0, axis=0), tracks=60)
-    col, gain = score(seen)
+    col, gain = edge_gains(seen)
     linear, left = seen.linear, seen.linear.residual_after(seen.base.step)
     for n in (0, len(col) // 3, len(col) // 2, len(col) - 1):
         pull, known = np.zeros(2), np.eye(2)
@@ -142,5 +142,5 @@ def displaced(px: float, start: float) -> Displacement:
 
 def test_the_largest_score_is_at_the_edge() -> None:
     seen = residuals_of(displaced(3.0, 0.4), tracks=300)
-    col, gain = score(seen)
+    col, gain = edge_gains(seen)
     assert abs(col[gain.argmax()] - 0.4 * seen.size[0, 0]) < 0.02 * seen.size[0, 0]

@@ -192,7 +192,7 @@ def test_terms_of_all_images_compete_with_splines_and_detectors(monkeypatch, kin
     terms: Any = [SimpleNamespace(kind=kind, view=v, where=(axis,), moved=None, gain=9.0) for v, kind in kinds.items()]
     for name, value in (
         ("_layout_of", None), ("_at_selection", Ended("found", 9)), ("_solve_with", Ended("tried", 2)),
-        ("with_splines", Ended("whole", whole)), ("standing_out", []),
+        ("with_splines", Ended("whole", whole)), ("significant_intervals", []),
     ):  # fmt: skip
         monkeypatch.setattr(image_terms, name, lambda *_, value=value: value)
     monkeypatch.setattr(image_terms, "is_better", lambda one, other, outer: one < other)
@@ -282,7 +282,7 @@ def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> Non
         found("transient", 1, 9.0, 10.0, where=decay),
     ]
     layout = image_terms._layout_of(parts, 4)
-    waves, params = layout.waves, layout.start
+    waves, params = layout.additional, layout.start
     assert params is not None
     assert (waves.count, waves.edges.shape, waves.steps.shape) == (0, (4, 0), (4, 2, 5))
     np.testing.assert_array_equal(waves.steps[2], [rows, decay])

@@ -68,7 +68,7 @@ def choose(monkeypatch, skew: bool, trend: bool, error: float, rms: float, **giv
         trending = trend and options.model != "affine"
         return Said(options.model, after, is_skew=skew, has_trend=trending, goes_on=prior is not None)
 
-    monkeypatch.setattr(models, "standing_out", lambda *_: [])
+    monkeypatch.setattr(models, "significant_intervals", lambda *_: [])
     monkeypatch.setattr(models, "with_splines", lambda found, *_: found)
     monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
     monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
@@ -138,7 +138,7 @@ def test_what_an_affine_explains_wholly_no_parts_of_images_are_asked_to(monkeypa
         asked.append("strips")
         return found
 
-    monkeypatch.setattr(models, "standing_out", lambda *_: out)
+    monkeypatch.setattr(models, "significant_intervals", lambda *_: out)
     monkeypatch.setattr(models, "with_splines", lambda found, *_: found)
     monkeypatch.setattr(models, "with_terms", without_strips)
     monkeypatch.setattr(models, "_without_moving_ground", without_moving)

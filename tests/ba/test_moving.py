@@ -209,7 +209,7 @@ def test_moving_ground_is_looked_for_where_a_region_shows_it(tracks: int, metres
         extra=nothing,
         sigma=np.zeros(0),
     )
-    assert MovingObjects.shows(seen) == shown
+    assert MovingObjects.may_move(seen) == shown
 
 
 def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
@@ -268,7 +268,7 @@ def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
     assert everywhere.side == ""
     assert everywhere.share == pytest.approx(0.2, abs=0.01)
     assert parts.is_tied()
-    assert [len(part.view) for part in (parts.inner, parts.apart)] == [int((~moves).sum()), int(moves.sum())]
+    assert [len(part.view) for part in (parts.inner, parts.moving)] == [int((~moves).sum()), int(moves.sum())]
     lost = replace(parts, group=(block.view == 1).astype(np.int64))
     assert not lost.is_tied()
     alone = replace(parts, group=np.isin(block.point, block.point[block.view == 0]) & (block.view > 0))
@@ -291,7 +291,7 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr("barpc.ba.select.parts.members", of_share)
         one: Any = SimpleNamespace(member=parts.inner.point % share == 0)
         gone = (parts.group == 0) & (block.point % share == 0)
-        less = parts.less(found, one)
+        less = parts.with_group(found, one)
         np.testing.assert_array_equal(less.group, np.where(gone, number, parts.group))
         parts = less
     assert [len(part.view) for part in asked[1::2]] == [0, 0]  # no control points

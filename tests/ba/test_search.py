@@ -14,8 +14,8 @@ from barpc.ba.constraints.block import Block, join
 from barpc.ba.evidence.scan import Interval
 from barpc.ba.robust.rounds import Outcome
 from barpc.ba.select import anomalies, search
-from barpc.ba.select.anomalies import shared_errors
-from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _SelectedTerm, _uncovered
+from barpc.ba.select.anomalies import log_ratio_by_image
+from barpc.ba.select.beam import Selection, TermSearch, _overlap, _SearchState, _SelectedTerm, _without_overlaps
 from barpc.ba.select.search import linearised_among, search_terms
 from barpc.ba.solution import solve_block
 from barpc.ba.terms import TERMS
@@ -289,7 +289,7 @@ def test_intervals_are_the_same_whose_most_is_common(one, other, same) -> None:
     assert not _overlap(interval(*one), interval(*other, view=1))
     assert not _overlap(interval(*one), interval(*other, axis=0))
     rows = [interval(*one), interval(*other), interval(50, 60)]
-    assert _uncovered(rows) == ([rows[0], rows[2]] if same else rows)
+    assert _without_overlaps(rows) == ([rows[0], rows[2]] if same else rows)
 
 
 @pytest.mark.parametrize(("seed", "also"), [(2, (0,)), (1, ())])
@@ -316,7 +316,7 @@ def placed(kind: str, view: int = 0) -> Term:
 def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_that_may_pass_it() -> None:
     base = combined().seen.base
     for count, kind, ended in ((4, "step", False), (5, "step", True), (0, "moving_objects", True)):
-        found = combined(*[("step", 0, 9.0)] * count).added([(placed(kind), base, 20.0)])
+        found = combined(*[("step", 0, 9.0)] * count).with_best_of([(placed(kind), base, 20.0)])
         assert (found.ended, found.gain) == (ended, 9.0 * count + 20.0)
     # as many more as the other has and two, none gaining more than the last
     for best, may in (((60.0, 59.0), True), ((60.0, 60.0), False)):
@@ -326,13 +326,14 @@ def test_a_combination_ends_with_six_terms_or_moving_ground_and_another_goes_on_
         assert combined(("step", 0, 30.0), ("step", 0, 20.0)).may_exceed(noise) == may
     best, other = combined(("sinusoid", 1, 60.0)), combined(("decay", 0, 30.0))
     for beside, adds in ((30.0 - SURE + 0.1, True), (30.0 - SURE, False)):  # beside the best: no other way
-        assert other.adds_to(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
-    assert not other.adds_to(best, [(placed("decay", 1), base, 40.0)])
+        assert other.complements(best, [(placed("decay"), base, beside), (placed("step"), base, 90.0)]) == adds
+    assert not other.complements(best, [(placed("decay", 1), base, 40.0)])
     behind = combined(("step", 2, 50.0), ("decay", 0, 30.0))
-    assert not behind.adds_to(best, [(placed("decay"), base, 30.0)])  # what went before is another
-    assert behind.adds_to(combined(("step", 2, 50.0), ("sinusoid", 1, 60.0)), [(placed("decay"), base, 30.0)])
+    assert not behind.complements(best, [(placed("decay"), base, 30.0)])  # what went before is another
+    assert behind.complements(combined(("step", 2, 50.0), ("sinusoid", 1, 60.0)), [(placed("decay"), base, 30.0)])
     for rival, gap in ((0.5, 19.5), (-3.0, 20.0)):  # over nothing, where the runner-up is worse
-        assert combined().added([(placed("step"), base, 20.0), (placed("decay", 1), base, rival)]).taken[0].gap == gap
+        (row,) = combined().with_best_of([(placed("step"), base, 20.0), (placed("decay", 1), base, rival)]).taken
+        assert row.gap == gap
 
 
 # --- of a block that was solved ---------------------------------------------------------------------------------------
@@ -358,20 +359,20 @@ def solved(*moved: Displacement, views: int = 3, tracks: int = 250) -> Solved:
 
 def test_rows_that_stand_out_are_said_in_pixels_from_the_floor_on_and_looked_for_once() -> None:
     one = solved(STEP)
-    found = anomalies.standing_out(one.outcome, one.block, FLOOR)
+    found = anomalies.significant_intervals(one.outcome, one.block, FLOOR)
     assert found
     assert found[0].view == 1
     assert (found[0].start, found[0].stop) == pytest.approx((8000.0, 12000.0), abs=600.0)
     assert all(row.gain > SURE for row in found)
-    assert anomalies.standing_out(one.outcome, one.block, FLOOR) is found
-    means = [row for row in anomalies.standing_out(one.outcome, one.block, 0.0) if not row.by_share]
+    assert anomalies.significant_intervals(one.outcome, one.block, FLOOR) is found
+    means = [row for row in anomalies.significant_intervals(one.outcome, one.block, 0.0) if not row.by_share]
     assert all(0.0 < row.off < 2.1 for row in means)  # no more than what is displaced
-    assert not [row for row in anomalies.standing_out(one.outcome, one.block, 3.0) if not row.by_share]
+    assert not [row for row in anomalies.significant_intervals(one.outcome, one.block, 3.0) if not row.by_share]
     sound = solved()
-    assert anomalies.standing_out(sound.outcome, sound.block, FLOOR) == []
-    assert anomalies.left_over(sound.outcome, sound.block, FLOOR) == []
+    assert anomalies.significant_intervals(sound.outcome, sound.block, FLOOR) == []
+    assert anomalies.unexplained_intervals(sound.outcome, sound.block, FLOOR) == []
     # what was cut there lies off by what it is displaced, as the tracks of the others see it
-    left = anomalies.left_over(one.outcome, one.block, FLOOR)
+    left = anomalies.unexplained_intervals(one.outcome, one.block, FLOOR)
     apart = [row.apart for row in left if row.by_share and row.view == 1]
     assert apart
     assert 0.8 < max(apart) < 2.2
@@ -385,10 +386,10 @@ def test_periods_and_errors_that_neighbours_share_are_measured_by_the_ties_that_
     assert anomalies.correlated_noise_gain(sound.outcome, sound.block) < 2.0
     assert anomalies.correlated_noise_gain(shared.outcome, shared.block) > 50.0
     # means of cells are none of an image's part
-    means = anomalies.standing_out(shared.outcome, shared.block, FLOOR)
+    means = anomalies.significant_intervals(shared.outcome, shared.block, FLOOR)
     gain = anomalies.correlated_noise_gain(shared.outcome, shared.block)
     expected = [row for row in means if row.by_share or row.gain > gain]
-    assert len(anomalies.left_over(shared.outcome, shared.block, FLOOR)) == len(expected)
+    assert len(anomalies.unexplained_intervals(shared.outcome, shared.block, FLOOR)) == len(expected)
 
 
 def test_of_n_views_two_n_less_three_residuals_of_a_track_are_free_of_what_neighbours_share() -> None:
@@ -398,7 +399,7 @@ def test_of_n_views_two_n_less_three_residuals_of_a_track_are_free_of_what_neigh
     off = cell_errors(2.0, 1)(view, place / 1000.0) + rng.normal(0, 1, (2, 600))
     right = rng.random(600) < 0.9
     used = right & (np.hypot(*off) < 5.0)
-    whole = float(shared_errors(view[used], place[:, used], size, off[:, used]).sum())
+    whole = float(log_ratio_by_image(view[used], place[:, used], size, off[:, used]).sum())
     assert whole > 30.0
     for many, track in ((3, np.arange(600) // 3), (2, np.arange(600) // 2)):
         found = anomalies.correlated_log_ratio(view, place, size, off, right, track)

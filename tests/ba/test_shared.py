@@ -10,7 +10,7 @@ import pytest
 
 from barpc.ba import adjust_tracks
 from barpc.ba.select import anomalies
-from barpc.ba.select.anomalies import shared_errors
+from barpc.ba.select.anomalies import log_ratio_by_image
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make
 from tests.distributions import multivariate_normal
@@ -34,7 +34,7 @@ def test_noise_of_every_tie_by_itself_is_shared_by_no_neighbours() -> None:
     found = []
     for seed in range(20):
         view, place, off = ties(seed=seed)
-        found.append(shared_errors(view, place, SIZE, off))
+        found.append(log_ratio_by_image(view, place, SIZE, off))
     assert np.shape(found) == (20, 2)
     assert np.max(found) < 2.0
     assert np.mean(np.array(found) == 0.0) > 0.8
@@ -44,12 +44,12 @@ def test_noise_of_every_tie_by_itself_is_shared_by_no_neighbours() -> None:
 def test_errors_of_cells_are_found_in_the_view_that_has_them(side: int) -> None:
     view, place, off = ties()
     for size, least in ((1.0, 60.0), (2.0, 300.0)):
-        found = shared_errors(view, place, SIZE, with_cells(place, view, off, side, size, 1))
+        found = log_ratio_by_image(view, place, SIZE, with_cells(place, view, off, side, size, 1))
         assert found[0] < 2.0
         assert found[1] > least
         # whatever the unit
         smaller = 0.1 * with_cells(place, view, off, side, size, 1)
-        np.testing.assert_allclose(shared_errors(view, place, SIZE, smaller), found)
+        np.testing.assert_allclose(log_ratio_by_image(view, place, SIZE, smaller), found)
 
 
 def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) -> None:
@@ -57,7 +57,7 @@ def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) 
     off = with_cells(place, view, off, 2, 1.5, 0)
     monkeypatch.setattr(anomalies, "_SIDES", np.array([2]))
     monkeypatch.setattr(anomalies, "_CORRELATED_SHARES", np.array([0.6]))
-    found = shared_errors(view, place, SIZE, off)
+    found = log_ratio_by_image(view, place, SIZE, off)
     for v in range(2):
         mine = view == v
         values = off[:, mine] / np.sqrt((off[:, mine] ** 2).mean())
@@ -72,10 +72,10 @@ def test_the_gain_is_that_of_a_normal_distribution_less_the_choice(monkeypatch) 
 def test_few_ties_and_none_tell_nothing() -> None:
     view, place, off = ties(29)
     off = with_cells(place, view, off, 4, 9.0, 0)
-    np.testing.assert_array_equal(shared_errors(view, place, SIZE, off), 0.0)
+    np.testing.assert_array_equal(log_ratio_by_image(view, place, SIZE, off), 0.0)
     none = np.zeros((2, 0))
-    np.testing.assert_array_equal(shared_errors(np.zeros(0, np.int64), none, SIZE, none), 0.0)
-    np.testing.assert_array_equal(shared_errors(view, place, SIZE, np.zeros_like(off)), 0.0)
+    np.testing.assert_array_equal(log_ratio_by_image(np.zeros(0, np.int64), none, SIZE, none), 0.0)
+    np.testing.assert_array_equal(log_ratio_by_image(view, place, SIZE, np.zeros_like(off)), 0.0)
 
 
 def biased(world: World, size: float, side: int, seed: int) -> World:

@@ -127,7 +127,7 @@ def test_a_rate_s_change_is_a_further_unknown_that_a_fit_says() -> None:
         lambda rate: Transient.at_rate(s, -rate, 1.0),
     ):
         one, near = made(1.0 / 400.0), made(np.exp(step) / 400.0)
-        found = one.with_rate(s)
+        found = one.with_rate_derivatives(s)
         half = one.columns.shape[1]
         np.testing.assert_array_equal(found.columns[:, :half], one.columns)
         np.testing.assert_allclose(found.columns[:, half:], (near.columns - one.columns) / step, atol=1e-5)
@@ -139,11 +139,11 @@ def test_a_rate_s_change_is_a_further_unknown_that_a_fit_says() -> None:
 )
 def test_a_rate_changes_by_what_a_fit_asks_for_and_a_factor_e_at_most(moved, slope, step) -> None:
     one = Decay.at(seen(), 1, (1, 300.0, 4000.0, 300.0, 0.01), 1.0)
-    found = one.at_rate_of(fitted(60, [7.0, *moved, *slope]))
+    found = one.with_rate_of(fitted(60, [7.0, *moved, *slope]))
     assert found.where is not None
     assert found.where[:4] == (1, 300.0, 4000.0, 300.0)
     assert found.where[4] == pytest.approx(0.01 * np.exp(step))
-    assert one.at_rate_of(fitted(60, [0.0, 0.0, 1.0, 1.0])).where == one.where
+    assert one.with_rate_of(fitted(60, [0.0, 0.0, 1.0, 1.0])).where == one.where
 
 
 def test_a_low_frequency_displacement_has_as_many_splines_as_ties_hold() -> None:

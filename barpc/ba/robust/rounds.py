@@ -59,8 +59,8 @@ class Outcome(Minimum):
     prior: PriorTest  # comparison of the corrections with the given priors, and the estimated priors
     smooth: SmoothTest  # of the final residuals
     by_point: Array  # (2, 3, K) derivatives of the image points by the final ground points [px/m]
-    # cache of `select.anomalies.standing_out`: noise floor [px] -> significant intervals of the images
-    standing_out: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
+    # cache: noise floor [px] -> significant intervals of the images
+    significant_intervals: dict[float, list[Interval]] = field(default_factory=dict, init=False, repr=False)
 
 
 class Rounds:

@@ -1,9 +1,9 @@
 """Tests of the residuals of a solved block: significant intervals, periods and correlated noise.
 
-Rejected observations are tested with the others. Matching noise that neighbouring tie points share is the rival of
-every other explanation: templates overlap, and shadows or seasons displace neighbours the same way. A step, a sinusoid
-or a moving group may fit such noise, so a term must gain more evidence than noise of which a part is common to all tie
-points of a cell of the image.
+Rejected observations are tested with the others. Matching noise may be correlated between neighbouring tie points:
+templates overlap, and shadows or seasons displace neighbours the same way. A step, a sinusoid or a moving group may fit
+such noise. So a term must gain more evidence than a model of correlated noise: a part of the noise is common to all tie
+points in a cell of the image.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from barpc.base.statistics import FEW, OUTLIER, SURE
 from barpc.scene import BoolArray, IntArray
 
 _SIDES = 2 ** np.arange(2, 6)  # grids to try: cells along each side of an image
-_CORRELATED_SHARES = np.linspace(0.0, 1.0, 21)[1:-1]  # to try: part of the noise variance that is common to a cell
+_CORRELATED_SHARES = np.linspace(0.0, 1.0, 21)[1:-1]  # to try: part of the noise variance common to a cell
 
 
-def standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Find the intervals of images with significantly more rejected tie points, or a displacement above `floor` [px].
+def significant_intervals(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """Find the intervals of rows or columns with significantly many rejected tie points, or a displacement.
 
-    The result is cached in the outcome.
+    A displacement must exceed `floor` [px]. The result is cached in the outcome.
     """
-    if floor not in outcome.standing_out:
-        outcome.standing_out[floor] = _standing_out(outcome, block, floor)
-    return outcome.standing_out[floor]
+    if floor not in outcome.significant_intervals:
+        outcome.significant_intervals[floor] = _find_significant(outcome, block, floor)
+    return outcome.significant_intervals[floor]
 
 
-def _standing_out(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+def _find_significant(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
     rows, off = _whitened(outcome, block)
-    right = outcome.inlier[rows].astype(np.float64)  # inliers only: a few rejected ones would make a mean by chance
+    right = outcome.inlier[rows].astype(np.float64)  # means of inliers only: a few large outliers would shift them
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
     found = scan(block.view[rows], block.xy[:, rows], image_sizes(block), 1.0 - right, off, right, floor / pixel)
     return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
 
 
-def left_over(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
-    """Return the significant intervals of the result, with the median residual of rejected tie points in each.
+def unexplained_intervals(outcome: Outcome, block: Block, floor: float) -> list[Interval]:
+    """Return the significant intervals that correlated noise does not explain.
 
-    Tracks of which all observations were rejected are triangulated again from all of these.
+    Each has the median residual of its rejected tie points. Rejected tracks are triangulated from all observations.
     """
-    found = standing_out(outcome, block, floor)
-    if not all(one.by_share for one in found):  # correlated noise has means, too, and is no fault of an interval
+    found = significant_intervals(outcome, block, floor)
+    if not all(one.by_share for one in found):  # correlated noise also displaces intervals
         by_neighbours = correlated_noise_gain(outcome, block)
         found = [one for one in found if one.by_share or one.gain > by_neighbours]
     if not any(one.by_share for one in found):
@@ -77,7 +77,7 @@ def periods_of(outcome: Outcome, block: Block) -> list[Period]:
 
 
 def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
-    """Return the evidence for correlated over independent noise of the inliers [nats]."""
+    """Return the log-likelihood ratio [nats] of correlated over independent noise of the inliers of a block."""
     rows, off = _whitened(outcome, block)
     return correlated_log_ratio(
         block.view[rows], block.xy[:, rows], image_sizes(block), off, outcome.inlier[rows], block.point[rows]
@@ -87,17 +87,18 @@ def correlated_noise_gain(outcome: Outcome, block: Block) -> float:
 def correlated_log_ratio(
     view: IntArray, place: Array, size: Array, off: Array, right: BoolArray, track: IntArray
 ) -> float:
-    """Return the evidence for correlated noise [nats] in residuals `off` (2, k) [standard deviations] of tie points.
+    """Return the log-likelihood ratio [nats] of correlated over independent noise in all images.
 
-    The inliers are `right` (k,). It is scaled by degrees of freedom: 2 n - 3 of 2 n residuals in a track of n views.
+    Residuals `off` (2, k) are in standard deviations, `right` (k,) are the inliers; else as `log_ratio_by_image`. The
+    ratio is scaled by the share of degrees of freedom: a track of n views has 2 n residuals, 2 n - 3 of them free.
     """
     right = right & (np.hypot(*off) < OUTLIER)
     free = 1.0 - 1.5 * len(np.unique(track[right])) / max(int(right.sum()), 1)
-    return free * float(shared_errors(view[right], place[:, right], size, off[:, right]).sum())
+    return free * float(log_ratio_by_image(view[right], place[:, right], size, off[:, right]).sum())
 
 
 def _confirmed_observations(outcome: Outcome, block: Block) -> Array:
-    """Return 1 for all observations (K,) of points with two inliers, rejected ones included; else 0."""
+    """Return 1 for all observations (K,) of points with at least two inliers, rejected ones included; else 0."""
     right = np.bincount(block.point[outcome.inlier], minlength=block.num_points)
     return (right[block.point] >= 2).astype(np.float64)
 
@@ -116,8 +117,10 @@ def image_sizes(block: Block) -> Array:
     return np.array([view.size for view in block.views], dtype=np.float64).T
 
 
-def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Array:
-    """Return the log-likelihood ratio (N,) [nats] of noise that cells share over independent noise, for each image.
+def log_ratio_by_image(view: IntArray, place: Array, size: Array, off: Array) -> Array:
+    """Return the log-likelihood ratio (N,) [nats] of correlated over independent noise, for each image.
+
+    Correlated noise has a part that is common to all tie points in a cell of the image.
 
     Parameters
     ----------
@@ -127,8 +130,8 @@ def shared_errors(view: IntArray, place: Array, size: Array, off: Array) -> Arra
 
     Returns
     -------
-    The ratio of the best grid and shared part, less the logarithm of the number of both; at least 0. The two
-    coordinates are independent. Covariance of a cell (compound symmetry): (1 - a) I + a 11', a the shared part.
+    The ratio at the best grid and common part a, less the logarithm of the number of both tried; at least 0. The two
+    coordinates are independent. The covariance of a cell is (1 - a) I + a 11' (compound symmetry).
     """
     num = size.shape[1]
     count = np.bincount(view, minlength=num)

@@ -26,7 +26,7 @@ from barpc.scene import BoolArray
 
 logger = logging.getLogger(__name__)
 
-_LEAST_FLOORS = 2.5  # least amplitude of sinusoids and motions, in noise floors; images without faults show 1.8
+_MIN_AMPLITUDE = 2.5  # of sinusoids and motions, in noise floors; images without faults show up to 1.8
 _Candidate = tuple[Term, MixtureFit, float]
 """A term, the fit that includes it, and its gain of evidence [nats]."""
 
@@ -45,9 +45,9 @@ class _SelectedTerm:
     term: Term
     gain: float  # evidence over the state before [nats]
     gap: float  # evidence over the runner-up [nats]
-    runner_up: str  # kind of it
+    runner_up: str  # kind of the runner-up
     or_of: tuple[int, ...]  # other views with a similar gain
-    before: Residuals  # without the term
+    before: Residuals  # residuals without the term
 
     @property
     def name(self) -> tuple[str, int]:
@@ -59,7 +59,7 @@ class _SelectedTerm:
 class _SearchState:
     """A combination of terms."""
 
-    seen: Residuals  # beside these terms
+    seen: Residuals  # residuals with all terms of the combination
     taken: tuple[_SelectedTerm, ...] = ()  # in the order of selection
     ended: bool = False  # no further term is tried
 
@@ -69,45 +69,45 @@ class _SearchState:
         return sum(row.gain for row in self.taken)
 
     @property
-    def followed(self) -> MixtureFit:
-        """The fit with those terms that are estimated with the cameras: all, or all but the last."""
+    def camera_fit(self) -> MixtureFit:
+        """The fit with the final cameras: it leaves out a last term not estimated with them (`Term.FOLLOWED`)."""
         last = self.taken[-1]
         return self.seen.base if last.term.FOLLOWED else last.before.base
 
     @property
-    def moves(self) -> bool:
+    def has_motion(self) -> bool:
         """Whether the last term is a moving group."""
         return bool(self.taken) and self.taken[-1].term.group is not None
 
     @property
-    def gain_beside_motion(self) -> float:
+    def gain_without_motion(self) -> float:
         """Evidence gained by all terms but a moving group."""
-        return self.gain - (self.taken[-1].gain if self.moves else 0.0)
+        return self.gain - (self.taken[-1].gain if self.has_motion else 0.0)
 
     def may_pass(self, best: _SearchState) -> bool:
-        """Return whether further terms, each gaining at most as much as the last, may reach more than `best`."""
+        """Return whether the state may gain more than `best` if each further term gains as much as its last one."""
         left = RIVALS + len(best.taken) - 1 - len(self.taken)
         return self.gain + left * self.taken[-1].gain > best.gain
 
     def may_exceed(self, noise: float) -> bool:
-        """Return whether further terms, each gaining at most as much as the best, may exceed correlated `noise`."""
+        """Return whether the state may gain more than `noise` [nats] if each further term gains as much as its best."""
         return self.gain + (TRIED - len(self.taken)) * max(row.gain for row in self.taken) > noise
 
-    def adds_to(self, best: _SearchState, beside: list[_Candidate]) -> bool:
-        """Return whether its last term gains as much together with the best state: then it is no rival of that."""
+    def complements(self, best: _SearchState, beside: list[_Candidate]) -> bool:
+        """Return whether the last term is among the next candidates `beside` of `best`, with a similar gain."""
         last, one = self.taken[-1], self.taken[-1].term
         same = [row.name for row in self.taken[:-1]] == [row.name for row in best.taken[:-1]]
         gains = [row[2] for row in beside if row[0].NAME == one.NAME and not row[0].differs(one)]
         return same and max(gains, default=0.0) > last.gain - SURE
 
-    def added(self, tried: list[_Candidate]) -> _SearchState:
-        """Return the state with the best candidate; of complementary parts of an image with like gains the smaller."""
+    def with_best_of(self, tried: list[_Candidate]) -> _SearchState:
+        """Return the state with the first candidate of `tried`, or with a smaller part of its image of equal gain."""
         first = tried[0]
         same = [row for row in tried if row[2] > first[2] - SURE and _of_one_image(row[0], first[0])]
         one, made, gain = min(same, key=lambda row: row[0].share(self.seen))
         others = [row for row in tried if row[0] is not one and row[0].differs(one)]
         other = max(
-            ((row[0].NAME, _least_gain(row, one, gain)) for row in others), default=("", 0.0), key=itemgetter(1)
+            ((row[0].NAME, _gain_bound(row, one, gain)) for row in others), default=("", 0.0), key=itemgetter(1)
         )
         close = [row[0] for row in others if row[2] > gain - SURE]
         or_of = tuple(sorted({row.view for row in close if isinstance(row, Sinusoid) and isinstance(one, Sinusoid)}))
@@ -117,11 +117,11 @@ class _SearchState:
         seen = replace(self.seen, base=made, extra=extra, sigma=np.append(self.seen.sigma, one.sigma))
         return _SearchState(seen, taken, not one.FOLLOWED or len(taken) == TRIED)
 
-    def without_noise(self) -> _SearchState:
-        """Return the state without the last terms where correlated noise explains as much as these.
+    def without_noise_terms(self) -> _SearchState:
+        """Return the state without its last terms, if correlated noise explains the residuals as well as these.
 
-        They must gain more than the evidence for correlated noise falls by them, and more than that which is still. A
-        term counts correlated errors as independent ones, so its gain is too large.
+        Terms are kept if they gain more than the evidence for correlated noise falls by them, and more than remains of
+        it. The gain of a term is too large: it counts correlated errors as independent ones.
         """
         still = _noise_evidence(self.seen) if self.taken else 0.0
         for n, row in enumerate(self.taken):
@@ -130,16 +130,16 @@ class _SearchState:
                 return _SearchState(row.before, self.taken[:n])
         return self
 
-    def replaces(self, best: _SearchState) -> bool:
-        """Return whether it gains as much as `best` with as many terms, or with fewer and correlated noise."""
+    def may_replace(self, best: _SearchState) -> bool:
+        """Return whether the state gains as much as `best` with as many terms, or with fewer and correlated noise."""
         more = len(best.taken) - len(self.taken)
-        followed = all(row.term.FOLLOWED for row in self.taken)  # others do not correct their image
-        if not followed or best.moves or more < 0:
+        corrected = all(row.term.FOLLOWED for row in self.taken)  # terms that are only reported do not correct images
+        if not corrected or best.has_motion or more < 0:
             return False
         return best.gain - self.gain <= (_noise_evidence(self.seen) if more else 0.0)
 
     def other_views(self, states: list[_SearchState]) -> list[tuple[int, ...]]:
-        """Return for each term its alternative views: those in states that differ by it alone and gain as much."""
+        """Return for each term its alternative views, from states that differ only in this view and gain as much."""
         found: list[set[int]] = [set(row.or_of) for row in self.taken]
         for state in states:
             differ = [n for n, (a, b) in enumerate(zip(self.taken, state.taken, strict=False)) if a.name != b.name]
@@ -153,7 +153,7 @@ class _SearchState:
         state = self
         for n, row in enumerate(self.taken):
             seen, plain = state.seen, row.term.simpler(state.seen)
-            if plain is None or state.moves:
+            if plain is None or state.has_motion:
                 continue
             at = slice(*(sum(len(one.term.sigma) for one in state.taken[: n + k]) for k in (0, 1)))
             extra = seen.extra.copy()
@@ -170,27 +170,27 @@ class _SearchState:
         for row, views in zip(self.taken, or_of, strict=True):
             start, stop = stop, stop + len(row.term.sigma)
             unknowns = self.seen.base.extra[start:stop]
-            # a term that was not the best of its step won together with the others: by the margin of these
+            # a term that was not the best of its step was selected for the gain of the combination
             gap = row.gap if row.gap > 0.0 else margin
             yield from row.term.findings(
                 self.seen, unknowns, gain=row.gain, gap=gap, runner_up=row.runner_up, or_of=views
             )
 
 
-def _contains(one: Term, other: Term) -> bool:
-    """Return whether `other` is a limit of a term: an infinitely long decay is a step, or the complement of one."""
+def _generalises(one: Term, other: Term) -> bool:
+    """Return whether a term has `other` as a limit: an infinitely long decay is a step, or the complement of a step."""
     if not _of_one_image(one, other) or one.price <= other.price:
         return False
     assert one.where is not None
     assert other.where is not None
     (axis, start, stop, _, rate), (axis2, *ends) = one.where, other.where[:3]
-    size = 0.5 * stop if rate > 0.0 else -start  # an open end as of `open_ended`
+    size = 0.5 * stop if rate > 0.0 else -start  # of the image, from the open end (`open_ended`)
     return axis == axis2 and (ends[0] == -size or ends[1] == 2.0 * size)
 
 
-def _least_gain(row: _Candidate, best: Term, gain: float) -> float:
-    """Return the least gain of a candidate once refined: one that contains the best gains as much, less its price."""
-    return max(row[2], gain + best.price - row[0].price) if _contains(row[0], best) else row[2]
+def _gain_bound(row: _Candidate, best: Term, gain: float) -> float:
+    """Return a lower bound of the gain [nats] of a candidate after refinement: it may generalise the best term."""
+    return max(row[2], gain + best.price - row[0].price) if _generalises(row[0], best) else row[2]
 
 
 def _of_one_image(one: Term, other: Term) -> bool:
@@ -204,7 +204,7 @@ def _residuals(found: MixtureFit, linear: Linear, extra: Array) -> Array:
 
 
 def _noise_evidence(seen: Residuals) -> float:
-    """Return the evidence for correlated noise beside the terms taken [nats], without moving tracks."""
+    """Return the log-likelihood ratio [nats] of correlated over independent noise beside the terms of a state."""
     found, linear = seen.base, seen.linear
     off, _ = residuals_from_inliers(linear, _residuals(found, linear, seen.extra), found.right)
     track = np.full(len(linear.view), -1)
@@ -213,7 +213,7 @@ def _noise_evidence(seen: Residuals) -> float:
     right = (track >= 0) & (found.right > 0.5)
     if len(found.moving):
         right &= found.moving < 0.5
-    # residuals beyond the outlier limit are no matching noise, and do not count
+    # residuals beyond the outlier limit are no matching noise, and are ignored
     return correlated_log_ratio(linear.view, seen.place, seen.size, off, right, track)
 
 
@@ -223,8 +223,9 @@ class TermSearch:
     Parameters
     ----------
     seen : Residuals
+        The linearised block without terms.
     first : list of Interval
-        Significant intervals before the first term.
+        Significant intervals of the solved block.
     floor, sigma : float, least displacement to find, and standard deviation of observations [px]
     """
 
@@ -240,20 +241,20 @@ class TermSearch:
         states, noise = first, _noise_evidence(self.start)
         while not ended and any(state.may_exceed(noise) for state in states):
             states, ended = self._extended(states)
-        if first[0].moves and states[0].gain_beside_motion < first[0].gain:
+        if first[0].has_motion and states[0].gain_without_motion < first[0].gain:
             # the terms beside the moving group gain less than it did alone: it is taken alone
             states = first[:1]
         margin = states[0].gain - (states[1].gain if len(states) > 1 else 0.0)
-        reduced = [state.without_noise() for state in states]
+        reduced = [state.without_noise_terms() for state in states]
         best = reduced[0]
         for state in sorted(reduced[1:], key=lambda state: -state.gain):
-            if state.replaces(best):
+            if state.may_replace(best):
                 best, margin = state, max(state.gain - best.gain, 0.0)
         or_of = best.other_views(reduced)
         best = best.simplified()
         if not best.taken:
             return Selection()
-        return Selection(tuple(best.findings(margin, or_of)), best.followed.step, best.followed.right)
+        return Selection(tuple(best.findings(margin, or_of)), best.camera_fit.step, best.camera_fit.right)
 
     def _extended(self, states: list[_SearchState]) -> tuple[list[_SearchState], bool]:
         """Return the best combinations with one more term, and whether the search ends with them."""
@@ -262,7 +263,7 @@ class TermSearch:
             if state.ended or (best.ended and not state.may_pass(best)):
                 grown.append(state)
                 continue
-            if state is not best and state.adds_to(best, beside):
+            if state is not best and state.complements(best, beside):
                 continue
             self.seen, self.taken = state.seen, state.taken
             tried = [row for row in self._candidates() if row[2] > SURE]
@@ -270,7 +271,7 @@ class TermSearch:
                 return states, True
             beside = tried if state is best else beside
             for n in [0, *_rivals(tried)] if tried else []:
-                grown.append(state.added([tried[n], *tried[:n], *tried[n + 1 :]]))
+                grown.append(state.with_best_of([tried[n], *tried[:n], *tried[n + 1 :]]))
             grown += [] if tried else [replace(state, ended=True)]
         kept: list[_SearchState] = []
         for state in sorted(grown, key=lambda state: -state.gain):
@@ -282,27 +283,27 @@ class TermSearch:
     def _candidates(self) -> list[_Candidate]:
         """Return the candidates for the next term, the best first; gains may be negative."""
         seen = self.seen
-        out, periods = self._standing_out(seen.base, seen.extra)
-        # in pairs a fit with more wrong matches may hide an interval: those of the rejected observations are used then
+        out, periods = self._significant(seen.base, seen.extra)
+        # the fit to a pair may explain an interval by wrong matches: then the intervals of the solved block are used
         out = out or ([] if self.taken else self.first)
         made = self._with_fits([], self._most_promising(list(proposed(seen, out, periods))))
         made = self._refined(self._with_fits(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
-        moves = out or self.group or (not self.taken and MovingObjects.shows(seen))
-        if moves and not (self._explains_all(made) and self._stands_still(made[0])):
+        moves = out or self.group or (not self.taken and MovingObjects.may_move(seen))
+        if moves and not (self._explains_all(made) and self._shows_no_motion(made[0])):
             made = self._sorted([row[:2] for row in (*made, *self._motion_candidates())])
-        least = self.floor * _LEAST_FLOORS
+        least = self.floor * _MIN_AMPLITUDE
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)
 
-    def _standing_out(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
+    def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         """Return the significant intervals and periods beside a fit with terms of columns `extra` (2, e, K).
 
-        They are cached: the fit of the best candidate is tested after its refinement, and again as the next state.
+        They are cached by the fit: that of the best candidate is tested here and again in the next step.
         """
         if id(found) not in self.tested:
-            self.tested[id(found)] = found, *self._significant(found, extra)
+            self.tested[id(found)] = found, *self._find_significant(found, extra)
         return self.tested[id(found)][1:]
 
-    def _significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
+    def _find_significant(self, found: MixtureFit, extra: Array) -> tuple[list[Interval], list[Period]]:
         seen, linear = self.seen, self.seen.linear
         rows = linear.in_tracks
         wrong, view, place = (1.0 - found.right)[rows], linear.view[rows], seen.place[:, rows]
@@ -310,35 +311,35 @@ class TermSearch:
         off, weight = all_residuals[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
         out = [one for one in scan(view, place, seen.size, wrong, off, weight, floor) if one.gain > SURE]
-        return _uncovered(out)[:RIVALS], find_periods(view, place[1], seen.size, weight, off)[:RIVALS]
+        return _without_overlaps(out)[:RIVALS], find_periods(view, place[1], seen.size, weight, off)[:RIVALS]
 
     def _explains_all(self, made: list[_Candidate]) -> bool:
         """Return whether no residuals are significant beside the best candidate: it needs no rival then."""
         if not made or made[0][2] <= SURE or not made[0][0].FOLLOWED:
             return False
         one, found, _ = made[0]
-        return not any(self._standing_out(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
+        return not any(self._significant(found, np.concatenate([self.seen.extra, one.columns], axis=1)))
 
-    def _stands_still(self, candidate: _Candidate) -> bool:
-        """Return whether no region of the ground moves beside a candidate, by a score test."""
+    def _shows_no_motion(self, candidate: _Candidate) -> bool:
+        """Return whether a score test finds no moving region of the ground beside a candidate."""
         one, found, _ = candidate
         extra = np.concatenate([self.seen.extra, one.columns], axis=1)
         sigma = np.append(self.seen.sigma, one.sigma)
-        return not MovingObjects.shows(replace(self.seen, base=found, extra=extra, sigma=sigma))
+        return not MovingObjects.may_move(replace(self.seen, base=found, extra=extra, sigma=sigma))
 
     def _motion_candidates(self) -> list[_Candidate]:
-        """Return moving groups, searched for once, and displaced parts of images with the same observations."""
+        """Return the moving groups, and as their rivals displaced image parts that contain the same observations."""
         self.group = self.group or list[Term](MovingObjects.of(self.seen))
         found = self._with_fits([], self.group)
         rows = self.seen.linear.in_tracks
-        members = [(one, row[1]) for row in found if row[2] > SURE for one in self._parts_with_members(row[1], rows)]
-        fits = [(one, self._fit(one, base=still)) for one, still in members]  # cameras of the still tracks
+        members = [(one, row[1]) for row in found if row[2] > SURE for one in self._parts_at_motion(row[1], rows)]
+        fits = [(one, self._fit(one, base=still)) for one, still in members]  # from the cameras of still tracks
         return self._refined(self._sorted([*(row[:2] for row in found), *fits]))
 
     def _refined(self, made: list[_Candidate]) -> list[_Candidate]:
-        """Return the candidates, best first, with ends, periods and lengths refined where these may gain most.
+        """Return the candidates, best first; ends, periods and lengths of the most promising are refined.
 
-        Where no residuals are significant beside the best, terms that contain it are not refined.
+        If no residuals are significant beside the best, terms that generalise it are not refined.
         """
         kinds = [kind for kind in TERMS.values() if kind.LOCAL]
         local = [one for kind in kinds for one in [row[0] for row in made if isinstance(row[0], kind)][:RIVALS]]
@@ -347,13 +348,13 @@ class TermSearch:
         out, enough = list[tuple[Term, MixtureFit]](), False
         for one, found, gain in made:
             asked = gain > least and (one in local or not (one.LOCAL or one.group))
-            same = enough and _contains(one, made[0][0])
-            out.append(self._refine(one, found) if asked and not same else (one, found))
+            same = enough and _generalises(one, made[0][0])
+            out.append(self._refine_one(one, found) if asked and not same else (one, found))
             enough = self._explains_all(self._sorted(out)) if len(out) == 1 else enough
         return self._sorted(out)
 
     def _most_promising(self, offered: list[Term]) -> list[Term]:
-        """Return the terms whose gain, by a sample of tracks, is at least a `RIVALS`-th of the best."""
+        """Return the terms that gain at least 1 / `RIVALS` of the best gain, on a sample of tracks."""
         few, linear = self.seen.few, self.seen.linear
         if 2 * np.count_nonzero(few.in_tracks) > np.count_nonzero(linear.in_tracks) or len(offered) < 3:
             return offered  # the sample saves too little
@@ -362,8 +363,8 @@ class TermSearch:
         least = max(gains) / RIVALS if max(gains) > SURE else -np.inf
         return [one for one, gain in zip(offered, gains, strict=True) if gain >= least]
 
-    def _parts_with_members(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
-        """Yield displaced parts of images that contain a moving group: they may be its cause."""
+    def _parts_at_motion(self, found: MixtureFit, rows: BoolArray) -> Iterator[Term]:
+        """Yield displaced image parts where the moving tracks of a fit concentrate: they may be the true cause."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
         best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
@@ -378,14 +379,15 @@ class TermSearch:
         base = self.seen.base.evidence
         return sorted(((*row, row[1].evidence - base - row[0].price) for row in made), key=lambda row: -row[2])
 
-    def _refine(self, one: Term, found: MixtureFit) -> tuple[Term, MixtureFit]:
+    def _refine_one(self, one: Term, found: MixtureFit) -> tuple[Term, MixtureFit]:
+        """Return a term and its fit after alternate refinement of the shape and fits of all unknowns (backfitting)."""
         for _ in range(BACKFITTING):
             others = np.einsum("cek,e->ck", self.seen.extra, found.extra[: -len(one.sigma)])
             better, made = found, one
             for shape in one.shapes(self.seen, self._fit):
                 again = shape.refined(self.seen, found, others)
                 if not _unchanged(again, one):
-                    # a fit of as many unknowns is a start
+                    # a fit with as many unknowns gives start values
                     fitted = self._fit(again, base=found if len(again.sigma) == len(one.sigma) else None)
                     more = fitted.evidence - again.price > better.evidence - made.price
                     better, made = (fitted, again) if more else (better, made)
@@ -396,13 +398,14 @@ class TermSearch:
         return one, found
 
     def _fit(self, one: Term, linear: Linear | None = None, base: MixtureFit | None = None) -> MixtureFit:
+        """Return the fit with a term added; `base` gives the start values."""
         seen, sigma = self.seen, np.append(self.seen.sigma, one.sigma)
         extra = np.concatenate([seen.extra, one.columns], axis=1)
         return fit_mixture(linear or seen.linear, extra, sigma, base or seen.base, one.group)
 
 
 def _unchanged(one: Term, before: Term) -> bool:
-    """Return whether a term has the place of `before`, and nearly the same prior."""
+    """Return whether a refined term has the same place as `before`, and nearly the same prior."""
     same = one.where == before.where and len(one.sigma) == len(before.sigma)
     return same and bool((np.abs(np.log(one.sigma / before.sigma)) < STANDS).all())
 
@@ -416,7 +419,7 @@ def _rivals(tried: list[_Candidate]) -> list[int]:
     return list(found.values())[: RIVALS - 1]
 
 
-def _uncovered(intervals: list[Interval]) -> list[Interval]:
+def _without_overlaps(intervals: list[Interval]) -> list[Interval]:
     """Return the intervals, the best first, without those that mostly overlap a better one."""
     out: list[Interval] = []
     for one in intervals:
@@ -426,6 +429,7 @@ def _uncovered(intervals: list[Interval]) -> list[Interval]:
 
 
 def _overlap(one: Interval, other: Interval) -> bool:
+    """Return whether more than half of the union of two intervals is common to both."""
     common = min(one.stop, other.stop) - max(one.start, other.start)
     either = max(one.stop, other.stop) - min(one.start, other.start)
     return (one.view, one.axis) == (other.view, other.axis) and 2.0 * common > either

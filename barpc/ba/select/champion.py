@@ -26,17 +26,17 @@ _PAIRS_PER_OBSERVATION = 2  # number of following observations of the track with
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Epipolar offsets of pairs of a block's tie points, by pair of images and by eighths of their rows and columns.
+    """Pairs of images, and eighths of their rows and columns, with the epipolar offsets of their tie points.
 
-    An offset is the distance [px] of an observation from the epipolar line of another of its track, in its own image.
-    It does not depend on the ground point: it is the product of both residuals with the left null vector of their
-    derivatives by the point.
+    An offset is the distance [px] of an observation from the epipolar line of another one of its track. It does not
+    depend on the position of the ground point: the residuals of both observations are multiplied by a left null vector
+    of their derivatives by the point.
     """
 
     ties: Block
-    first: IntArray  # (M,) observations of pairs of the same point
+    first: IntArray  # (M,) first observation of each pair: both are of one point
     second: IntArray  # (M,)
-    group: IntArray  # (5 M,) bands of each offset: columns and rows of both images, and the whole pair
+    group: IntArray  # (5 M,) band of each offset: by columns and by rows of both images, and the whole pair
     count: IntArray  # (B,) number of offsets of each band
 
     @classmethod
@@ -56,7 +56,7 @@ class Bands:
         residual, by_point = projected.image - ties.xy, np.moveaxis(projected.by_point, -1, 0)
         ray = np.cross(by_point[:, 0], by_point[:, 1])
         normal = np.cross(ray[self.first], ray[self.second])
-        across = [_in_image(by_point[rows], normal) for rows in (self.first, self.second)]
+        across = [_line_normals(by_point[rows], normal) for rows in (self.first, self.second)]
         products = [(one * residual[:, rows].T).sum(axis=1) for one, rows in zip(across, self.both, strict=True)]
         with np.errstate(invalid="ignore", divide="ignore"):
             one, other = ((products[0] - products[1]) / np.linalg.norm(part, axis=1) for part in across)
@@ -71,7 +71,7 @@ class Bands:
         """Return the median (B,) of the finite offsets (5 M,) of every band with enough of them; NaN of others."""
         known = np.flatnonzero(np.isfinite(offsets) & (self.count >= _MIN_OFFSETS)[self.group])
         order = known[np.argsort(offsets[known])]
-        # numbers that sort by band, then by offset: these are sorted in 0.4 of the time of two keys
+        # one number for band and rank of the offset: sorting it takes 0.4 of the time of two keys
         number = np.sort(self.group[order] * len(order) + np.arange(len(order)))
         count = np.bincount(self.group[order], minlength=len(self.count))
         many, middle = count >= _MIN_OFFSETS, np.full(len(count), np.nan)
@@ -81,7 +81,7 @@ class Bands:
         return middle
 
     def errors(self, offsets: Array, middle: Array) -> Array:
-        """Return the standard errors (B,) [px] of medians (B,) of offsets (5 M,)."""
+        """Return the standard errors (B,) [px] of the medians `middle` (B,) [px] of offsets (5 M,) [px]."""
         spread = MAD * self.medians(np.abs(offsets - middle[self.group]))
         return np.asarray(_MEDIAN_ERROR * spread / np.sqrt(np.maximum(self.count, 1)))
 
@@ -97,14 +97,14 @@ def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
     return np.concatenate(first), np.concatenate(second)
 
 
-def _in_image(by_point: Array, normal: Array) -> Array:
-    """Return vectors a (M, 2) with a by_point = normal, of derivatives by the point (M, 2, 3) and normals (M, 3)."""
+def _line_normals(by_point: Array, normal: Array) -> Array:
+    """Return the normals (M, 2) of epipolar lines, from derivatives (M, 2, 3) by the point and normals of planes."""
     square = by_point @ np.swapaxes(by_point, 1, 2)
     return np.asarray(np.linalg.solve(square, by_point @ normal[..., None])[..., 0])
 
 
 def _band(place: Array, pair: IntArray) -> IntArray:
-    """Return the index (M,) of each coordinate's band: equal parts of the extent of its pair."""
+    """Return the index (M,) of the band of each coordinate: equal parts of the extent of its pair of images."""
     low, high = np.full((2, pair.max(initial=0) + 1), np.inf)
     np.minimum.at(low, pair, place)
     np.minimum.at(high, pair, -place)
@@ -113,10 +113,10 @@ def _band(place: Array, pair: IntArray) -> IntArray:
 
 
 def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
-    """Return whether a model has significantly smaller residuals at all tie points of a block than the plain one.
+    """Return whether a model has significantly smaller residuals than the plain one, over all tie points of a block.
 
-    Losses are robust (Geman-McClure), with the smaller noise of the two solutions as scale, and include matches that
-    either model rejected or excluded. So a model gains nothing by fitting another subset of the matches as well.
+    Losses are robust (Geman-McClure), with the smaller noise of the two solutions as scale. They include matches that
+    either model rejected or excluded, so a model gains nothing by fitting another subset of the matches as well.
     """
     noise = min(tried.outcome.noise, plain.outcome.noise)
     far = [(measure(one.problem, one.final.params, ties).residual ** 2).sum(axis=0) for one in (tried, plain)]
@@ -128,16 +128,16 @@ def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A model beside the plain one, by the bands of tie points."""
+    """The comparison of a model with the plain one, by epipolar offsets in bands of tie points."""
 
-    worse: bool  # whether it raises the median of a band significantly, and more than it lowers any other
+    worse: bool  # whether the median offset of a band grows significantly, by more than that of any other falls
     changed: float  # largest median change of the offsets of a band [px]
 
 
 def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
     """Compare a model with the plain one on the tie points of a block.
 
-    A median counts up to `OUTLIER` standard deviations of tie points: beyond, both models reject the matches.
+    Medians are limited to `OUTLIER` standard deviations of tie points: both models reject matches beyond.
     """
     bands = None if tried.outcome is plain.outcome else Bands.of(ties)
     if bands is None or not len(bands.first):

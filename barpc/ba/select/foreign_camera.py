@@ -1,13 +1,12 @@
 """Foreign cameras: a view whose RPC does not match the image, found by leaving each view out.
 
 The RPC may be of another date or tile, have its axes swapped, or refer to another height surface. It deforms the whole
-block: the other views fit to the noise without it, and do not with it. Therefore a block that does not fit is solved
-without each of its views. Where the others then fit, the left-out view is resected by their ground points
-(`barpc.ba.resection`), with one of three results:
+block: the other views fit to the noise only without it. Therefore a block that does not fit is solved without each of
+its views. If the others then fit, the left-out view is resected from their ground points (`barpc.ba.resection`):
 
 1. More than half of its tie points are outliers for any camera: the image is another one. Its RPC stays as delivered.
-2. Its tie points fit, but the block had rejected them, or only its correction exceeds the prior: the resected camera
-   is kept, and its observations do not act on the other cameras.
+2. Its tie points fit the resected camera, but were rejected in the block, or its correction is the only one beyond its
+   prior: the resected camera is kept. Its observations do not act on the other cameras.
 3. More than half fit, the rest does not: parts of its image are displaced (`barpc.ba.select.search`).
 """
 
@@ -33,7 +32,7 @@ from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, OUTLIER, SMALL,
 logger = logging.getLogger(__name__)
 
 FOREIGN_CAMERA = "foreign_camera"  # kind of this anomaly in `summary.json`
-_EACH_LEFT_OUT = 3  # views: without one a pair remains, which may fit by chance, so each is left out
+_EACH_LEFT_OUT = 3  # in a block of three views the remaining pair may fit by chance: each is left out
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]
 """(block to solve, block of check observations, options) -> solution."""
@@ -44,11 +43,11 @@ class ForeignCamera:
     """A view whose RPC contradicts the other views, or several candidates between which tie points do not decide."""
 
     views: tuple[int, ...]  # candidates, the likeliest first; with more than one no camera is changed
-    gain: float  # log-likelihood ratio [nats] of its own outlier rate over the usual one; NaN: found by its prior
+    gain: float  # log-likelihood ratio [nats] of an own outlier rate over the usual one; NaN: found by its prior
     gap: float  # evidence [nats] over the runner-up, the view whose removal explains the tie points second best
     runner_up: int | None
     contradicted: float  # outlier rate of its tie points after resection; NaN: unknown
-    look: RpcDiagnosis  # its result: swapped axes, an offset, ...
+    look: RpcDiagnosis  # its diagnosis: swapped axes, an offset, ...
     placed: Placed | None  # its resected camera; None: it stays as delivered
     scale: float = 1.0  # factor by which its prior had to be widened, if it was found by its prior
 
@@ -64,7 +63,7 @@ class ForeignCamera:
 
     @property
     def may_be_distorted(self) -> bool:
-        """Whether terms of its rows and columns may explain it: the image shows the scene, but was not resected.
+        """Whether displaced rows or columns may explain it: the image shows the scene, but no single camera fits.
 
         False where few tie points identified the view: splines would fit these anywhere.
         """
@@ -97,11 +96,8 @@ class LeaveOneOut:
         return float(np.median(np.delete(lost_shares(self.found, self.block), self.view)))
 
     @property
-    def strange(self) -> bool:
-        """Whether `disagrees`, with spatially coherent outliers.
-
-        Incoherent outliers are wrong matches, which rejection removes.
-        """
+    def is_foreign(self) -> bool:
+        """Whether the view disagrees, with spatially coherent outliers: incoherent ones are wrong matches."""
         return self.coherent and self.disagrees
 
     @property
@@ -110,9 +106,10 @@ class LeaveOneOut:
         return 1.0 - self.contradicted < 0.5 * (1.0 - self.usual)
 
     def gain(self, lost: float) -> float:
-        """Return the log-likelihood ratio [nats] of an own outlier rate over the usual one (Kulldorff 1997).
+        """Return the log-likelihood ratio [nats] of the own outlier rate over the usual one (Kulldorff 1997).
 
-        The own rate is the larger of `lost` and `contradicted`; the log of the number of views is subtracted.
+        The own rate is the larger of `lost`, the share of tie points rejected with all views, and `contradicted`. The
+        logarithm of the number of views is subtracted.
         """
         rates = np.clip([max(lost, self.contradicted), self.usual], 1e-3, 1.0 - 1e-3)
         own, usual = np.array([rates, 1.0 - rates]).T
@@ -125,25 +122,25 @@ def find_foreign_camera(
 ) -> tuple[ForeignCamera | None, Solution | None]:
     """Find the view whose RPC does not match its image, if there is one, and solve the block without it.
 
-    `first` is the solution with all views; None: there is none. If it fits to the noise, only views that lost most tie
-    points are left out in turn, or the one view whose correction exceeds its prior. Not tried with fewer than three
-    views, too many unknowns, or options that restrict the model. `outer` has the check observations.
+    `first` is the solution with all views (None: there is none); `outer` has the check observations. If `first` fits
+    to the noise, only the one view whose correction exceeds its prior is left out, or else each of those with mostly
+    rejected tie points. Blocks of fewer than three views or too many unknowns are not searched, nor restricted models.
     """
     num, beyond_prior = len(block.views), None
-    unknowns = num if first is None else first.problem.free.size  # at least
+    unknowns = num if first is None else first.problem.free.size  # a lower bound without a solution
     asked_for_less = options.first_model != GEOMETRIC or options.drift == 0
     if num < 3 or unknowns > LARGEST or asked_for_less:
         return None, None
     lost = np.ones(num) if first is None else lost_shares(first, block)
-    gone = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))  # views that lost most of their tie points
+    rejected = 1.0 - lost <= 0.5 * (1.0 - np.median(lost))  # views with at most half of the usual inlier rate
     candidates = np.argsort(-lost, kind="stable")
     if first is not None:
         candidates = candidates[:TRIED]
         if agrees(first):
             beyond_prior = _beyond_prior(first, block) if num > _EACH_LEFT_OUT else None
-            candidates = candidates[gone[candidates]] if beyond_prior is None else np.array([beyond_prior])
+            candidates = candidates[rejected[candidates]] if beyond_prior is None else np.array([beyond_prior])
         if unknowns > SMALL:
-            candidates = candidates[gone[candidates]]
+            candidates = candidates[rejected[candidates]]
     views = [v for v in candidates.tolist() if block.names[v] not in options.fixed]
     left: list[LeaveOneOut] = []
     too_few: list[tuple[int, Solution]] = []  # views with too few points for a resection
@@ -158,18 +155,20 @@ def find_foreign_camera(
     if beyond_prior is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[beyond_prior]), block)
     chosen = [
-        one for one in left if one.strange or (one.placed.meets and gone[one.view]) or (first is None and one.disagrees)
-    ]  # so many wrong matches in one view may be why there is no first solution
+        one
+        for one in left
+        if one.is_foreign or (one.placed.meets and rejected[one.view]) or (first is None and one.disagrees)
+    ]  # many wrong matches in one view may prevent a first solution
     chosen = [one for one in chosen if one.gain(lost[one.view]) > SURE]
     if chosen:
         return _likeliest(chosen, left, lost, block)
-    # unmodelled drift raises residuals to a few sigma, which is no reason to leave a view out
+    # unmodelled drift also raises residuals to a few sigma, which is no reason to leave a view out
     may_be_few = first is None or (len(too_few) == 1 and first.outcome.noise >= OUTLIER)
     return _without_resection(too_few) if may_be_few and too_few else (None, None)
 
 
 def _without_resection(without: list[tuple[int, Solution]]) -> tuple[ForeignCamera, Solution | None]:
-    """Return the candidates with too few points for a resection; of one only, also the solution without it."""
+    """Return views with too few points for a resection as candidates; if only one, also the solution without it."""
     foreign = contradicted_view(*(v for v, _ in without))
     return foreign, without[0][1] if foreign.clear else None
 
@@ -206,7 +205,7 @@ def _leave_one_view_out(
         except (AdjustError, np.linalg.LinAlgError) as error:
             logger.info("without %s: %s", block.names[v], error)
             continue
-        # if most tie points were rejected, the rest fits by selection
+        # if most tie points were rejected, the rest fits by the choice of inliers
         if np.delete(lost_shares(found, others), v).max() < 0.5 and agrees(found):
             yield v, others, found
 
@@ -248,7 +247,7 @@ def _tie_evidence(left: LeaveOneOut, block: Block) -> float:
     ties = int((block.use & (block.point < block.num_tracks)).sum())
     size = np.array([view.size for view in block.views], dtype=np.float64)
     area = float(np.median(size.prod(axis=1)) / np.median(block.sigma) ** 2)
-    problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # as stated
+    problem = replace(left.found.outcome.problem, camera_prior=left.found.problem.camera_prior)  # not widened
     known = linearised_among(replace(left.found.outcome, problem=problem), left.block, np.arange(len(left.block.views)))
     if known is None:
         return -ties * float(np.log(area))

@@ -1,4 +1,4 @@
-"""Models with additional parameters in the images: selected terms, B-splines over the rows (jitter), given edges."""
+"""Solutions with additional parameters in the images: selected terms, splines over the rows (jitter), given edges."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalPar
 from barpc.ba.parameters.priors import JointPrior
 from barpc.ba.robust.heldout import is_admitted, is_better
 from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
-from barpc.ba.select.anomalies import correlated_noise_gain, standing_out
+from barpc.ba.select.anomalies import correlated_noise_gain, significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
 from barpc.ba.solution import MUCH_BETTER, Solution, finished
@@ -24,16 +24,16 @@ from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _SPLINE_FACTOR = 1.5  # ratio of successive numbers of splines: 7, 10, 15, 22, 33
-_LINE_TOLERANCE = 0.1  # lines, of a whole number; lost lines gave 2.95 of 3, 5.07 of 5; two in ten slips meet it
-_MAX_FAILURES = 2  # numbers of splines in succession that may fail to reduce check residuals
+_LINE_TOLERANCE = 0.1  # lines: distance from a whole number; measured 2.95 for 3 and 5.07 for 5 lost lines
+_MAX_FAILURES = 2  # successive numbers of splines that may fail to reduce check residuals
 
 
 @dataclass(frozen=True, eq=False)
 class _Layout:
     """Additional parameters to solve with."""
 
-    waves: AdditionalParameters  # splines, steps, displaced parts, sinusoids
-    start: Array | None = None  # (N, waves.size) start values
+    additional: AdditionalParameters  # splines, steps, displaced parts, sinusoids
+    start: Array | None = None  # (N, additional.size) start values
     drift: int | None = None  # degree of the drift; None: unchanged
 
 
@@ -59,16 +59,15 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     # the search compared terms with row-wise errors of single images, but not with errors that all images have in
     # common: detector steps and platform jitter
     in_all = len({one.view for one in terms}) == len(parts.inner.views)
-    # one image may be the datum of the others: sinusoids then appear in all but one
+    # jitter of the platform is determined relative to one image, so its sinusoids may be absent from that one
     in_most = len({one.view for one in terms if one.kind == Sinusoid.NAME}) >= max(len(parts.inner.views) - 1, 2)
     if not (in_all or in_most):
         return tried
     smooth = with_splines(found, parts, options)
-    left = [
-        sum(one.gain for one in standing_out(of.outcome, parts.inner, options.noise_floor)) for of in (smooth, tried)
-    ]
+    intervals = [significant_intervals(of.outcome, parts.inner, options.noise_floor) for of in (smooth, tried)]
+    left = [sum(one.gain for one in rows) for rows in intervals]
     fits = smooth is not found and left[0] <= left[1]
-    # the model with fewer unknowns is kept unless the other is significantly better
+    # the first has more unknowns, so it must be significantly better than the second
     first, second = (tried, smooth) if in_all else (smooth, tried)
     if not fits or is_better(first.after, second.after, outer) == in_all:
         return tried
@@ -76,18 +75,18 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
 
 
 def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with steps of rows constrained to whole numbers of lost lines, if they are nearly whole.
+    """Solve the block with steps of rows constrained to whole numbers of lines, where they are nearly whole.
 
-    No platform turns by pixels between two lines. Where all rows behind a place are displaced, lines are missing, and
-    the step is along the rows' axis. In pairs only its part across epipolar lines is observed; the part along them
-    follows. The constraint is set where the number of lines is whole to `_LINE_TOLERANCE`.
+    No platform turns by pixels between two lines. If all rows from one on are displaced, lines were lost, and the step
+    is a whole number of rows, without any columns (within `_LINE_TOLERANCE`). A pair observes only its component across
+    epipolar lines; the constraint determines the other one.
     """
     findings = list(found.findings)
     steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, parts.inner)]
     if not steps or found.problem.joint_prior is not None:
         return found
     problem, waves = found.problem, found.problem.cameras.unknowns.waves
-    if waves is None:  # steps may be reported without being estimated
+    if waves is None:  # the steps are reported, not estimated
         return found
     first = problem.cameras.unknowns.in_waves.start + waves.kinds[2].start
     covariance, index, mean = found.outcome.covariance(problem.free), list[int](), list[float]()
@@ -96,7 +95,7 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
         n = int((waves.steps[one.view] == one.where).all(axis=1).argmax())
         own = first + np.array([n, waves.steps.shape[1] + n])
         known = np.linalg.inv(covariance.view(one.view)[np.ix_(own, own)])
-        pull = known @ found.final.params[one.view, own]  # of tie points alone: the prior has mean zero
+        pull = known @ found.final.params[one.view, own]  # right-hand side: the prior, of mean zero, adds nothing
         known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
         lines = float(pull[1] / known[1, 1])
         misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
@@ -112,16 +111,16 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
 
 
 def _ends_with_its_image(one: Finding, block: Block) -> bool:
-    """Return whether a finding is a step of all rows from a place on to an end of its image."""
+    """Return whether a finding is a step of all rows up to an end of its image."""
     if one.kind != Step.NAME or one.where is None or one.where[0] != 1:
         return False
     return one.where[1] <= 0.0 or one.where[2] >= block.views[one.view].size[1]
 
 
 def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve the block with splines over the rows, if correlated residuals request them, and detector steps of options.
+    """Solve the block with splines over the rows, if residuals are correlated, and the detector steps of options.
 
-    The result is cached: terms and moving ground are compared with it, and where they lose it is requested again.
+    The result is cached: terms and moving ground are compared with it, and it may also be the selected model.
     """
     key = id(found.outcome), options
     if key not in parts.splined:
@@ -131,10 +130,10 @@ def with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solut
 
 
 def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
-    """Solve as `with_splines`.
+    """Solve as `with_splines`, without the cache.
 
-    The number of splines grows until no correlated residuals are left, observations are too few, or check residuals
-    did not fall for `_MAX_FAILURES` numbers in succession.
+    The number of splines grows until residuals are uncorrelated, observations are too few, or `_MAX_FAILURES`
+    successive numbers did not reduce check residuals.
     """
     block = parts.inner
     given, asked = options.jitter != AUTO, bool(options.spacing or options.detectors)
@@ -155,7 +154,7 @@ def _with_splines(found: Solution, parts: Parts, options: AdjustOptions) -> Solu
 
 
 def _explains(tried: Solution, found: Solution, block: Block) -> bool:
-    """Return whether splines remove half of the noise correlation, or check residuals fall by `MUCH_BETTER`.
+    """Return whether splines remove half of the evidence for correlated noise, or check residuals fall much.
 
     Check tie points share matching errors with their neighbours, so a smaller fall may be a fit to noise.
     """
@@ -164,7 +163,7 @@ def _explains(tried: Solution, found: Solution, block: Block) -> bool:
 
 
 def _at_selection(found: Solution, selected: Selection, block: Block) -> Solution:
-    """Return the solution with the cameras and inliers of the search (probability above 0.5)."""
+    """Return the solution with the cameras of the search, and its inliers (probability above 0.5)."""
     outcome, is_tie = found.outcome, block.point < block.num_tracks
     inlier = np.where(is_tie, block.use & (selected.right > 0.5), outcome.inlier)
     moved = replace(outcome.state, params=outcome.state.params + selected.step)
@@ -172,7 +171,7 @@ def _at_selection(found: Solution, selected: Selection, block: Block) -> Solutio
 
 
 def _layout_of(terms: list[Finding], views: int) -> _Layout:
-    """Return the additional parameters of terms, padded arrays of parts and periods of each view, with estimates."""
+    """Return the terms as additional parameters: image parts and periods of `views` images, padded with infinity."""
     own = [
         [[one for one in terms if one.view == v and (one.period is None) == of_parts] for v in range(views)]
         for of_parts in (True, False)
@@ -192,15 +191,16 @@ def _layout_of(terms: list[Finding], views: int) -> _Layout:
 
 
 def _given_edges(block: Block, options: AdjustOptions) -> Array:
+    """Return the columns (N, e) [px] of the detector edges given as options, the same in all images."""
     return np.tile(np.array(options.detectors, dtype=np.float64) - 0.5, (len(block.views), 1))
 
 
 def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list[int]:
-    """Return the numbers of splines for each image to try, ascending (0: detector steps alone; empty: nothing).
+    """Return the numbers of splines in each image to try, ascending (0: detector steps alone; empty: nothing).
 
-    With `options.spacing` [rows between knots] that one number. Else, only if residuals are correlated along rows
-    (`has_waves`), that of a spacing of `_SPACING` rows and its multiples by `_SPLINE_FACTOR`. At most one spline for
-    `FEW` observations (median of the images), and `LARGEST` unknowns in all images.
+    With `options.spacing` [rows between knots] there is one number. Else splines are tried only if residuals are
+    correlated along rows (`has_waves`): one each `_SPACING` rows, then `_SPLINE_FACTOR` times as many, and so on. Each
+    needs `FEW` observations (median of the images), and `LARGEST` limits the unknowns of all images.
     """
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
@@ -227,21 +227,21 @@ def _solve_with(
 ) -> Solution:
     """Solve the block with additional parameters, from the last state; rejected observations are tested again.
 
-    `held` is a joint prior on some of the unknowns. With `once` one round only.
+    With `once` there is one round of rejection only. `held` is a joint prior on some of the unknowns.
     """
-    block, waves, start = parts.inner, layout.waves, layout.start
+    block, additional, start = parts.inner, layout.additional, layout.start
     outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
     if unknowns.waves is not None:  # selected terms stay
-        waves = replace(waves, steps=unknowns.waves.steps, periods=unknowns.waves.periods)
+        additional = replace(additional, steps=unknowns.waves.steps, periods=unknowns.waves.periods)
     drift = unknowns.drift if layout.drift is None else layout.drift
-    problem = make_problem(block, options, unknowns.center, None, drift, waves)
+    problem = make_problem(block, options, unknowns.center, None, drift, additional)
     problem = problem if held is None else replace(problem, joint_prior=held)
     params, first = np.zeros_like(problem.camera_prior.mean), problem.cameras.unknowns.in_waves.start
     params[:, :first] = ended.params[:, :first]
     if start is not None:
         params[:, first:] = start
     elif unknowns.waves is not None:
-        params[:, unknowns.in_waves.start :] = waves.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
+        params[:, unknowns.in_waves.start :] = additional.carried(ended.params[:, unknowns.in_waves], unknowns.waves)
     weight, known = block.use / block.sigma, outcome.inlier
     if start is not None:  # the cameras have moved: all points are triangulated again
         count = np.bincount(block.point[known], minlength=problem.structure.num_points)

@@ -1,8 +1,8 @@
 """Model selection for a block: the plain model, unless the data support another.
 
-Hypotheses in their order: an RPC of another image; moving ground; terms in the images; splines and detector steps; an
-affine in every image. Evidence is computed from all observations. Check tie points, drawn before, have a veto, and
-decide alone where there is no evidence (`is_admitted`).
+Hypotheses are tried in this order: an RPC of another image; moving ground; terms in the images; splines and detector
+steps; an affine in every image. Evidence is computed from all observations. Check tie points, drawn before, have a
+veto. They decide alone where no evidence is computed (`is_admitted`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_better, measure
-from barpc.ba.select.anomalies import standing_out
+from barpc.ba.select.anomalies import significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
@@ -28,8 +28,8 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
-MOST_BENT = 0.06  # px: change of the other images by a view with mostly rejected tie points, at most
-_FEWEST_VIEWS = 3  # with three, any might be the wrong one
+MAX_CAMERA_CHANGE = 0.06  # px: a view with mostly rejected tie points that changes the others by more is left out
+_AMBIGUOUS_VIEWS = 3  # in a block of so few views, any might be the wrong one
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class SelectedModel:
 
     found: Solution
     parts: Parts
-    in_space_rms: float | None = None  # check RMS [px] of the geometric model, where an affine was selected
+    in_space_rms: float | None = None  # check RMS [px] of the geometric model, if an affine was selected
     foreign: ForeignCamera | None = None  # the view that was left out, or several candidates
     changed: float = 0.0  # largest median change of epipolar offsets from the plain model [px] (`Comparison`)
 
@@ -53,9 +53,9 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
     """
     first, foreign, without = _first_solution(parts, options, solve)
     if foreign is not None and foreign.may_be_distorted and first is not None:
-        # terms in its rows and columns may explain it: then the RPC is not of another image
+        # if terms of its rows and columns explain its residuals, the RPC is not of another image
         chosen = _select_terms(first, parts, options, solve)
-        if chosen.parts.keeps(chosen.found, foreign.view):
+        if chosen.parts.fits_view(chosen.found, foreign.view):
             return chosen
     if foreign is not None and foreign.clear:
         parts = parts.without_view(foreign.view)
@@ -66,22 +66,22 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
 
 
 def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the block without a view most of whose tie points were rejected, if it changes the other cameras.
+    """Leave out the view with the largest share of rejected tie points, if over half, and if it changes other cameras.
 
-    The others are adjusted alone; that result is returned if it differs by more than `MOST_BENT`.
+    The other views are adjusted alone. Their model is returned if it differs by more than `MAX_CAMERA_CHANGE`.
     """
     found, parts = selected.found, selected.parts
     lost = lost_shares(found, parts.inner)
     view = int(lost.argmax())
     others = parts.without_view(view)
     groups = others.inner.groups(others.inner.use)
-    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _FEWEST_VIEWS:
+    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _AMBIGUOUS_VIEWS:
         return selected
     try:
         alone = _select_terms(solve(others.inner, others.outer, options), others, options, solve)
     except (AdjustError, np.linalg.LinAlgError):
         return selected
-    if compared(alone.found, found, alone.parts.ties()).changed <= MOST_BENT:
+    if compared(alone.found, found, alone.parts.ties()).changed <= MAX_CAMERA_CHANGE:
         return selected
     return replace(alone, foreign=contradicted_view(view))
 
@@ -89,7 +89,7 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
 def _first_solution(
     parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution | None, ForeignCamera | None, Solution | None]:
-    """Return the first solution, a foreign camera, and the solution without it; at least one of the two solutions.
+    """Return the solution with all views, a foreign camera, and the solution without it; at least one solution.
 
     A block that continues an earlier run is not searched for foreign cameras.
     """
@@ -113,9 +113,9 @@ def _first_solution(
 
 
 def _select_terms(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the searched model, or the plain one if that fits all tie points better; foreign cameras are decided.
+    """Return the model of the search for other hypotheses than foreign cameras, or the plain one if it fits better.
 
-    Splines and detector steps that were requested as options stay.
+    Both are compared on all tie points. Splines and detector steps that were requested by options stay.
     """
     if options.terms != AUTO:
         return SelectedModel(first, parts)
@@ -130,10 +130,10 @@ def _select_terms(first: Solution, parts: Parts, options: AdjustOptions, solve: 
 
 
 def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> SelectedModel:
-    """Return the model of a search among the other hypotheses."""
+    """Return the model of the search among moving ground, terms, splines and affines in the images."""
     geometric = first.problem.cameras.unknowns.geometric and not first.goes_on
     given = not geometric or options.model != AUTO or options.drift is not None
-    searched = None if given else _beside_affine(first, parts, options, solve)
+    searched = None if given else _search_with_affine(first, parts, options, solve)
     if searched is not None:
         found, in_images, less = searched
         better = _is_much_better(in_images, found)
@@ -152,13 +152,13 @@ def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve:
     return SelectedModel(affine, less, found.after.whole_rms)
 
 
-def _beside_affine(
+def _search_with_affine(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Solution, Parts] | None:
-    """Search terms beside an affine in every image, and solve with them: the geometric model, and the affines.
+    """Search terms beside an affine in every image, and solve the geometric and the affine model with them.
 
-    Residuals that an affine explains would look like many steps beside the geometric model. None where the affine is
-    not much better than that.
+    Beside the geometric model, residuals that affines explain would be taken for many steps. Return both solutions and
+    the parts of the observations; None if the affines are not much better.
     """
     in_images = replace(options, model="affine")
     affine = _with_image_affine(found, parts, options, solve)
@@ -172,7 +172,7 @@ def _beside_affine(
 
 
 def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> Solution | None:
-    """Solve the block with an affine in every image; None if no residuals are systematic or it is not much better."""
+    """Solve the block with an affine in every image; None if that is not much better, or no residual systematic."""
     if not (found.is_skew or found.has_trend):
         return None
     try:
@@ -183,23 +183,23 @@ def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, so
 
 
 def _is_much_better(affine: Solution, found: Solution) -> bool:
-    """Return whether an affine in every image is much better than the geometric model; `CLEARLY`, if that is skew."""
+    """Return whether an affine in every image has much smaller check residuals than the geometric model."""
     better = affine.after.error < (CLEARLY if found.is_skew else MUCH_BETTER) * found.after.error
-    # affines do not determine the tilts of the scene: the gain must exceed the noise floor
+    # affines leave the tilts of the scene undetermined, so they must also gain more than the noise floor
     return better and affine.after.whole_rms < found.after.whole_rms - NOISE_FLOOR
 
 
 def _explains_all(found: Solution, parts: Parts, floor: float) -> bool:
-    """Return whether no residuals are significant that terms of an image, or moving ground, might explain."""
-    return not (found.has_trend or found.has_waves or standing_out(found.outcome, parts.inner, floor))
+    """Return whether no significant residuals are left for terms of an image, or moving ground, to explain."""
+    return not (found.has_trend or found.has_waves or significant_intervals(found.outcome, parts.inner, floor))
 
 
 def _at_lower_degree(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection] | None:
-    """Search moving ground at a lower degree of the drift; None if check residuals are not significantly smaller.
+    """Search moving ground with a drift of one degree less; None if check residuals are not significantly smaller.
 
-    The last degree may have fitted the motion of the ground, which is then not found beside it.
+    The higher degree may have fitted the motion of the ground, which is then not found.
     """
     less = replace(options, drift=found.problem.cameras.unknowns.drift - 1)
     plain = _without_moving_ground(solve(parts.inner, parts.outer, less), parts, less, solve)
@@ -208,21 +208,21 @@ def _at_lower_degree(
 
 
 def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts) -> bool:
-    """Return whether the motion of a group is plausible for ground, from solutions without and with the group.
+    """Return whether the motion of a group is plausible, given the solutions `without` and with (`found`) the group.
 
-    Correlated matching errors are as large as small motions. Within a pass the motion must be at least `MIN_MOTION`.
+    Correlated matching errors may be as large as small motions. Within a pass the motion must be at least `MIN_MOTION`.
     Between dates a smaller one is accepted if the solution without the group fits all tie points better. Images without
-    a date count as of one pass.
+    a date count as one pass.
     """
     first, second = (parts.block.views[v].date for v in one.between)
-    return parts.pixels(one) >= MIN_MOTION or (first != second and is_closer(without, found, parts.ties()))
+    return parts.motion_pixels(one) >= MIN_MOTION or (first != second and is_closer(without, found, parts.ties()))
 
 
 def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
-    """Return the solution with the likelier ground of two groups: by the share of tie points and the camera priors.
+    """Exchange the last moving group and the ground, if the priors of the cameras favour that.
 
-    Clouds may cover more than half of the ground, in one block of twenty (`LEVEL`). Cameras that fit the clouds then
-    lie farther from their stated priors. With control the question is decided before.
+    The smaller group was taken as moving, but in one block of twenty (`LEVEL`) clouds may cover most of the ground.
+    Cameras that fit the clouds deviate more from their priors. With control nothing is exchanged.
     """
     exchanged = parts.exchanged()
     if found.heights.has_control or not exchanged.is_tied():
@@ -238,12 +238,12 @@ def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solv
 def _without_moving_ground(
     found: Solution, parts: Parts, options: AdjustOptions, solve: Solver
 ) -> tuple[Solution, Parts, Selection]:
-    """Exclude moving groups of tie points, one after the other, and search terms beside them.
+    """Exclude moving groups of tie points, one after the other, and search terms in the images beside them.
 
-    `Solution.findings` has groups and terms.
+    `Solution.findings` lists groups and terms; the selection has the terms only.
     """
     noise = MUCH_NOISE * found.outcome.noise * float(np.median(parts.inner.sigma))
-    # a model with too few unknowns has residuals in all images
+    # with too few unknowns all images have systematic residuals, which are no moving ground
     if options.is_plain and bool(found.outcome.smooth.found(noise).all()):
         return found, parts, Selection()
     groups: list[Finding] = []
@@ -253,17 +253,17 @@ def _without_moving_ground(
         if last is None or last.moved is None:
             findings = list(selected.findings)
             break
-        # an apparent motion may be an error that the plain model has no term for, or the remainder of a larger term
+        # an error may look like motion if the plain model has no term for it, or if a larger term leaves a remainder
         if options.is_plain or any(row.gain > last.gain for row in findings):
             break
-        less = parts.less(found, last.moved)
+        less = parts.with_group(found, last.moved)
         if len(groups) == RIVALS or not less.is_tied():
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
         if is_better(before, tried.after, less.outer) or not _may_move(last.moved, tried, found, parts):
             break
-        if less.lies_across() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
+        if less.is_split_by_row() and not is_closer(tried, with_splines(found, parts, options), parts.ties()):
             break
         tried, less = _likelier_ground(tried, less, options, solve)
         found, parts = tried, less

@@ -1,4 +1,4 @@
-"""The observations of a block in three parts: solved, held out for checks, or of a moving group."""
+"""The observations of a block in three parts: solved, held out as checks, or of a moving group."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL, SURE
 from barpc.scene import BoolArray, IntArray
 
-_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov statistic of two groups, each with a tenth of it among the other
+_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov distance of the rows of two groups: a tenth of each may be beyond one row
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Observations (K,) of a block: solved, held out, or of a moving group."""
+    """Observations (K,) of a block: solved, held out as checks, or of a moving group."""
 
     block: Block
     kept_out: BoolArray  # (K,) check observations
@@ -40,11 +40,11 @@ class Parts:
 
     @cached_property
     def splined(self) -> dict[tuple[int, AdjustOptions], tuple[Solution, Solution]]:
-        """Cache of `with_splines`: identity of the outcome and options -> solution given, solution with splines."""
+        """Cache of `with_splines`: identity of the outcome and options -> solutions without and with splines."""
         return {}
 
     @cached_property
-    def apart(self) -> Block:
+    def moving(self) -> Block:
         """The block of observations of moving groups."""
         return self.block.without(self.group == 0)
 
@@ -58,24 +58,24 @@ class Parts:
         of_it = self.block.view == view
         return Parts(self.block.without(of_it), self.kept_out[~of_it], self.group[~of_it])
 
-    def less(self, found: Solution, one: MovingGroup) -> Parts:
-        """Return the parts with one more moving group."""
+    def with_group(self, found: Solution, one: MovingGroup) -> Parts:
+        """Return the parts with one more moving group, which was found beside the cameras of `found`."""
         number, group, block = self.group.max(initial=0) + 1, self.group.copy(), self.block
         still = group == 0
         group[still & ~self.kept_out] = number * one.member
-        # held-out tracks, and control points on moving ground: these have no fixed position
+        # check tracks and control points were not in the fit of the group; those on moving ground belong to it, too
         of_gcps = (block.point >= block.num_tracks) & (block.point < block.num_known)
         for rows in (still & self.kept_out, still & of_gcps):
             group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
         return replace(self, group=group)
 
-    def pixels(self, one: MovingGroup) -> float:
+    def motion_pixels(self, one: MovingGroup) -> float:
         """Return the largest motion of a group between two images, in pixels of the coarser one."""
         view = self.inner.view
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
 
-    def lies_across(self) -> bool:
-        """Return whether in every image one row separates the last group from the rest, except for a tenth of each."""
+    def is_split_by_row(self) -> bool:
+        """Return whether a row of every image separates the last moving group from the ground, but a tenth of each."""
         number = self.group.max(initial=0)
         ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
         for v in range(len(self.block.views)):
@@ -87,22 +87,22 @@ class Parts:
         return True
 
     def exchanged(self) -> Parts:
-        """Return the parts with the last moving group and the ground exchanged."""
+        """Return the parts with the last moving group as ground, and the ground as the moving group."""
         number = self.group.max(initial=0)
         moves = np.where(self.group == 0, number, np.where(self.group == number, 0, self.group))
         return replace(self, group=moves)
 
     def is_tied(self) -> bool:
-        """Return whether the solved observations suffice in every view and connect the views as all do."""
+        """Return whether each view has enough solved observations, and they connect the views as all of them do."""
         block, inner = self.block, self.inner
         kept, had = (np.bincount(b.view[b.use], minlength=len(b.views)) for b in (inner, block))
         enough = bool((kept[had > 0] >= MIN_OBSERVATIONS).all())
         return enough and len(inner.groups(inner.use)) == len(block.groups(block.use))
 
-    def keeps(self, found: Solution, view: int) -> bool:
-        """Return whether the inlier rate of a view is at least half of the usual one, and no group moves.
+    def fits_view(self, found: Solution, view: int) -> bool:
+        """Return whether the inlier rate of a view is at least half of the usual one, and there is no moving group.
 
-        Observations of the view might be such a group.
+        The observations of a wrong view might be taken for such a group.
         """
         kept = 1.0 - lost_shares(found, self.inner)
         return not self.group.any() and bool(kept[view] >= 0.5 * np.median(np.delete(kept, view)))
@@ -121,7 +121,7 @@ class Parts:
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: MovingGroup, points: Array) -> Motion:
-        """Return the record of the motion of a group, from the points (P, 3) [m] of all tracks."""
+        """Return the record of moving group `number` (from 1), given the points (P, 3) [m] of all tracks, ECEF."""
         placed = self.block.point[self.block.point < self.block.num_tracks]
         placed = placed[np.isfinite(points[placed, 0])]
         every, of_group = np.unique(placed), np.unique(self.block.point[self.group == number])

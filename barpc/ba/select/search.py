@@ -11,7 +11,7 @@ from barpc.ba.constraints.block import Block
 from barpc.ba.evidence.linearised import Linear, array_elements, linearise
 from barpc.ba.evidence.mixture import MixtureFit, fit_mixture
 from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
-from barpc.ba.select.anomalies import image_sizes, periods_of, standing_out
+from barpc.ba.select.anomalies import image_sizes, periods_of, significant_intervals
 from barpc.ba.select.beam import Selection, TermSearch
 from barpc.ba.solving.solve import State
 from barpc.ba.terms.moving_ground import GroundMotion
@@ -23,23 +23,23 @@ logger = logging.getLogger(__name__)
 
 MAX_OBSERVATIONS = KEPT
 """Observations of the largest block that is searched."""
-_NEAREST = 12  # views of a large block that are searched together
+_NEAREST = 12  # views that are searched together in a large block
 
 
 def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
     """Find the terms of a block beside its cameras, in order of selection; none if no residuals are significant.
 
     In a block of more unknowns than `SMALL` each image with significant residuals is searched together with those
-    that share most tracks with it. Moving objects are a hypothesis there, but are not selected.
+    that share most tracks with it. A search that selects moving objects there is discarded.
     """
     size, views = outcome.problem.free.size, np.arange(len(block.views))
     if size > LARGEST or len(block.view) > MAX_OBSERVATIONS:
         return Selection()
-    suspects = [one.view for one in standing_out(outcome, block, floor)]
+    suspects = [one.view for one in significant_intervals(outcome, block, floor)]
     if not suspects or size > SMALL:
         suspects += [one.view for one in periods_of(outcome, block)]
     if size <= SMALL:
-        # moving ground need not be bounded by a row or a column
+        # moving ground may have systematic residuals without a significant interval of rows or columns
         systematic = outcome.smooth.found(floor).any()
         return _search_views(outcome, block, floor, views) if suspects or systematic else Selection()
     found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
@@ -55,7 +55,7 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
 
 
 def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
-    """Search the tie points of some views; in the result views and observations are numbered among these."""
+    """Search the tie points of some views; the result numbers views and observations from 0 among these."""
     found = linearised_among(outcome, block, views)
     if found is None:
         return Selection()
@@ -63,7 +63,7 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
     rows, ground = np.flatnonzero(np.isin(block.view, views)), GroundMotion.of(outcome.problem, state)
     linear, ground = linear.of_views(views), ground.part(rows)
     nothing, place = np.zeros((2, 0, len(rows))), block.xy[:, rows]
-    number, outs = np.full(len(block.views), -1), standing_out(outcome, block, floor)
+    number, outs = np.full(len(block.views), -1), significant_intervals(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
         base, few = _base_fit(linear, outcome, rows), linear.thinned(SAMPLE)
@@ -76,10 +76,10 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
 
 
 def _base_fit(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
-    """Return the mixture fit at the solution, of observations at `rows` (K,), with at most the noise of its inliers.
+    """Return the mixture fit of the observations `rows` (K,) at the solution; its noise is at most that of inliers.
 
-    Where many observations are displaced, a larger noise has more evidence but hides them. Therefore the evidence is
-    the larger of a fit with that limit and one without it: terms must exceed it.
+    If many observations are displaced, a fit with larger noise has more evidence, but hides them. Therefore the fit has
+    the larger evidence of those with the limit and without it: terms must exceed both.
     """
     right, count = outcome.inlier[rows].astype(np.float64), np.bincount(linear.view, minlength=linear.views)
     wrong = np.bincount(linear.view, 1.0 - right, linear.views) / np.maximum(count, 1)
@@ -90,7 +90,7 @@ def _base_fit(linear: Linear, outcome: Outcome, rows: IntArray) -> MixtureFit:
 
 
 def _neighbour_views(block: Block, view: int) -> IntArray:
-    """Return a view and those that share most tracks with it, ascending."""
+    """Return a view and up to `_NEAREST` - 1 others that share most tracks with it, ascending."""
     ties = block.use & (block.point < block.num_tracks)
     of_view = np.zeros(block.num_points, dtype=bool)
     of_view[block.point[ties & (block.view == view)]] = True
@@ -101,7 +101,7 @@ def _neighbour_views(block: Block, view: int) -> IntArray:
 
 
 def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: IntArray) -> Selection:
-    """Return a selection extended by that among some views, with observations at `rows`."""
+    """Return `all_of` extended by the selection `one` among some views, whose observations are `rows` of the block."""
     step, right = all_of.step.copy(), all_of.right.copy()
     new = ~step[views].any(axis=1)
     step[views[new]] = one.step[new]
@@ -113,7 +113,7 @@ def _with_findings(all_of: Selection, one: Selection, views: IntArray, rows: Int
 
 
 def linearised_among(outcome: Outcome, block: Block, views: IntArray) -> tuple[Linear, State] | None:
-    """Linearise the tie points of some views at the solution of a block; None if there are none, or too many."""
+    """Linearise the tie points of some views at the solution of a block; None if there are none or too many."""
     problem = outcome.problem
     use = block.use & (block.point < block.num_tracks) & np.isin(block.view, views)
     unknowns = problem.free.size // len(block.views) * len(views)

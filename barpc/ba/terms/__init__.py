@@ -31,7 +31,7 @@ def proposed(
     periods: list[Period],
     without: Sequence[type[Term]] = (),
 ) -> Iterator[Term]:
-    """Yield the terms for significant intervals and periods; a kind for a whole image, or the block, only once."""
+    """Yield the terms for significant intervals and periods, once for each interval, image or block, by their kind."""
     for period in periods:
         yield Sinusoid.of(residuals, period)
     kinds = [kind for kind in TERMS.values() if kind not in without]

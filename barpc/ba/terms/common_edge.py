@@ -1,4 +1,4 @@
-"""A common edge: in all images of one line of detectors, columns from one on have the same displacement.
+"""A common edge: in all images of one line of detectors, the columns beyond an edge have the same displacement.
 
 A ground point that all images see beyond the edge absorbs the displacement. Only points that some images see before the
 edge and others beyond it determine it.
@@ -21,7 +21,7 @@ from barpc.base.geodesy import Array
 
 
 class CommonEdge(Term):
-    """Columns from one on have the same displacement in all images."""
+    """A displacement of the columns beyond an edge, the same in all images."""
 
     NAME: ClassVar[str] = "common_edge"
     NOUN: ClassVar[str] = "a step at the same column of all images"
@@ -40,8 +40,8 @@ class CommonEdge(Term):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the edge that explains most of the residuals."""
-        col, gain = score(residuals)
+        """Return the edge with the largest gain (`edge_gains`); the interval does not matter."""
+        col, gain = edge_gains(residuals)
         return [cls.at(residuals, float(col[int(gain.argmax())]))] if len(col) else []
 
     @classmethod
@@ -54,7 +54,7 @@ class CommonEdge(Term):
         return cls(-1, columns, np.full(2, sigma), float(np.log(width)) + SIZE_PRICE, where, parts=parts)
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the edge with a prior as wide as its size."""
+        """Return the edge with the prior of its displacement as wide as the estimate."""
         return self.at(residuals, self.where[1], self.prior_width(found))  # type: ignore[index]
 
     def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
@@ -64,12 +64,12 @@ class CommonEdge(Term):
                 yield replace(one, kind=self.NAME)
 
 
-def score(residuals: Residuals) -> tuple[Array, Array]:
-    """Return the positions (m,) [px] midway between columns of observations, and the gain (m,) [nats] of an edge there.
+def edge_gains(residuals: Residuals) -> tuple[Array, Array]:
+    """Return positions (m,) [px] midway between columns of observations, and the gain (m,) [nats] of an edge there.
 
-    The score test S' M^-1 S / 2 of one displacement of all observations beyond the edge, ground points eliminated: S is
-    the sum of their residuals, M its information. Tracks are weighted by the inverse of their residual norm, as for
-    the L1 norm.
+    The gain is the score test S' M^-1 S / 2 of one displacement of all observations beyond the edge, with ground points
+    eliminated: S is the gradient of their weighted residuals, M the information. Tracks are weighted by the inverse of
+    their residual norm, to approximate the L1 norm.
     """
     linear, base = residuals.linear, residuals.base
     left = linear.residual_after(base.step) + np.einsum("cek,e->ck", residuals.extra, base.extra) / linear.sigma

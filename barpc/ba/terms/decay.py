@@ -14,30 +14,30 @@ from barpc.ba.terms.step import ImagePart, Step, open_ended
 from barpc.ba.terms.term import Residuals, Term
 from barpc.base.geodesy import Array
 
-LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # lengths of decays to try, over that of the image
+LENGTHS = 2.0 ** np.arange(-7.0, 1.0)  # lengths of decays to try, as fractions of the length of the image
 
 
 class Decaying(Term):
     """A term whose displacement decays exponentially along the rows."""
 
     def first_cost(self, residuals: Residuals) -> float:
-        """Return the change of the sum of residual norms over the noise, for a sample of tracks; negative: it helps."""
+        """Return the change of the sum of residual norms by the term, on a sample of tracks; negative: it helps."""
         precision = self.sigma**-2.0
         return first_guess(residuals.few, residuals.base, residuals.extra, self.columns, precision)[2]
 
     def shapes(self, residuals: Residuals, fit: Callable[[Term], MixtureFit]) -> list[Self]:
-        """Return the term with the rate of a linearised fit, and itself."""
-        return [self.at_rate_of(fit(self.with_rate(residuals))), self]
+        """Return the term with the rate improved by a linearised fit, and the term itself."""
+        return [self.with_rate_of(fit(self.with_rate_derivatives(residuals))), self]
 
-    def with_rate(self, residuals: Residuals) -> Self:
-        """Return the term with twice the unknowns: the second half are derivatives by the log of its rate."""
+    def with_rate_derivatives(self, residuals: Residuals) -> Self:
+        """Return the term with columns (2, 2 e, K): its own, and their derivatives by the logarithm of the rate."""
         _, _, _, origin, rate = self.where  # type: ignore[misc]
         first_row = residuals.size[1, residuals.linear.view] if self.parts and rate < 0.0 else origin
         slope = -self.columns * np.maximum((residuals.place[1] - first_row) * rate, 0.0)
         return replace(self, columns=np.concatenate([self.columns, slope], axis=1), sigma=np.tile(self.sigma, 2))
 
-    def at_rate_of(self, found: MixtureFit) -> Self:
-        """Return the term with the rate of a fit `with_rate`, changed by a factor e at most; columns are unchanged."""
+    def with_rate_of(self, found: MixtureFit) -> Self:
+        """Return the term with the rate of a fit with derivatives, within a factor of e; its columns are unchanged."""
         moved, slope = np.split(found.extra[-2 * len(self.sigma) :], 2)
         step = float(np.clip(moved @ slope / max(float(moved @ moved), 1e-30), -1.0, 1.0))
         *place, rate = self.where  # type: ignore[misc]
@@ -45,7 +45,7 @@ class Decaying(Term):
 
 
 class Decay(Decaying, ImagePart):
-    """Rows of one image are displaced from an origin on, with exponential decay upwards or downwards."""
+    """A displacement of rows of one image that decays exponentially from an origin, upwards or downwards."""
 
     NAME: ClassVar[str] = "decay"
     NOUN: ClassVar[str] = "a decaying displacement of the rows of an image"
@@ -56,7 +56,7 @@ class Decay(Decaying, ImagePart):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the best decay downwards and the best upwards that begin at an end of an interval of rows."""
+        """Return the best decay downwards and the best upwards that begin at an end of the interval, if of rows."""
         if interval.axis == 0:
             return []
         # the interval is displaced, or the rest of the image is: both sides of both ends are tried
@@ -76,7 +76,7 @@ class Decay(Decaying, ImagePart):
         return found
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the decay with the origin of largest likelihood, and a prior as wide as its size."""
+        """Return the decay with the origin of largest likelihood, and a prior as wide as the estimate."""
         place, gain = self.gains(residuals, found, others)
         axis, _, _, _, rate = self.where  # type: ignore[misc]
         size = float(residuals.size[axis, self.view])
@@ -87,6 +87,6 @@ class Decay(Decaying, ImagePart):
         return self.at(residuals, self.view, (axis, *ends, origin, rate), self.prior_width(found))
 
     def simpler(self, residuals: Residuals) -> Term:
-        """Return the step of the same rows."""
+        """Return the step of the same rows, with the same prior."""
         axis, start, stop = self.where[:3]  # type: ignore[index]
         return replace(Step.at(residuals, self.view, (axis, start, stop, 0.0, 0.0)), sigma=self.sigma)

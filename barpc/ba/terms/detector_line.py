@@ -1,4 +1,4 @@
-"""A line of detectors: each detector of one image is displaced by itself, between edges at two or more columns."""
+"""A line of detectors: each detector of one image has a displacement, between edges at two or more columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from barpc.base.statistics import FEW, OUTLIER, SURE, robust_spread
 
 
 class DetectorLine(Term):
-    """Columns of one image between successive edges are displaced, each part by itself."""
+    """Displacements of the columns of one image between successive edges, one for each part."""
 
     NAME: ClassVar[str] = "detector_line"
     NOUN: ClassVar[str] = "displaced detectors of an image"
@@ -32,7 +32,7 @@ class DetectorLine(Term):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the line of the interval's image, if its residuals change at two columns or more."""
+        """Return the line of the image, if its mean residuals change at two columns or more."""
         if interval.axis:
             return []
         base = residuals.base
@@ -42,7 +42,7 @@ class DetectorLine(Term):
 
     @classmethod
     def at(cls, residuals: Residuals, view: int, edges: list[float], sigma: float = FIRST_SIGMA) -> Self:
-        """Return the line with edges at columns [px], and the prior standard deviation of its displacements [px].
+        """Return the line with edges at columns [px], and prior standard deviation `sigma` of displacements [px].
 
         Displacements are relative to the columns before the first edge.
         """
@@ -54,7 +54,7 @@ class DetectorLine(Term):
         return cls(view, columns, np.full(columns.shape[1], sigma), price, parts=parts)
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the line with edges by the cameras of the fit, and a prior as wide as its displacements."""
+        """Return the line with edges found beside the cameras of the fit, and a prior as wide as the estimates."""
         own = np.einsum("cek,e->ck", self.columns, found.extra[-len(self.sigma) :])
         edges = change_points(residuals, self.view, found, others, own)
         return self.at(residuals, self.view, edges, self.prior_width(found)) if len(edges) > 1 else self
@@ -70,12 +70,12 @@ def change_points(
 ) -> list[float]:
     """Return the columns [px], ascending, at which the mean residual of a view changes significantly.
 
-    Residuals are those of a fit `found` with displacements `others` (2, K) [px], against ground points intersected from
-    inliers. The displacements `own` (2, K) [px] of a line in the fit are added to them. Without `own`, rejected
-    observations count, too, up to `OUTLIER` times the spread of all: those of displaced detectors may be rejected.
+    Residuals are those of the fit `found`, beside displacements `others` (2, K) [px] by other terms. Ground points are
+    intersected from inliers. If a line is in the fit, its displacements `own` (2, K) [px] are removed for that only.
+    Without `own`, rejected observations are used, too: those of displaced detectors may be rejected.
 
-    Candidates are found by binary segmentation. The least significant one beside the others and a trend, which the
-    cameras follow, is removed until all are significant.
+    Candidates are found by binary segmentation. They are estimated together with a trend, which the cameras may absorb.
+    The least significant one is removed until all are significant.
     """
     linear, price = residuals.linear, Step.at(residuals, view, (0, 0.0, 1.0, 0.0, 0.0)).price + SURE
     left = linear.residual_after(found.step) + others / linear.sigma
@@ -85,7 +85,7 @@ def change_points(
     order = np.flatnonzero(rows)[np.argsort(residuals.place[0, rows], kind="stable")]
     col, plain = residuals.place[0, order], _limited(off[:, order].T / found.noise)
     values = plain
-    if own is not None:  # of a large displacement, different shares are absorbed by points of two and of three images
+    if own is not None:  # points of two and of three images absorb different shares of a large displacement
         moved = own / linear.sigma
         off, _ = residuals_from_inliers(linear, left + moved, found.right)
         values = _limited((off - moved)[:, order].T / found.noise)
@@ -100,7 +100,7 @@ def change_points(
             break
         del edges[int(gain.argmin())]
     sums = _cumulative_sums(plain)
-    for n in range(len(edges)):  # each was found before its neighbours
+    for n in range(len(edges)):  # each again, as its neighbours were found after it
         first, stop = (edges[n - 1] if n else 0), (edges[n + 1] if n + 1 < len(edges) else len(order))
         edges[n] = _best_split(sums, first, stop)[0]
     return [0.5 * float(col[n - 1] + col[n]) for n in edges]
@@ -113,24 +113,24 @@ def _limited(values: Array) -> Array:
 
 
 def _cumulative_sums(values: Array) -> Array:
-    """Return the sums (n + 1, 2) of the first 0, 1 ... n values."""
+    """Return the sums (n + 1, 2) of the first 0, 1 ... n of the values (n, 2)."""
     return np.vstack([np.zeros(2), np.cumsum(values, axis=0)])
 
 
 def _segmented(sums: Array, first: int, stop: int, price: float) -> list[int]:
-    """Return the indices between `first` and `stop` at which a mean changes, ascending, by binary segmentation.
+    """Return the indices between `first` and `stop` at which the mean changes, ascending, by binary segmentation.
 
-    A part is divided where `_best_split` says, if the gain exceeds `price` [nats].
+    A part is divided at its `_best_split`, if the gain of that exceeds `price` [nats].
     """
     at, gain = _best_split(sums, first, stop)
     return [*_segmented(sums, first, at, price), at, *_segmented(sums, at, stop, price)] if gain > price else []
 
 
 def _best_split(sums: Array, first: int, stop: int) -> tuple[int, float]:
-    """Return the index between `first` and `stop` with the largest log-likelihood gain [nats] by two means, and this.
+    """Return the index that divides values `first` to `stop` into two means of largest likelihood, and the gain [nats].
 
-    `sums` (n + 1, 2) are cumulative sums of values of unit variance. Each side has at least `FEW` values; a part with
-    fewer has no gain.
+    `sums` (n + 1, 2) are cumulative sums of values of unit variance. Both sides have at least `FEW` values; without
+    such an index the gain is 0.
     """
     count, whole = np.arange(FEW, stop - first - FEW + 1), stop - first
     if not len(count):

@@ -18,7 +18,7 @@ from barpc.sensor.image_corrections import profile
 
 
 class LowFrequency(Term):
-    """Splines over the rows of one image, orthogonal to the polynomials of the drift."""
+    """A displacement of rows of one image by splines that are orthogonal to the polynomials of the drift."""
 
     NAME: ClassVar[str] = "low_frequency"
     NOUN: ClassVar[str] = "a low-frequency displacement of the rows of an image"
@@ -26,7 +26,7 @@ class LowFrequency(Term):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the splines of an image; their number is limited by its observations."""
+        """Return the splines of the image of an interval; their number is limited by the observations of an image."""
         view, linear = interval.view, residuals.linear
         rows = np.flatnonzero(linear.view == view)
         u = 2.0 * residuals.place[1, rows] / residuals.size[1, view] - 1.0
@@ -37,7 +37,7 @@ class LowFrequency(Term):
         return [cls(view, in_both_coordinates(residuals, rows, basis), sigma, cost)]
 
     def alternatives(self, residuals: Residuals, found: MixtureFit) -> list[Term]:
-        """Return the step and the decay that the fitted curve resembles most, without the drift."""
+        """Return the step and the decay that most resemble the fitted curve, apart from a drift."""
         size = float(residuals.size[1, self.view])
         rows = (np.arange(BINS) + 0.5) / BINS * size
         splines = AdditionalParameters(len(self.sigma) // 2 + DRIFTS).splines(2.0 * rows / size - 1.0)

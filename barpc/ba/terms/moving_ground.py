@@ -25,12 +25,12 @@ from barpc.base.statistics import LEVEL, SAMPLE, SURE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 GROUND_CELLS = 6  # cells along each side of the ground
-_STARTS = 8  # regions to start a fit from, those of the best score
+_STARTS = 8  # regions, those of the best score, from which a fit starts
 
 
 @dataclass(frozen=True, eq=False)
 class GroundMotion:
-    """Ground points of the tracks of a block in a local frame, and the derivative of observations by their motion."""
+    """Ground points of the tracks of a block in a local frame, and the derivatives of observations by their motion."""
 
     center: Array  # (3,) [m], ECEF
     low: Array  # (2,) least east and north of the points [m]
@@ -40,7 +40,7 @@ class GroundMotion:
 
     @classmethod
     def of(cls, problem: Problem, state: State, like: GroundMotion | None = None) -> GroundMotion:
-        """Return the ground of the points of a problem, in the frame of `like` if given."""
+        """Return the ground motion of the points of a problem; `like` gives the frame, else the points do."""
         points = state.points[problem.structure.point]
         center = np.nanmedian(points, axis=0) if like is None else like.center
         basis = enu_basis(ground_from_ecef(center))
@@ -52,7 +52,7 @@ class GroundMotion:
         return cls(center, like.low, like.high, place, by_ground)
 
     def part(self, rows: IntArray) -> GroundMotion:
-        """Return the ground of the observations `rows`."""
+        """Return the ground motion of the observations `rows`."""
         return replace(self, place=self.place[:, rows], by_ground=self.by_ground[..., rows])
 
     @cached_property
@@ -71,7 +71,7 @@ class GroundMotion:
         return np.asarray(row * number + col)
 
     def by_moves(self, view: IntArray, views: int) -> Array:
-        """Return the displacements (2, 2 N - 2, K) [px] by motions of `pixel` east and north, views from the second."""
+        """Return the displacements (2, 2 N - 2, K) [px] by motions of `pixel` east and north in views but the first."""
         out = np.zeros((2, 2 * (views - 1), len(view)))
         for v in range(1, views):
             rows = np.flatnonzero(view == v)
@@ -84,10 +84,10 @@ class Motion:
     """The record of a moving group for the report."""
 
     metres: float  # largest motion between two views, without the part that a height would explain [m]
-    between: tuple[int, int]  # these views
-    share: float  # of the tracks
+    between: tuple[int, int]  # these two views
+    share: float  # of the tracks of the block
     box: tuple[float, float, float, float]  # west, south, east, north [deg]: 5 % and 95 % quantiles of its tracks
-    side: str  # of the block on which it lies, as "north-west"; "": on no one side
+    side: str  # of the block, as "north-west"; "": on no single side
     gcps: tuple[str, ...] = ()  # names of control points among them
     dates: tuple[str, str] = ("", "")  # of the two views; empty: unknown
 
@@ -101,15 +101,16 @@ class MovingGroup:
     member: BoolArray  # (K,) observations of its tracks
     shares: Array  # (GROUND_CELLS^2,) share of moving tracks in each cell
     ground: GroundMotion
-    fit: MixtureFit  # with the group
+    fit: MixtureFit  # the fit with the group
 
 
-def shows(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> bool:
-    """Return whether a region of the ground may move: whether its score, by a sample of tracks, exceeds the price.
+def may_move(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> bool:
+    """Return whether a region of the ground may move: its score on a sample of tracks exceeds the price of a group.
 
-    The expected largest score of R still regions is subtracted: half the chi-square quantile of probability 1 / R.
+    The largest score expected by chance among R regions is subtracted: half the chi-square quantile exceeded with
+    probability 1 / R.
     """
-    few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
+    few, group = linear.thinned(SAMPLE), _uniform_group(linear, ground)
     if not few.tracks:
         return False
     chance = float(gammainccinv(0.5 * len(group.sigma), 1.0 / len(_REGIONS)))
@@ -118,20 +119,20 @@ def shows(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, 
     return bool(gain * all_of / some > price_of_group(linear, group.cell) + SURE)
 
 
-def _any_group(linear: Linear, ground: GroundMotion) -> Group:
-    """Return a group to which any track belongs with probability 0.5, with the prior of its unknowns."""
+def _uniform_group(linear: Linear, ground: GroundMotion) -> Group:
+    """Return a group to which each track belongs with prior probability 0.5."""
     by_move, cell = ground.by_moves(linear.view, linear.views), ground.cells(GROUND_CELLS)
     return Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
 
 
 def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
-    """Return the most likely moving group beside a fit `base` with terms `extra`, as a start; None without tracks."""
-    few, group = linear.thinned(SAMPLE), _any_group(linear, ground)
+    """Return the start of a fit of the most likely moving group, beside the fit `base`; None without tracks."""
+    few, group = linear.thinned(SAMPLE), _uniform_group(linear, ground)
     cell, rows = group.cell, few.in_tracks
     if not rows.any():
         return None
     starts = [replace(group, share=share) for share in _start_shares(linear, group, base, extra, sigma)]
-    # iterated to the end: a few iterations do not show which start ends best
+    # fits are iterated to the end, as a few iterations do not show which start is the best
     ended = [(Mixture(few, extra, sigma, base, one).run(cooled=COOLED**2), one) for one in starts]
     found, start = max(ended, key=lambda row: row[0].evidence)
     shares = _cell_shares(found.moving, cell, rows)[cell]
@@ -171,7 +172,7 @@ def _region_gains(linear: Linear, group: Group, base: MixtureFit, extra: Array, 
 
 
 def _regions() -> BoolArray:
-    """Return regions (R, GROUND_CELLS^2) of cells: rectangles, half-planes and bands in eight directions."""
+    """Return regions of the ground (R, GROUND_CELLS^2): rectangles, half-planes and bands in eight directions."""
     row, col = np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS)
     low, high = np.triu_indices(GROUND_CELLS)
     inside = [(one >= low[:, None]) & (one <= high[:, None]) for one in (row, col)]
@@ -190,7 +191,7 @@ _REGIONS = _regions()
 
 
 def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
-    """Return the best regions, none of which overlaps a better one in more than half of their union."""
+    """Return the `_STARTS` best regions, none of which shares more than half of their union with a better one."""
     found: list[BoolArray] = []
     for n in np.argsort(-gains, kind="stable"):
         one = regions[n]
@@ -201,7 +202,7 @@ def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
 
 
 def _cell_shares(member: Array, cell: IntArray, rows: BoolArray) -> Array:
-    """Return the share of members in each cell, among the observations `rows`."""
+    """Return the share (GROUND_CELLS^2,) of members among the observations `rows` of each cell."""
     moving_count, count = (np.bincount(cell[rows], w, GROUND_CELLS**2) for w in (member[rows], np.ones(rows.sum())))
     return np.asarray((moving_count + 0.5) / (count + 1.0))
 
@@ -215,7 +216,7 @@ def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureF
     up = np.array([ground.by_ground[:, :, member & (linear.view == v)].mean(axis=2) for v in seen])
     apart = np.zeros((1, 1)), (0, 0)
     if len(seen) >= 2:
-        # a shift of all views is no motion; a part along the parallax of the views may be height
+        # a shift common to all views is no motion, and a part along their parallax may be a height
         parallax = -np.linalg.solve(up[:, :, :2], up[:, :, 2:])[..., 0]
         design = np.column_stack([np.tile(np.eye(2), (len(seen), 1)), parallax.ravel()])
         flat = moved[seen].ravel()
@@ -228,7 +229,7 @@ def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureF
 
 
 def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> BoolArray:
-    """Return the observations (K,) of a block that belong to a group found at camera unknowns (N, q)."""
+    """Return the mask (K,) of observations of a block that belong to a group, with camera unknowns (N, q)."""
     if not len(block.view):
         return np.zeros(0, dtype=bool)
     part, points = problem_of_block(problem, params, block)

@@ -14,7 +14,7 @@ from barpc.base.geodesy import Array
 
 
 class MovingObjects(Term):
-    """Displacements on the ground, one for each view, of a group of tie points with a share in each ground cell."""
+    """Motions of a group of tie points on the ground, one for each view; each cell has a share of moving tracks."""
 
     NAME: ClassVar[str] = "moving_objects"
     NOUN: ClassVar[str] = "moving objects"
@@ -24,10 +24,10 @@ class MovingObjects(Term):
     )
 
     @staticmethod
-    def shows(residuals: Residuals) -> bool:
-        """Return whether a region of the ground may move (`moving_ground.shows`)."""
+    def may_move(residuals: Residuals) -> bool:
+        """Return whether a region of the ground may move (`moving_ground.may_move`)."""
         seen = residuals
-        return moving_ground.shows(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
+        return moving_ground.may_move(seen.linear, seen.ground, seen.base, seen.extra, seen.sigma)
 
     @classmethod
     def of(cls, residuals: Residuals) -> list[Self]:
@@ -40,10 +40,7 @@ class MovingObjects(Term):
         return [cls(-1, none, np.zeros(0), cost, group=one)]
 
     def amplitude(self, residuals: Residuals, found: MixtureFit) -> float:
-        """Return the largest motion between two views, without an effect of height, in pixels of the coarser one.
-
-        Infinite for an empty group.
-        """
+        """Return `Motion.metres` in pixels of the coarser of the two views; infinity for an empty group."""
         if self.group is None or not (found.moving > 0.5).any():
             return np.inf
         linear, ground = residuals.linear, residuals.ground
@@ -51,7 +48,7 @@ class MovingObjects(Term):
         return one.metres / max(ground.pixel_of(np.flatnonzero(linear.view == v)) for v in one.between)
 
     def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
-        """Yield its record, with the members of the group."""
+        """Yield the record of the group, with its members."""
         assert self.group is not None
         group = moving_ground.group_of(residuals.linear, residuals.ground, self.group, residuals.base)
         yield Finding(self.NAME, self.view, None, np.zeros(2), unknowns=unknowns, moved=group, **fields)

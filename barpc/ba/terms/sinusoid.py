@@ -44,5 +44,6 @@ class Sinusoid(Term):
 
 
 def _amplitude(unknowns: Array) -> Array:
+    """Return the amplitude (2,), col and row, of a cosine and a sine in each coordinate."""
     amplitude: Array = np.hypot(*unknowns.reshape(2, 2).T)
     return amplitude

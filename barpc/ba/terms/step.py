@@ -20,7 +20,7 @@ class ImagePart(Term):
 
     FOLLOWED: ClassVar[bool] = True
     LOCAL: ClassVar[bool] = True
-    NUM_SHAPES: ClassVar[int]  # shape parameters with a price: size, length
+    NUM_SHAPES: ClassVar[int]  # shape parameters that have a price: size, length of a decay
 
     @classmethod
     def at(cls, residuals: Residuals, view: int, where: Where, sigma: float = FIRST_SIGMA) -> Self:
@@ -34,13 +34,13 @@ class ImagePart(Term):
         return cls(view, columns, np.full(2, sigma), cost, where)
 
     def size(self, residuals: Residuals, unknowns: Array) -> Array:
-        """Return its displacement (2,), col and row [px]; with a decay, at its origin."""
+        """Return the displacement (2,), col and row [px]; with a decay, that at its origin."""
         return unknowns
 
     def gains(self, residuals: Residuals, found: MixtureFit, others: Array) -> tuple[Array, Array]:
-        """Return positions (n,) [px] of the view's observations, ascending, and the log-likelihood gain (n,) of each.
+        """Return positions (n,) [px] of the observations of the view, ascending, and the log-likelihood gain (n,).
 
-        The gain is that of the displacement if it were everywhere; `found` and `others` as for `refined`.
+        The gain is that of displacing all observations, not only those in the part. `found`, `others`: see `refined`.
         """
         linear = residuals.linear
         axis, _, _, *decay = self.where  # type: ignore[misc]
@@ -85,7 +85,7 @@ class Step(ImagePart):
 
 
 class LinesLost(Step):
-    """A step of rows by a whole number of them: lost or repeated lines. `image_terms` makes it from a `Step`."""
+    """A step by a whole number of rows: lost or repeated lines. `image_terms` makes it from a `Step`."""
 
     NAME: ClassVar[str] = "lines_lost"
     NOUN: ClassVar[str] = "lines lost, or repeated"
@@ -93,17 +93,17 @@ class LinesLost(Step):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return none: `Step` is proposed instead."""
+        """Return no terms: `Step` is proposed instead."""
         return []
 
 
 def open_ended(start: float, stop: float, size: float) -> tuple[float, float]:
-    """Return the ends of a part; those at an end of the image (of length `size`) are moved far beyond it."""
+    """Return the ends of a part [px]; those at an end of the image of length `size` [px] are moved far beyond it."""
     return (-size if start <= 0.0 else start), (2.0 * size if stop >= size else stop)
 
 
 def largest_part(gain: Array) -> tuple[int, int]:
-    """Return the first and last index of the run of values with the largest sum."""
+    """Return the first and last index of the run of values of largest sum (maximum subarray)."""
     sums = np.concatenate([[0.0], np.cumsum(gain)])
     lowest = np.minimum.accumulate(sums[:-1])
     last = int((sums[1:] - lowest).argmax())

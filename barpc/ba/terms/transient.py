@@ -39,14 +39,14 @@ class Transient(Decaying):
 
     @classmethod
     def propose(cls, residuals: Residuals, interval: Interval) -> list[Self]:
-        """Return the transient with the most likely length and end of the images."""
+        """Return the best of the transients of all lengths, at the first or at the last rows."""
         lengths = LENGTHS * float(np.median(residuals.size[1]))
         tried = [cls.at_rate(residuals, sign / length, FIRST_SIGMA) for sign in (1.0, -1.0) for length in lengths]
         return [tried[int(np.argmin([one.first_cost(residuals) for one in tried]))]]
 
     @classmethod
     def at_rate(cls, residuals: Residuals, rate: float, sigma: float) -> Self:
-        """Return the transient of a rate [1/px] (negative: at the end), with prior standard deviation `sigma` [px]."""
+        """Return the transient of a rate [1/px] (negative: of the last rows), and prior standard deviations [px]."""
         parts = []
         for v, size in enumerate(residuals.size[1].tolist()):
             where = (1, *open_ended(0.0, size, size), 0.0 if rate > 0.0 else size, rate)
@@ -56,7 +56,7 @@ class Transient(Decaying):
         return cls(-1, columns, np.full(columns.shape[1], sigma), cost, where, parts=tuple(parts))
 
     def refined(self, residuals: Residuals, found: MixtureFit, others: Array) -> Self:
-        """Return the transient with a prior as wide as its size."""
+        """Return the transient with a prior as wide as the estimates."""
         return self.at_rate(residuals, self.where[4], self.prior_width(found))  # type: ignore[index]
 
     def findings(self, residuals: Residuals, unknowns: Array, **fields: Any) -> Iterator[Finding]:
