@@ -134,7 +134,11 @@ def _only_alone(driver: str) -> bool:
 def _opened_quietly(name: str | Path, **how: Any) -> Any:
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(name, **how)
+        dataset = rasterio.open(name, **how)
+    if dataset.tags(ns="OVERVIEWS"):  # GDAL opens what they name, by whatever driver, once it reads every second pixel
+        dataset.close()
+        raise RasterioError("it names another file as its overviews")
+    return dataset
 
 
 class _Asked(RemoteFile):
@@ -278,7 +282,7 @@ def _file_of(file: Path, driver: str, alone: bool, stack: ExitStack) -> _File:
     if alone or _only_alone(driver) or not _PLAIN.fullmatch(str(file)):
         return _File.of(stack.enter_context(_opened_alone(file, driver)), driver, held=True)
     found = file.stat()
-    return _plain_file(file, driver, found.st_mtime_ns, found.st_size)
+    return _plain_file(file, driver, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
 @lru_cache(4096)  # a DEM of many tiles is opened for every window
