@@ -16,7 +16,7 @@ from barpc.base.remote import _CACHE_BYTES as HELD
 from barpc.base.remote import _MAX_REQUEST_BYTES as REQUEST
 from barpc.base.remote import REQUEST_BYTES, hosts
 from barpc.pointio import names, third_party_matches
-from barpc.rasters import dem, mosaic
+from barpc.rasters import dem, raster
 from barpc.report import runfiles
 from barpc.rpcio import images
 from barpc.sensor import document as metadata
@@ -97,7 +97,7 @@ def rows() -> list[tuple[str, str]]:
             f"{hosts.TIMEOUT:g} s, and 1 s for {hosts._SLOWEST:,} bytes; {hosts._MOVES} redirects; "
             f"{size(hosts._EXTRA)} beside the data",
         ),
-        ("rasters open at a time", many(mosaic._MOST_OPEN)),
+        ("rasters open at a time", many(raster.GDAL_OPTIONS["GDAL_MAX_DATASET_POOL_SIZE"])),
         ("an image of a product's metadata", f"{many(metadata.MOST_PIXELS)} rows or columns"),
         ("a polynomial of a SICD", f"degree {sicd._ORDER}"),
         ("a name of an image", f"{names.MAX_NAME} bytes"),

@@ -50,7 +50,8 @@ from barpc.dsm.stereo import (
 from barpc.pipeline.executor import CachingExecutor, worker_count
 from barpc.pipeline.pictures import encoded
 from barpc.pipeline.remake import remake_report
-from barpc.rasters.raster import BLOCK_SIZE, hashed, map_crs, open_raster
+from barpc.rasters.raster import hashed, map_crs, open_raster
+from barpc.rasters.vrt import BLOCK_SIZE
 from barpc.report.finished import FinishedRun
 from barpc.report.page import can_render
 from barpc.report.runfiles import FOLDER, SURFACE, run_key

@@ -15,9 +15,8 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
-from html import escape
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,7 +32,7 @@ from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
 from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.rasters.raster import GDAL_OPTIONS
-from barpc.rasters.vrt import Vrt, read_vrt
+from barpc.rasters.vrt import Named, Vrt, read_vrt, vrt_text
 from barpc.rpcio import Carrier, format_for, read_rpc, sidecars
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.sensor import SensorModel
@@ -211,12 +210,9 @@ def _lent(path: Path) -> Iterator[Path]:
 
 
 def _camera_only(vrt: Vrt) -> str:
-    items = vrt.metadata.get("RPC", {}).items()
-    rows = "".join(f'<MDI key="{escape(key)}">{escape(value)}</MDI>' for key, value in items)
-    return (
-        f'<VRTDataset rasterXSize="{vrt.size[0]}" rasterYSize="{vrt.size[1]}">'
-        f'<Metadata domain="RPC">{rows}</Metadata><VRTRasterBand dataType="Byte" band="1"/></VRTDataset>\n'
-    )
+    blank = replace(vrt.bands[0], sources=())
+    items = {"RPC": vrt.metadata.get("RPC", {})}
+    return vrt_text(Vrt(vrt.size, (blank,), None, "", None, items, "", ()), lambda source: Named(str(source.file)))
 
 
 # --- consumers --------------------------------------------------------------------------------------------

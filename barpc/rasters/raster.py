@@ -3,8 +3,9 @@
 GDAL decides by content what a file is, and some contents (a VRT, a web service description) make it read other
 files or the network. So the first bytes choose the one driver that may open a file, GDAL does not look at the files
 beside it, and a VRT or a list of tiles is never shown to it: `barpc.rasters.vrt` and `barpc.rasters.composed` read
-it, and `barpc.rasters.mosaic` puts the pixels together. Of a file on another host, and of raw pixels with a header,
-GDAL asks this process for bytes: it sees nothing else, and only this process speaks with the host.
+it, and GDAL is shown a VRT written of that, in which every file stands with its one driver. Of a file on another
+host, and of raw pixels with a header, GDAL asks this process for bytes: it sees nothing else, and only this process
+speaks with the host.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
@@ -29,6 +30,7 @@ from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.warp import transform as warp_points
+from rasterio.windows import Window
 
 from barpc.base import identity
 from barpc.base.errors import ImageError, InputError
@@ -37,8 +39,8 @@ from barpc.base.identity import Input
 from barpc.base.remote import PathOrUrl, Remote, RemoteFile, location
 from barpc.base.safe_io import IMAGE, opened, read_head
 from barpc.rasters.composed import header_beside, is_raw, placed_tiles, refuse_foreign_channels, shown_header
-from barpc.rasters.crs import crs_of, refuse_opening_crs
-from barpc.rasters.vrt import INDIRECT, MAGIC, Band, Source, Vrt, read_vrt
+from barpc.rasters.crs import crs_of, plain_crs, refuse_opening_crs
+from barpc.rasters.vrt import GDAL_TYPES, INDIRECT, MAGIC, PROPERTIES, Band, Named, Source, Vrt, read_vrt, vrt_text
 
 DRIVERS: dict[bytes, str] = {
     b"II*\x00": "GTiff",
@@ -59,7 +61,6 @@ DRIVERS: dict[bytes, str] = {
 MOSAICS = ("VRT", "TIL")
 """Texts that name rasters, which GDAL is never shown."""
 
-BLOCK_SIZE = 512  # px a side, read and written at a time
 GRID_TAG = "ALTITUDE_B0"  # of a raster that is a localisation grid
 
 GDAL_OPTIONS: dict[str, Any] = {
@@ -68,6 +69,7 @@ GDAL_OPTIONS: dict[str, Any] = {
     "GDAL_HTTP_MAX_RETRY": 0,
     "GDAL_VRT_ENABLE_PYTHON": "NO",
     "GDAL_CACHEMAX": 64 << 20,  # bytes, as rasterio sets it
+    "GDAL_MAX_DATASET_POOL_SIZE": 64,  # sources of VRTs that are open at a time
     "GDAL_NUM_THREADS": "1",  # threads open the file anew: what fails in one of them nobody hears of
 }
 """Settings under which every raster is read."""
@@ -81,7 +83,7 @@ _WARNINGS = threading.Lock()  # catch_warnings is process-wide
 
 @contextmanager
 def open_raster(path: str | os.PathLike[str], driver: str | None = None) -> Iterator[Any]:
-    """Open a raster read-only, as a rasterio.DatasetReader or a Mosaic; an error while it is open names the file, too.
+    """Open a raster read-only, as a rasterio.DatasetReader; an error while it is open names the file, too.
 
     `driver` may open a file whose first bytes do not tell its kind (`barpc.rasters.dem.HEIGHT_DRIVERS`). ImageError for
     a file that is missing, a folder, empty, of no kind that barpc reads, damaged, remote, or a VRT that is not of the
@@ -113,16 +115,30 @@ def _damage_of(file: PathOrUrl, reason: str) -> str:
 
 
 def _open_dataset(file: PathOrUrl, driver: str) -> Any:
+    _refuse_what_opens_others(file, driver)
+    if isinstance(file, Remote):
+        return _opened_remote(file, driver)
+    return _opened_alone(file, driver) if _only_alone(driver) else _opened_quietly(file, driver=driver)
+
+
+def _refuse_what_opens_others(file: PathOrUrl, driver: str) -> None:
     refuse_opening_crs(file, driver)
     if driver == "PCIDSK":
         refuse_foreign_channels(file)
-    if isinstance(file, Remote):
-        return _opened_remote(file, driver)
-    if driver == "ENVI" or (driver == "JP2OpenJPEG" and _LOOKS_BESIDE_JP2):
-        return _opened_alone(file, driver)
+
+
+def _only_alone(driver: str) -> bool:
+    return driver == "ENVI" or (driver == "JP2OpenJPEG" and _LOOKS_BESIDE_JP2)
+
+
+def _opened_quietly(name: str | Path, **how: Any) -> Any:
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(file, driver=driver)
+        dataset = rasterio.open(name, **how)
+    if dataset.tags(ns="OVERVIEWS"):  # GDAL opens what they name, by whatever driver, once it reads every second pixel
+        dataset.close()
+        raise RasterioError("it names another file as its overviews")
+    return dataset
 
 
 class _Asked(RemoteFile):
@@ -167,9 +183,7 @@ def _open_visible(driver: str, files: Mapping[str, Callable[[], Any]]) -> Any:
             raise FileNotFoundError(name)
         return files[name]()
 
-    with _WARNINGS, warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(_VISIBLE_NAME, driver=driver, opener=opener)
+    return _opened_quietly(_VISIBLE_NAME, driver=driver, opener=opener)
 
 
 @contextmanager
@@ -187,20 +201,113 @@ def _opened_alone(file: Path, driver: str) -> Iterator[Any]:
             yield dataset
 
 
-def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Any:
-    """Return a VRT, or a list of tiles as one, whose sources are all rasters that are read here."""
+_PLAIN = re.compile(r"[\w/.~ ,@:\\()-]+")  # a path that vrt:// takes as it stands
+_SHOWN_DOMAINS = "", "RPC"  # of metadata; others name files
+
+
+@contextmanager
+def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Iterator[Any]:
+    """Open a VRT, or a list of tiles as one, by a new VRT in which every source has its one driver.
+
+    By its first bytes alone a source could be another VRT to GDAL.
+    """
     if isinstance(file, Remote):
         raise ImageError(f"{name}: a {driver} is read from disk only; give the images it is made of")
     vrt = read_vrt(file, name=name) if driver == "VRT" else _vrt_of_tiles(file)
-    drivers: dict[Path, str] = {}
-    for source in vrt.sources:
-        if source.file not in drivers:
-            drivers[source.file] = identify(source.file)[1]
-            if drivers[source.file] in MOSAICS:
-                raise ImageError(f"{name}: a {driver} of a VRT is not read; give the images it is made of")
-    from barpc.rasters.mosaic import Mosaic  # few rasters are VRTs
+    for text in filter(None, (vrt.srs, vrt.gcp_srs)):
+        try:
+            CRS.from_string(plain_crs(text, name, ImageError))
+        except CRSError as error:
+            raise ImageError(f"{name}: the VRT's coordinate system cannot be read ({error})") from error
+    drivers = {source.file: identify(source.file)[1] for source in vrt.sources}
+    if mosaics := set(drivers.values()).intersection(MOSAICS):
+        raise ImageError(f"{name}: a {mosaics.pop()} of a VRT is not read; give the images it is made of")
+    raw = "ENVI" in drivers.values()  # GDAL finds a header only where it looks beside every file: each is shown alone
+    with ExitStack() as stack:
+        with rasterio.Env(**{"GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"} if raw else {}):
+            files = {at: _file_of(at, kind, raw, stack) for at, kind in drivers.items()}
+            bands = [_placed(band, files, vrt.size, name) for band in vrt.all]
+            shown = replace(
+                vrt,
+                bands=tuple(bands[: len(vrt.bands)]),
+                mask=bands[-1] if vrt.mask else None,
+                metadata={domain: vrt.metadata.get(domain, {}) for domain in _SHOWN_DOMAINS},
+            )
+            text = vrt_text(shown, lambda source: files[source.file].named(source))
+            dataset = stack.enter_context(_opened_quietly(text, driver="VRT"))
+            if raw:
+                _open_sources(dataset, shown)
+        dataset.vrt = vrt
+        yield dataset
 
-    return Mosaic(name, vrt, lambda source: _open_dataset(source, drivers[source]))
+
+def _open_sources(dataset: Any, vrt: Vrt) -> None:
+    """Read a pixel of every source, so that GDAL opens it."""
+    for band in vrt.all:
+        for x, y, width, height in (source.dst or (0, 0, 1, 1) for source in band.sources):
+            pixel = Window(max(x, 0), max(y, 0), 1, 1)
+            if pixel.col_off < min(x + width, vrt.size[0]) and pixel.row_off < min(y + height, vrt.size[1]):
+                dataset.read(window=pixel)
+                dataset.read_masks(window=pixel)
+
+
+class _File(NamedTuple):
+    """A source of a VRT: its name for GDAL, its size and its bands."""
+
+    name: str
+    size: tuple[int, int]
+    dtypes: tuple[str, ...]
+    units: tuple[str | None, ...]
+    blocks: tuple[tuple[int, int], ...]
+    held: bool  # open here as long as the VRT is
+
+    @classmethod
+    def of(cls, dataset: Any, driver: str, held: bool = False) -> _File:
+        """Return the record of an opened file."""
+        size, name = (dataset.width, dataset.height), f"vrt://{dataset.name}?if={driver}"
+        return cls(name, size, dataset.dtypes, dataset.units, tuple(dataset.block_shapes), held)
+
+    def named(self, source: Source) -> Named:
+        """Return its name for GDAL, with the properties without which GDAL never closes a file."""
+        if self.held:
+            return Named(self.name)
+        height, width = self.blocks[source.band - 1]
+        texts = *map(str, (*self.size, width, height)), GDAL_TYPES[self.dtypes[source.band - 1]]
+        return Named(self.name, properties=dict(zip(PROPERTIES, texts, strict=True)))
+
+
+def _file_of(file: Path, driver: str, alone: bool, stack: ExitStack) -> _File:
+    """Return a source; one that GDAL has to see alone is opened on the stack."""
+    _refuse_what_opens_others(file, driver)
+    if alone or _only_alone(driver) or not _PLAIN.fullmatch(str(file)):
+        return _File.of(stack.enter_context(_opened_alone(file, driver)), driver, held=True)
+    found = file.stat()
+    return _plain_file(file, driver, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+
+
+@lru_cache(4096)  # a DEM of many tiles is opened for every window
+def _plain_file(file: Path, driver: str, *_version: int) -> _File:
+    with _opened_quietly(file, driver=driver) as dataset:
+        return _File.of(dataset, driver)
+
+
+def _placed(band: Band, files: Mapping[Path, _File], size: tuple[int, int], name: str) -> Band:
+    """Return a band with all rectangles of its sources, and, where it states none, the unit of the first one."""
+    sources = []
+    for source in band.sources:
+        file = files[source.file]
+        if not 1 <= source.band <= len(file.dtypes):
+            raise ImageError(f"{name}: there is no band {source.band} in {os.fspath(source.file)}")
+        src, dst = source.src or (0, 0, *file.size), source.dst or (0, 0, *size)
+        if src[2:] != dst[2:]:
+            raise ImageError(
+                f"{name}: {os.fspath(source.file)} is {src[2]} x {src[3]} px and would be resampled to {dst[2]} x "
+                f"{dst[3]} px, which is not done; write it out as a GeoTIFF"
+            )
+        sources.append(replace(source, src=src, dst=dst))
+    first = next(iter(sources), None)
+    unit = files[first.file].units[first.band - 1] if band.unit is None and first else band.unit
+    return replace(band, sources=tuple(sources), unit=unit)
 
 
 def _vrt_of_tiles(file: Path) -> Vrt:
@@ -219,14 +326,10 @@ def _vrt_of_tiles(file: Path) -> Vrt:
     return replace(whole, size=size, bands=bands, mask=None)
 
 
-def shown_vrt(dataset: Any) -> Vrt | None:
-    """Return the VRT that an opened raster is; None of another."""
-    return getattr(dataset, "vrt", None)
-
-
 def vrt_of(dataset: Any, file: Path) -> Vrt:
     """Return the VRT that shows an opened raster whole; of one that is a VRT its own."""
-    if (own := shown_vrt(dataset)) is not None:
+    own: Vrt | None = getattr(dataset, "vrt", None)
+    if own is not None:
         return own
     whole = (0, 0, dataset.width, dataset.height)
     rows = zip(dataset.dtypes, dataset.nodatavals, dataset.colorinterp, strict=True)

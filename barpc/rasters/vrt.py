@@ -1,18 +1,18 @@
 """Reading a VRT: a closed grammar of tags, attributes and text; what is not in it is refused.
 
 GDAL's own reader takes attributes for elements, tags in any case, and half-closed documents. So GDAL is never
-shown a VRT: what this module reads is all there is, and `barpc.rasters.mosaic` puts the pixels together.
+shown a VRT of somebody else: what this module reads is all there is, and of that it writes a new one.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from barpc.base.errors import ImageError, RpcFormatError
 from barpc.base.safe_io import MB, XML, parse_xml, read_bytes
@@ -34,6 +34,7 @@ _TYPE = "|".join(GDAL_TYPES.values())
 _RESAMPLING = "nearest|near|bilinear|cubic|cubicspline|lanczos|average|rms|mode|gauss"
 _SRS = r"(?s:[A-Z_]{4,20}\[.*\])|EPSG:\d{1,6}"
 INDIRECT = re.compile(r"/vsi|[A-Za-z][A-Za-z0-9+._-]+:")
+BLOCK_SIZE = 512  # px a side, read and written at a time
 _SHIFT = 1e-3  # px; a rectangle that lies less beside whole pixels is meant to lie on them
 
 
@@ -46,7 +47,8 @@ class _Tag(NamedTuple):
 
 
 _RECT = ("xOff", "yOff", "xSize", "ySize")
-_SIZE_ATTRIBUTES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize")
+PROPERTIES = ("RasterXSize", "RasterYSize", "BlockXSize", "BlockYSize", "DataType")
+"""Of a source."""
 _SOURCE_ELEMENTS = "SourceFilename SourceBand SourceProperties SrcRect DstRect"
 _BAND = "ColorInterp NoDataValue HideNoDataValue SimpleSource ComplexSource"
 _FORGOTTEN = "Description UnitType Offset Scale Metadata CategoryNames ColorTable Histograms"
@@ -83,7 +85,7 @@ _GRAMMAR: dict[str, _Tag] = {
     "ComplexSource": _Tag(None, {"resampling": _RESAMPLING}, f"{_SOURCE_ELEMENTS} NODATA ScaleOffset ScaleRatio"),
     "SourceFilename": _Tag(_ANY, {"relativeToVRT": _SWITCH, "shared": _SWITCH}),
     "SourceBand": _Tag(rf"{_INTEGER_PATTERN}|mask,{_INTEGER_PATTERN}"),
-    "SourceProperties": _Tag(None, {"DataType": r"\w+", **dict.fromkeys(_SIZE_ATTRIBUTES, _INTEGER_PATTERN)}),
+    "SourceProperties": _Tag(None, {**dict.fromkeys(PROPERTIES, _INTEGER_PATTERN), "DataType": r"\w+"}),
     **dict.fromkeys(("SrcRect", "DstRect"), _Tag(None, dict.fromkeys(_RECT, _REAL_PATTERN))),
     **dict.fromkeys(_INTEGER_ELEMENTS, _Tag(_INTEGER_PATTERN)),
     **dict.fromkeys(("Description", "UnitType", "Category"), _Tag(_ANY)),
@@ -292,3 +294,77 @@ class _ElementReader:
         if not text or INDIRECT.match(text) or not (relative or Path(text).is_absolute()):
             raise ImageError(f"{self.name}: the VRT points at {text[:200]!r}, which is no plain local file")
         return self.folder / text
+
+
+# --- writing ----------------------------------------------------------------------------------------------
+
+
+class Named(NamedTuple):
+    """How a VRT names a file, and the file's size, block and type by GDAL's names, where they are known."""
+
+    text: str
+    relative: bool = False
+    properties: Mapping[str, str] = {}
+
+
+def vrt_text(vrt: Vrt, named: Callable[[Source], Named]) -> str:
+    """Return the text of a VRT, in which files have the names that `named` gives them."""
+    root = Element("VRTDataset", rasterXSize=str(vrt.size[0]), rasterYSize=str(vrt.size[1]))
+    if vrt.srs:
+        SubElement(root, "SRS").text = vrt.srs
+    if vrt.transform:
+        SubElement(root, "GeoTransform").text = ", ".join(map(repr, vrt.transform))
+    for domain, items in vrt.metadata.items():
+        element = SubElement(root, "Metadata", domain=domain)
+        for key, value in items.items():
+            SubElement(element, "MDI", key=key).text = value
+    if vrt.gcps:
+        element = SubElement(root, "GCPList", Projection=vrt.gcp_srs)
+        for gcp in vrt.gcps:
+            SubElement(element, "GCP", gcp)
+    block = {f"block{axis}Size": str(min(BLOCK_SIZE, n)) for axis, n in zip("XY", vrt.size, strict=True)}
+    for number, band in enumerate(vrt.bands, 1):
+        _add_band(root, band, named, {"band": str(number), **block})
+    if vrt.mask is not None:
+        _add_band(SubElement(root, "MaskBand"), vrt.mask, named, block)
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
+
+
+def _add_band(parent: Element, band: Band, named: Callable[[Source], Named], attributes: Mapping[str, str]) -> None:
+    element = SubElement(parent, "VRTRasterBand", {"dataType": GDAL_TYPES[band.dtype], **attributes})
+    hidden = band.nodata is None
+    texts = {
+        "NoDataValue": _number(band.fill) if band.fill or not hidden else "",
+        "HideNoDataValue": "1" if band.fill and hidden else "",
+        "ColorInterp": band.color.capitalize(),
+        "UnitType": band.unit or "",
+        "Scale": repr(band.linear[0]) if band.linear[0] != 1.0 else "",
+        "Offset": repr(band.linear[1]) if band.linear[1] else "",
+    }
+    for tag, text in texts.items():
+        if text:
+            SubElement(element, tag).text = text
+    for source in band.sources:
+        _add_source(element, source, named(source))
+
+
+def _add_source(parent: Element, source: Source, file: Named) -> None:
+    element = SubElement(parent, "SimpleSource" if source.plain else "ComplexSource")
+    # not shared: another VRT may have the file open as it was before it was written again
+    SubElement(element, "SourceFilename", shared="0", relativeToVRT=str(int(file.relative))).text = file.text
+    SubElement(element, "SourceBand").text = f"{'mask,' * source.mask}{source.band}"
+    if file.properties:
+        SubElement(element, "SourceProperties", dict(file.properties))
+    if source.dst:
+        for tag, rect in (("SrcRect", source.src or (0, 0, *source.dst[2:])), ("DstRect", source.dst)):
+            SubElement(element, tag, dict(zip(_RECT, map(str, rect), strict=True)))
+    if source.nodata is not None:
+        SubElement(element, "NODATA").text = _number(source.nodata)
+    if not source.plain:
+        SubElement(element, "ScaleOffset").text = repr(source.scale[1])
+        SubElement(element, "ScaleRatio").text = repr(source.scale[0])
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value.is_integer() else repr(value)  # GDAL reads 1e+17 of a whole type as 1

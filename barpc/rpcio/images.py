@@ -19,7 +19,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 from typing import Any, BinaryIO
 from zlib import crc32
@@ -36,8 +35,8 @@ from barpc.base.errors import ImageError, OutputError, RpcFormatError, plain
 from barpc.base.geodesy import Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import IMAGE, opened, plain_path, read_head
-from barpc.rasters.raster import earth_crs, has_mask, identify, open_raster, shown_vrt, transformed, vrt_of
-from barpc.rasters.vrt import GDAL_TYPES, Source
+from barpc.rasters.raster import earth_crs, has_mask, identify, open_raster, transformed, vrt_of
+from barpc.rasters.vrt import Named, Source, vrt_text
 from barpc.rpcio.text import (
     COEFFICIENTS,
     SINGLE,
@@ -48,7 +47,7 @@ from barpc.rpcio.text import (
     fields_in_order,
     rpc_from_fields,
 )
-from barpc.rpcio.xml import rpc_domain, rpc_from_domain
+from barpc.rpcio.xml import rpc_from_domain, rpc_items
 from barpc.sensor.rational import DERIVATIVE, POWERS
 from barpc.sensor.rpc import RPC
 
@@ -89,39 +88,15 @@ def write_rpc_vrt(
         for file in {source.file for source in shown.sources}:
             plain_path(file)
             _refuse_same(file, target)
-        folder = target.parent.resolve() if relative else None
-        lines = [f'<VRTDataset rasterXSize="{shown.size[0]}" rasterYSize="{shown.size[1]}">']
-        if shown.srs:
-            lines += [f"  <SRS>{escape(shown.srs, quote=False)}</SRS>"]
-            lines += [f"  <GeoTransform>{', '.join(map(repr, shown.transform or ()))}</GeoTransform>"]
-        lines.append(rpc_domain(rpc))
-        for index, band in enumerate(shown.bands, 1):
-            lines += [f'  <VRTRasterBand dataType="{GDAL_TYPES[band.dtype]}" band="{index}">']
-            hidden = "<HideNoDataValue>1</HideNoDataValue>" if band.nodata is None else ""
-            lines += [f"    <NoDataValue>{band.fill!r}</NoDataValue>{hidden}"] if band.fill or not hidden else []
-            lines += [f"    <ColorInterp>{band.color.capitalize()}</ColorInterp>"]
-            lines += [f"    {_source_element(source, folder)}" for source in band.sources]
-            lines += ["  </VRTRasterBand>"]
-        if shown.mask is not None:
-            mask = "".join(_source_element(source, folder) for source in shown.mask.sources)
-            lines += [f'  <MaskBand><VRTRasterBand dataType="Byte">{mask}</VRTRasterBand></MaskBand>']
-    write_text(vrt_path, "\n".join([*lines, "</VRTDataset>"]) + "\n", overwrite=overwrite)
+        placed = shown.transform if shown.srs else None
+        shown = replace(shown, transform=placed, metadata={"RPC": rpc_items(rpc)}, gcps=())
+        folder = target.parent.resolve()
 
+        def named(source: Source) -> Named:
+            file = source.file
+            return Named(os.path.relpath(file.resolve(), folder) if relative else str(file), relative)
 
-def _source_element(source: Source, folder: Path | None) -> str:
-    """Return a source of a VRT in XML, named relative to a folder, if any."""
-    name = str(source.file) if folder is None else os.path.relpath(source.file.resolve(), folder)
-    parts = [f'<SourceFilename relativeToVRT="{int(folder is not None)}">{escape(name, quote=False)}</SourceFilename>']
-    parts += [f"<SourceBand>{'mask,' * source.mask}{source.band}</SourceBand>"]
-    whole = (0, 0, *source.dst[2:]) if source.dst else None
-    for tag, rect in (("SrcRect", source.src or whole), ("DstRect", source.dst)):
-        frame = " ".join(f'{key}="{n}"' for key, n in zip(("xOff", "yOff", "xSize", "ySize"), rect or (), strict=False))
-        parts += [f"<{tag} {frame} />"] * (rect is not None)
-    if source.plain:
-        return f"<SimpleSource>{''.join(parts)}</SimpleSource>"
-    parts += [] if source.nodata is None else [f"<NODATA>{source.nodata!r}</NODATA>"]
-    parts += [f"<ScaleOffset>{source.scale[1]!r}</ScaleOffset><ScaleRatio>{source.scale[0]!r}</ScaleRatio>"]
-    return f"<ComplexSource>{''.join(parts)}</ComplexSource>"
+        write_text(vrt_path, vrt_text(shown, named), overwrite=overwrite)
 
 
 def local_image(image_path: Path | str) -> Path:
@@ -153,11 +128,12 @@ def write_rpc_copy(rpc: RPC, image_path: Path | str, copy_path: Path | str, *, o
         The image cannot be read; the copy exists, is the image itself, or cannot be written.
     """
     with copying(image_path, copy_path, overwrite) as (dataset, partial):
-        if shown_vrt(dataset) is None and dataset.driver == "GTiff":
+        if dataset.driver == "GTiff":
             with opened(image_path, IMAGE) as file, partial.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
         else:
-            _translate(dataset, partial, Path(copy_path))
+            raster_copy(dataset, str(partial), **TIFF_PROFILE)
+            require_pixels(partial, Path(copy_path), lambda block: _sum(dataset, block))
         put_tag(partial, printable(rpc), placed=earth_crs(dataset) is not None)
 
 
@@ -210,16 +186,6 @@ def copying(image_path: Path | str, target: Path | str, overwrite: bool) -> Iter
             yield dataset, partial
         except (RasterioError, CPLE_BaseError) as error:
             raise unwritten(target, str(error.__cause__ or error)) from error
-
-
-def _translate(dataset: Any, partial: Path, target: Path) -> None:
-    """Copy an image into a GeoTIFF; a VRT's pixels are GDAL's only when they stand in a file."""
-    whole = Window(0, 0, dataset.width, dataset.height)
-    if shown_vrt(dataset) is not None:
-        _copy_window(dataset, partial, target, whole)
-    else:
-        raster_copy(dataset, str(partial), **TIFF_PROFILE)
-        require_pixels(partial, target, lambda block: _sum(dataset, block))
 
 
 def _copy_window(dataset: Any, partial: Path, target: Path, window: Window) -> None:

@@ -188,11 +188,8 @@ def rpc_from_domain(items: Mapping[str, str], name: str, options: ReadOptions) -
     return replace(rpc, height_default=level) if np.isfinite(level) else rpc
 
 
-def rpc_domain(rpc: RPC) -> str:
-    """Return the `<Metadata domain="RPC">` element of an RPC, numbers that read back to the bit."""
+def rpc_items(rpc: RPC) -> dict[str, str]:
+    """Return GDAL's metadata domain of an RPC, numbers that read back to the bit."""
     fields = fields_from_rpc(rpc)
     fields |= {} if rpc.height_default is None else {_HEIGHT_DEFAULT: [rpc.height_default]}
-    rows = [
-        f'    <MDI key="{key}">{" ".join(map(format_number, values))}</MDI>' for key, values in sorted(fields.items())
-    ]
-    return "\n".join(['  <Metadata domain="RPC">', *rows, "  </Metadata>"])
+    return {key: " ".join(map(format_number, values)) for key, values in sorted(fields.items())}

@@ -15,7 +15,8 @@ from rasterio.windows import Window
 
 from barpc.base.errors import ImageError
 from barpc.base.geodesy import Array
-from barpc.rasters.raster import BLOCK_SIZE, open_raster
+from barpc.rasters.raster import open_raster
+from barpc.rasters.vrt import BLOCK_SIZE
 from barpc.scene import BoolArray
 
 FloatImage = npt.NDArray[np.float32]
@@ -183,7 +184,7 @@ class _RasterBand:
             raise ImageError(f"{os.fspath(path)}: band {number} is complex; give its amplitude as an image")
         flags = dataset.mask_flag_enums[number - 1]
         invalid = dataset.nodatavals[number - 1] if MaskFlags.nodata in flags else None
-        told = getattr(dataset, "driver", None) is not None and flags in ([MaskFlags.nodata], [MaskFlags.all_valid])
+        told = flags in ([MaskFlags.nodata], [MaskFlags.all_valid])
         return cls(dataset, number, dataset.nodata, invalid, told)
 
     def read(self, box: Box, zoom: int = 1) -> tuple[Pixels, BoolArray]:
@@ -253,7 +254,7 @@ def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | 
 
 def _overview_factor(dataset: Any, band: int) -> int:
     """Return the side [px] of pixels that overviews average at less cost: 4 (and 2) where decoding is dear, else 1."""
-    return 4 if getattr(dataset, "driver", "") == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
+    return 4 if dataset.driver == "JP2OpenJPEG" and {2, 4} <= set(dataset.overviews(band)) else 1
 
 
 def read_picture(path: str | os.PathLike[str], box: Box, found: Survey, zoom: int = 1) -> tuple[ByteImage, BoolArray]:
@@ -299,12 +300,9 @@ def thumbnail(path: str | os.PathLike[str], size: tuple[int, int], side: int, ba
         read = _RasterBand.of(dataset, path, band)
         ends = dataset.width, dataset.height
         zoom = max(1, min(max(ends) // (2 * side), *ends))
-        level = zoom if getattr(dataset, "driver", None) else 1  # a mosaic has no levels
         width, height = (n // zoom * zoom for n in ends)
-        step, parts = zoom * max(1, SPAN // zoom), []
-        for top in range(0, height, step):
-            both = read.read((0, top, width, min(step, height - top)), level)
-            parts.append([one[:: zoom // level, :: zoom // level] for one in both])
+        step = zoom * max(1, SPAN // zoom)
+        parts = [read.read((0, top, width, min(step, height - top)), zoom) for top in range(0, height, step)]
     pixels, valid = (np.concatenate(column) for column in zip(*parts, strict=True))
     stretch = Stretch.of(pixels[valid])
     if stretch is None:

@@ -30,8 +30,9 @@ from barpc.export.shots import read_scene
 from barpc.fit.points import terrain_range
 from barpc.pointio.names import unique_names
 from barpc.rasters.dem import Dem, localize_on_terrain
-from barpc.rasters.raster import BLOCK_SIZE, GDAL_OPTIONS, map_crs, open_raster
+from barpc.rasters.raster import GDAL_OPTIONS, map_crs, open_raster
 from barpc.rasters.vertical import WORDS, geoid_places
+from barpc.rasters.vrt import BLOCK_SIZE
 from barpc.report.finished import FinishedRun
 from barpc.scene import Camera
 from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid

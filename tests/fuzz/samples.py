@@ -96,7 +96,7 @@ def _read_format(path: Path, kind: str) -> object:
 
 
 def _pam() -> str:
-    from barpc.rpcio.xml import rpc_domain
+    from tests.rpcio.conftest import rpc_domain
 
     return f"<PAMDataset>\n{rpc_domain(make_rpc())}\n</PAMDataset>\n"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 
 from barpc.base import identity
 from barpc.base.errors import ImageError, InputError
@@ -67,6 +68,22 @@ def test_a_vrt_that_is_replaced_while_it_is_hashed_is_no_input(image: Path, tmp_
     monkeypatch.setattr(raster, "read_vrt", replaced)
     with pytest.raises(InputError, match="changed"):
         hashed(path)
+
+
+@pytest.mark.parametrize("name", ["x.tif", "x.jp2"])
+def test_an_image_whose_metadata_name_its_overviews_is_refused_in_a_vrt_too(
+    tmp_path: Path, image: Path, name: str
+) -> None:
+    """GDAL opens what they name, which may be a web service, when it reads every second pixel."""
+    shape = {"width": 64, "height": 64, "count": 1, "dtype": "uint16", "transform": rasterio.Affine.scale(2.0)}
+    with rasterio.open(tmp_path / "x.tif", "w", driver="GTiff", **shape) as out:
+        out.write(np.ones((1, 64, 64), np.uint16))
+        out.update_tags(ns="overviews", overview_file=str(image))
+    if name == "x.jp2":
+        rasterio.shutil.copy(tmp_path / "x.tif", tmp_path / name, driver="JP2OpenJPEG", WRITE_METADATA="YES")
+    for path in (tmp_path / name, vrt(tmp_path / "x.vrt", band(name))):
+        with pytest.raises(ImageError, match="names another file as its overviews"), open_raster(path):
+            pass
 
 
 def test_a_vrt_that_warps_is_refused(tmp_path: Path, image: Path) -> None:

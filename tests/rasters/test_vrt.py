@@ -17,8 +17,7 @@ from barpc.base.errors import ImageError
 from barpc.rasters.raster import open_raster
 from barpc.rasters.vrt import GDAL_TYPES
 from barpc.rpcio import read_rpc_source, write_crop, write_rpc_copy, write_rpc_vrt
-from barpc.rpcio.xml import rpc_domain
-from tests.rpcio.conftest import make_rpc
+from tests.rpcio.conftest import make_rpc, rpc_domain
 
 SIZE = (40, 30)
 RNG = np.random.default_rng(3)
@@ -154,6 +153,9 @@ BODIES = {
     "alpha": lambda: band("<ColorInterp>Gray</ColorInterp>", source("a.tif"), dtype="uint8")
     + band("<ColorInterp>Alpha</ColorInterp>", source("b.tif"), dtype="uint8", number=2),
     "NaN as nodata": lambda: band("<NoDataValue>nan</NoDataValue>", source("f.tif", PARTS[1]), dtype="float32"),
+    "a large whole number as nodata": lambda: band(
+        "<NoDataValue>100000000000000000</NoDataValue>", source("a.tif", PARTS[1]), dtype="int64"
+    ),
     "all that is passed over": lambda: (
         '<SRS dataAxisToSRSAxisMapping="2,1">EPSG:4326</SRS><GeoTransform> 5, 1e-3, 0.0, 44, 0, -1E-3</GeoTransform>'
         '<Metadata><MDI key="a">b</MDI></Metadata><Metadata domain="xml:X"><MDI key="y"/></Metadata>'
@@ -215,6 +217,34 @@ def test_a_linked_vrt_finds_its_sources_where_gdal_does(tmp_path: Path) -> None:
     assert_as_gdal(tmp_path / "far" / "x.vrt")
     write_rpc_vrt(make_rpc(), tmp_path / "far" / "x.vrt", tmp_path / "far" / "again.vrt")
     assert 'relativeToVRT="1">../a.tif<' in (tmp_path / "far" / "again.vrt").read_text()
+
+
+@pytest.mark.parametrize("name", ["a?if=VRT.tif", "a?b&c.tif", "%61.tif", "'a'.tif", "<a>.tif", "à.tif"])
+def test_a_source_has_any_name_that_a_file_has(tmp_path: Path, name: str) -> None:
+    raster(tmp_path / "a.tif")
+    raster(tmp_path / name)
+    text = name.replace("&", "&amp;").replace("<", "&lt;")
+    assert_as_gdal(vrt(tmp_path / "x.vrt", band(source(text))))
+
+
+def test_vrts_of_raw_pixels_are_read_in_turn(tmp_path: Path) -> None:
+    """GDAL finds the header of one where it may look beside all files: not beside those of the other."""
+    raster(tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as image:
+        pixels = image.read(1)
+    pixels.tofile(tmp_path / "raw.img")
+    lines = f"samples = {SIZE[0]}\nlines = {SIZE[1]}\nbands = 1\nheader offset = 0\ndata type = 12\nbyte order = 0"
+    (tmp_path / "raw.hdr").write_text(f"ENVI\n{lines}\ninterleave = bsq\n")
+    with rasterio.open(
+        tmp_path / "a.tif.msk", "w", driver="GTiff", **dict.fromkeys(("width", "height"), 9), count=1, dtype="uint8"
+    ) as beside:
+        beside.update_tags(INTERNAL_MASK_FLAGS_1="2")
+    masked = f"<MaskBand>{mask_of('a.tif')}</MaskBand>"
+    paths = [vrt(tmp_path / f"{n}.vrt", band(source(n)), masked) for n in ("raw.img", "a.tif")]
+    with open_raster(paths[0]) as first, open_raster(paths[1]) as second, open_raster(paths[0]) as third:
+        for dataset in (first, second, third):
+            np.testing.assert_array_equal(dataset.read(1), pixels)
+            assert (dataset.read_masks(1) == 255).all()
 
 
 def descriptors() -> int:

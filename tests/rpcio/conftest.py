@@ -13,7 +13,14 @@ from rasterio.shutil import copy as raster_copy
 
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
+from barpc.rpcio.xml import rpc_items
 from barpc.sensor.rpc import RPC
+
+
+def rpc_domain(rpc: RPC) -> str:
+    """The element of GDAL's metadata domain."""
+    rows = "".join(f'<MDI key="{key}">{value}</MDI>\n' for key, value in rpc_items(rpc).items())
+    return f'<Metadata domain="RPC">\n{rows}</Metadata>'
 
 
 def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RPC:

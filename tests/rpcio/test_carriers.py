@@ -20,11 +20,10 @@ from barpc.cli import main
 from barpc.rasters.raster import hashed, open_raster
 from barpc.rpcio import read_rpc, read_rpc_source, shadows, write_crop, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.rpcio.xml import rpc_domain
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import expanded
 from tests.rpcio.carriers import MAKERS, envi, gdal_pixels, pcidsk, seen_by_gdal
-from tests.rpcio.conftest import grid, make_rpc, pixels, write_image
+from tests.rpcio.conftest import grid, make_rpc, pixels, rpc_domain, write_image
 from tests.rpcio.test_tiles import STRIP, strip, tile
 
 

@@ -16,8 +16,7 @@ from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
 from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.sources import described
 from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
-from barpc.rpcio.xml import rpc_domain
-from tests.rpcio.conftest import grid, make_rpc, write_image
+from tests.rpcio.conftest import grid, make_rpc, rpc_domain, write_image
 from tests.rpcio.test_orders import A_ORDER
 
 B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"

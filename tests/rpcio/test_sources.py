@@ -25,8 +25,7 @@ from barpc.rpcio import (
 )
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.sources import described, only_physical
-from barpc.rpcio.xml import rpc_domain
-from tests.rpcio.conftest import dimap_v2, grid, write_image
+from tests.rpcio.conftest import dimap_v2, grid, rpc_domain, write_image
 
 STEM = "IMG_scene_R1C1"
 
