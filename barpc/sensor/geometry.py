@@ -213,21 +213,6 @@ class Several:
         return np.moveaxis(out, -1, 0)
 
 
-def ground_grids(
-    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = GRID_NODES
-) -> list[Array]:
-    """Return ground points over images and their altitudes and where their cameras see them: rows (n, 5) of each.
-
-    Of a grid (`image_grid`) of a camera, an image of its size and its altitudes; without points that it does not see.
-    """
-    grids = [image_grid(size, alt_range, nodes) for _, size, alt_range in cameras]
-    many = Several([model for model, _, _ in cameras], np.repeat(np.arange(len(grids)), nodes[0] ** 2 * nodes[1]))
-    image, alt = map(np.concatenate, zip(*grids, strict=True))
-    ground = many.localize(image, alt)
-    rows = np.hstack([ground, many.project(ground, image)]).reshape(len(grids), -1, 5)
-    return [one[np.isfinite(one[:, :3]).all(axis=1)] for one in rows]
-
-
 @dataclass(frozen=True, eq=False)
 class CameraCenter:
     """Position of a camera, and how it was found."""
