@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from click.testing import CliRunner, Result
 
 import barpc
@@ -43,6 +41,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, parts, scene
+from tests.geotiffs import write_blank
 from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
@@ -55,9 +54,7 @@ def files(made: Scene, folder: Path, sensor: str = "SIM1") -> list[Path]:
     folder.mkdir(parents=True)
     names = []
     for view in made.views:
-        path, how = folder / f"{view.name}.tif", {"driver": "GTiff", "count": 1, "dtype": "uint8", "sparse_ok": True}
-        with warnings.catch_warnings(action="ignore"):
-            rasterio.open(path, "w", width=view.size[0], height=view.size[1], **how).close()
+        path = write_blank(folder / f"{view.name}.tif", view.size)
         assert isinstance(view.sensor, RPC)
         put_tag(path, view.sensor)
         if sensor:

@@ -23,9 +23,10 @@ from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Footprints, shared_tiles
 from barpc.tie.pixels import tiles
 from tests.constants import chosen
+from tests.geotiffs import write_image
 from tests.tie.stages import select_pairs
 
-from .conftest import Rendered, write_image
+from .conftest import Rendered
 from .test_pairs import METRE, camera
 from .test_pairs import views as views_of
 

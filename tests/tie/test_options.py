@@ -26,7 +26,8 @@ from barpc.tie.patches.register import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
 from tests.costs import once
-from tests.tie.conftest import Rendered, write_image
+from tests.geotiffs import write_image
+from tests.tie.conftest import Rendered
 from tests.tie.stages import detect, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
 

@@ -25,7 +25,7 @@ from barpc.tie.patches.register import (
     register_places,
 )
 from tests.constants import Sized
-from tests.tie.conftest import write_image
+from tests.geotiffs import write_image
 from tests.tie.test_pairs import camera, views
 from tests.tie.test_tracks import tracks_of
 

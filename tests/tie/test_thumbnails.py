@@ -9,8 +9,7 @@ import pytest
 from barpc.rasters import raster
 from barpc.rasters.mosaic import Mosaic
 from barpc.tie.pixels import jpeg, thumbnail
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
