@@ -46,7 +46,7 @@ from barpc.base.geodesy import ground_from_ecef  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
 from tests.geotiffs import write_image  # noqa: E402
 
 Array = npt.NDArray[np.float64]

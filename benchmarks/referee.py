@@ -58,8 +58,8 @@ from barpc.rasters.dem import Dem
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look, fly
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -31,7 +31,7 @@ from barpc.base.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rasters.dem import Dem  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402
 from tests.scenes.season import other_season, write_dem, write_reference  # noqa: E402
 

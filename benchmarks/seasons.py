@@ -40,8 +40,8 @@ from barpc.base.options import RunOptions, TieOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402
-from barpc.sensor.geometry import epipolar_offset  # noqa: E402
 from barpc.sensor.rpc import altitude_range  # noqa: E402
+from barpc.sensor.triangulation import epipolar_offset  # noqa: E402
 from barpc.tie import find_tracks, match_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine  # noqa: E402

@@ -38,7 +38,7 @@ from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 from tests.geotiffs import write_blank, write_image
 from tests.pointio.stages import read_matches

@@ -54,8 +54,8 @@ from barpc.pointio.matches import write_matches  # noqa: E402
 from barpc.rpcio import write_rpc  # noqa: E402
 from barpc.scene import BoolArray  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
 from benchmarks.worlds_cameras import CHIPS, Array, Flaw, compass, ecef  # noqa: E402
 from benchmarks.worlds_dem import SINGLE, TOGETHER  # noqa: E402
 from benchmarks.worlds_families import FAMILIES, NAMES, PRIOR, Plan, World, draw, fly, make, step, wave  # noqa: E402

@@ -13,8 +13,7 @@ import numpy as np
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
 from barpc.export.shots import Scene, Shot, Window
-from barpc.sensor.geometry import image_grid
-from barpc.sensor.sampler import Sample
+from barpc.sensor.sampler import Sample, image_grid
 
 _DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
 _PINHOLE_STEPS = 100  # at most

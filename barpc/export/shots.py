@@ -27,9 +27,11 @@ from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
-from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, triangulate
+from barpc.sensor.centers import camera_center
+from barpc.sensor.geometry import footprint
 from barpc.sensor.rpc import RPC
-from barpc.sensor.sampler import Sample
+from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
+from barpc.sensor.triangulation import triangulate
 
 Window = tuple[int, int, int, int]
 """col, row of the first pixel, width, height [px]."""

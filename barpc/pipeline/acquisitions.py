@@ -15,8 +15,8 @@ from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.report.outcome import Carried
 from barpc.scene import BoolArray, Camera, View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import image_grid
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import image_grid
 from barpc.tie.pixels import read_pixels
 
 _SAME = 0.01  # px: RPCs of bands are equal to 1e-8, of other images of a pass they differ by 50 and more

@@ -33,7 +33,7 @@ from barpc.pointio.names import pair_name
 from barpc.rasters.dem import Dem
 from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.scene import BoolArray, Reference, View
-from barpc.sensor.geometry import CameraCenter, camera_centers
+from barpc.sensor.centers import CameraCenter, camera_centers
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.workspace import Workspace

@@ -22,9 +22,9 @@ from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
 from barpc.report.summary.words import enu, median, metres
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC
-from barpc.sensor.sampler import Sample
+from barpc.sensor.sampler import Sample, image_grid
+from barpc.sensor.triangulation import triangulate
 
 _MOTION_NODES = 3  # along each side of an image: places at which the motion of the ground is measured
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run

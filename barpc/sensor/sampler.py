@@ -17,8 +17,9 @@ from barpc.base.errors import FitError
 from barpc.base.geodesy import Array, BoolArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import GRID_NODES, Several, image_grid
+from barpc.sensor.geometry import Several
 
+GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
 NEGLIGIBLE_FIT_ERROR = 1e-6  # px: what no other method is tried on, and no round trip is held to
 SAMPLE_CELLS = 45
 """Along each side of the image: 2025 points of the whole."""
@@ -27,6 +28,15 @@ _WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new one
 
 Projection = Callable[[Array], Array]
 """Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
+
+
+def image_grid(
+    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = GRID_NODES
+) -> tuple[Array, Array]:
+    """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
+    col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
+    grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
+    return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from barpc.pointio.gcps import read_gcps
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View
-from barpc.sensor.geometry import epipolar_offset, triangulate
 from barpc.sensor.rpc import altitude_range
+from barpc.sensor.triangulation import epipolar_offset, triangulate
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 

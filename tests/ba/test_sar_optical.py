@@ -12,8 +12,9 @@ from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres
 from barpc.fit import fit_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look, fly
 from tests.sensor.s1_product import Product
 

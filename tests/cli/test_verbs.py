@@ -19,7 +19,8 @@ from barpc.cli.terminal import Lines, progress_told
 from barpc.dsm import stereo, surface
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
-from barpc.sensor.geometry import base_to_height, triangulate
+from barpc.sensor.geometry import base_to_height
+from barpc.sensor.triangulation import triangulate
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 
 POINT = ["5.4005", "43.1995", "200"]

@@ -17,7 +17,7 @@ from barpc.dsm.stereo import CameraErrors
 from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene

@@ -14,9 +14,10 @@ from barpc.dsm import stereo
 from barpc.dsm.stereo import CameraErrors, Tile, noise_of_mean
 from barpc.dsm.surface import shaded
 from barpc.scene import View
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, intersect_pair, triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import intersect_pair, triangulate
 from barpc.tie.patches.dense import WINDOW, DenseMatches, epipolar_frame
 from tests.dsm.conftest import ALTS
 

@@ -26,8 +26,8 @@ from barpc.export.colmap import colmap
 from barpc.export.light import UnknownTimeError, dated
 from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import camera_center, image_grid
-from barpc.sensor.sampler import Sample
+from barpc.sensor.centers import camera_center
+from barpc.sensor.sampler import Sample, image_grid
 
 OUT = Path("/elsewhere/out")
 HOW = ExportOptions()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from tests.reliability.trials import SAMPLES, crop
 
 FOLDER = SAMPLES[0].parent

@@ -18,8 +18,9 @@ from barpc.pointio.matches import write_matches
 from barpc.report import Run, verdict
 from barpc.rpcio import formats
 from barpc.rpcio.images import put_tag
-from barpc.sensor.geometry import Several, epipolar_offset
+from barpc.sensor.geometry import Several
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.geotiffs import write_image
 

@@ -20,9 +20,9 @@ from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.xml import write_maxar
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import Light
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look
 from tests.geotiffs import write_blank
 from tests.lanes import rest_slow

@@ -13,9 +13,9 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import fit_rpc
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import epipolar_offset, triangulate
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
 from barpc.sensor.sampler import Sample
+from barpc.sensor.triangulation import epipolar_offset, triangulate
 from tests.constants import chosen
 from tests.lanes import rest_slow
 

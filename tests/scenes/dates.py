@@ -11,8 +11,8 @@ import numpy as np
 
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, View
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
 from tests.scenes.files import _write_image
 from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.render import expose, render

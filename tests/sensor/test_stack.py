@@ -9,10 +9,11 @@ import pytest
 
 from barpc.base.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
+from barpc.sensor.centers import camera_center, camera_centers
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import GRID_NODES, Several, camera_center, camera_centers, image_grid
+from barpc.sensor.geometry import Several
 from barpc.sensor.rpc import RPC, RpcStack, localize_stack
-from barpc.sensor.sampler import Sample
+from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 

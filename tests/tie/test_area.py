@@ -16,7 +16,7 @@ from barpc.base.errors import DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.tie import Scope, TieOptions, find_tracks, read_area
 from barpc.tie.matchers import features
 from barpc.tie.pairing.area import Area

@@ -11,8 +11,8 @@ import pytest
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.rpc import altitude_range
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.tie import Matches, Pair, Scope, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey

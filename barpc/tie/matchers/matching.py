@@ -22,7 +22,7 @@ from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, View
-from barpc.sensor.geometry import image_grid
+from barpc.sensor.sampler import image_grid
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
