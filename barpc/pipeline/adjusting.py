@@ -16,7 +16,7 @@ from barpc.base.errors import BarpcError, DisconnectedError, InputError, TiePoin
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.tasks import Progress, Work
-from barpc.pipeline.calibrate import common_errors, refuse_strange
+from barpc.pipeline.calibrations import common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, GrowingRun, chosen_pairs, of_new
 from barpc.pipeline.exchanged import exchanged_cameras
 from barpc.pipeline.inputs import (

@@ -40,8 +40,8 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
 )
 from barpc.tie.pairing.resolution import Looks, finer
+from barpc.tie.patches.links import refine
 from barpc.tie.patches.oriented import MAX_PATCH_SHIFT
-from barpc.tie.patches.register import refine
 from barpc.tie.pixels import sample_stretch
 
 logger = logging.getLogger(__name__)

@@ -21,16 +21,8 @@ from barpc.base.statistics import SURE
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import (
-    _FinishedRun,
-    _may_be_covariance,
-    _OnLine,
-    _refuse_unsure,
-    _row_direction,
-    calibrations_of,
-    common_errors,
-    read_calibration,
-)
+from barpc.pipeline.calibrate import _FinishedRun, _OnLine, _refuse_unsure, _row_direction
+from barpc.pipeline.calibrations import _may_be_covariance, calibrations_of, common_errors, read_calibration
 from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run

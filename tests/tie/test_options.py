@@ -22,7 +22,7 @@ from barpc.tie.pairing.epipolar import (
 )
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.patches import dense
-from barpc.tie.patches.register import refine
+from barpc.tie.patches.links import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
 from tests.costs import once

@@ -13,17 +13,8 @@ from barpc.scene import Tracks
 from barpc.tie.pairing.epipolar import (
     epipolar_segments,
 )
-from barpc.tie.patches.register import (
-    PatchRegistration,
-    _at,
-    _merge_groups,
-    _Registrations,
-    _shared_variance,
-    _sparse,
-    _task_parts,
-    references,
-    register_places,
-)
+from barpc.tie.patches.links import _Registrations, _shared_variance, references
+from barpc.tie.patches.register import PatchRegistration, _at, _merge_groups, _sparse, register_places, task_parts
 from tests.constants import Sized
 from tests.geotiffs import write_image
 from tests.tie.test_pairs import camera, views
@@ -167,7 +158,7 @@ def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_poin
 def test_few_points_are_registered_in_bands_of_rows_swept_by_columns(count: int) -> None:
     places = np.random.default_rng(0).uniform(0, 40_000, (count, 2))
     links = np.arange(count) + 7
-    parts = _task_parts(places, links, 1024)
+    parts = task_parts(places, links, 1024)
     assert max(len(part) for part in parts) <= 512
     assert len(parts) <= 1.1 * count / 512 + count / 400  # nearly full
     assert sorted(np.concatenate(parts)) == links.tolist()
