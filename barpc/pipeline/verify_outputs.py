@@ -13,7 +13,7 @@ import sys
 import tempfile
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -74,7 +74,7 @@ def verify(paths: Sequence[Path | str], sample: Sample) -> list[Reading]:
     def measured(_: Consumer, read: Projection) -> tuple[float, float]:
         return sample.compare(read), float("nan")
 
-    return [reading for path in map(Path, paths) for reading in _consumer_readings(path, _consumers(path), measured)]
+    return [reading for path in map(Path, paths) for reading in _consumer_readings(path, measured)]
 
 
 def verify_grid(path: Path, sample: Scattered) -> list[Reading]:
@@ -87,7 +87,7 @@ def verify_grid(path: Path, sample: Scattered) -> list[Reading]:
         errors = sample.compare(read, consumer.locates)
         return errors.far, errors.rms
 
-    return _consumer_readings(path, _grid_consumers(path), measured)
+    return _consumer_readings(path, measured)
 
 
 def projection_by(tool: str, path: Path) -> Projection:
@@ -113,21 +113,20 @@ _MACHINE = frozenset(
 
 
 def _consumers(path: Path) -> dict[str, Consumer]:
-    """Return the tools that read a file of an RPC, those that are not installed too; barpc last."""
+    """Return the tools that read a file, those that are not installed too; barpc last."""
+    for end, consumers in _GRIDS.items():
+        if path.name.endswith(end):
+            return consumers
     row = format_for(path)
     return {name: CONSUMERS[name] for name in (*(() if row is None else row.consumers), "barpc")}
 
 
 def _tools_of(path: Path) -> dict[str, bool]:
     """Return the tools besides barpc that read a file, and whether they are installed."""
-    of_grid = path.name.endswith((GRID_SUFFIX, CORRECTION, STATE_END))
-    found = _grid_consumers(path) if of_grid else _consumers(path)
-    return {name: one.installed for name, one in found.items() if one.package != "barpc"}
+    return {name: one.installed for name, one in _consumers(path).items() if one.package != "barpc"}
 
 
-def _consumer_readings(
-    path: Path, consumers: Mapping[str, Consumer], measure: Callable[[Consumer, Projection], tuple[float, float]]
-) -> list[Reading]:
+def _consumer_readings(path: Path, measure: Callable[[Consumer, Projection], tuple[float, float]]) -> list[Reading]:
     """Read a file with all consumers; those that are not barpc get it in a folder of its own.
 
     OutputError where the machine and not the file is to blame; whatever else a reader raises is its finding.
@@ -135,7 +134,7 @@ def _consumer_readings(
     found = []
     with ExitStack() as stack:
         lent = cache(lambda: stack.enter_context(_lent(path)))
-        for name, consumer in consumers.items():
+        for name, consumer in _consumers(path).items():
             if not consumer.installed:
                 continue
             error, rms = float("nan"), float("nan")
@@ -368,7 +367,3 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
     CORRECTION: {"gdal": Consumer("rasterio", _gdal_correction), "barpc": Consumer("barpc", _own_grid)},
     STATE_END: {"barpc": Consumer("barpc", _own_grid)},
 }
-
-
-def _grid_consumers(path: Path) -> dict[str, Consumer]:
-    return next(consumers for end, consumers in _GRIDS.items() if path.name.endswith(end))
