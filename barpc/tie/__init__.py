@@ -47,7 +47,7 @@ __getattr__ = used_later(
         "PairReport": "barpc.tie.matchers.report",
         **dict.fromkeys(("Area", "read_area"), "barpc.tie.pairing.area"),
         **dict.fromkeys(("Pair", "Scope"), "barpc.tie.pairing.overlaps"),
-        "refine": "barpc.tie.patches.register",
+        "refine": "barpc.tie.patches.links",
         "ReferenceControl": "barpc.tie.reference",
         **dict.fromkeys(("TieResult", "find_tracks", "link", "thin"), "barpc.tie.tracks"),
     },

@@ -445,9 +445,8 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     def verify(paths: Any, sample: Any) -> list[Reading]:
         image, alts = (np.array([one.min(axis=0), one.max(axis=0)]) for one in (sample.image, sample.ground[:, 2]))
         size = tuple(np.rint(np.ptp(image, axis=0) + 1).astype(int).tolist())
-        asked.append(
-            (sorted(path.name for path in paths), size, tuple(alts.tolist()), all(path.is_file() for path in paths))
-        )
+        names, there = sorted(path.name for path in paths), all(path.is_file() for path in paths)
+        asked.append((names, size, tuple(alts.tolist()), there))
         return [Reading(paths[0], "gdal", 2e-6), Reading(paths[1], "rpcm", NAN, "no field")]
 
     monkeypatch.setattr(module, "verify", verify)

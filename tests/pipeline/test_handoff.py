@@ -133,9 +133,8 @@ def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monk
         with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
             verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))
     else:
-        assert [reading.passed for reading in verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))].count(
-            False
-        ) == 1
+        readings = verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))
+        assert [reading.passed for reading in readings].count(False) == 1
 
 
 def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, monkeypatch, capsys):
