@@ -47,6 +47,7 @@ from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
 from barpc.sensor.triangulation import triangulate  # noqa: E402
+from tests.everywhere import rows_of  # noqa: E402
 from tests.geotiffs import write_image  # noqa: E402
 
 Array = npt.NDArray[np.float64]
@@ -205,10 +206,8 @@ def measured(clean: Clean, plant: Plant, size: tuple[int, int], sensors: Sequenc
     xy, seen = _shown(clean, plant.view, size, plant)
     xy = xy[seen & (np.abs(xy[:, plant.axis] - plant.start + 0.5) > _EDGE)]
     places = np.stack(_places(clean, plant.view, xy, plant), axis=1)  # (N, V, 2)
-    count, views = places.shape[:2]
-    number = np.tile(np.arange(views), count), np.repeat(np.arange(count), views)
-    found = triangulate(sensors, *number, places.reshape(-1, 2), alt=clean.altitude)
-    off = found.residuals.reshape(count, views, 2)
+    found = triangulate(sensors, *rows_of(places), alt=clean.altitude)
+    off = found.residuals.reshape(places.shape)
     apart = np.linalg.norm(off[:, :, None] - off[:, None], axis=-1).max(axis=(1, 2))
     worst = 0.0
     for axis in (0, 1):

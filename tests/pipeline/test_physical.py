@@ -18,12 +18,12 @@ from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.xml import write_maxar
-from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import Light
 from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look
+from tests.everywhere import rows_of, tied
 from tests.geotiffs import write_blank
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc, write_image
@@ -69,20 +69,13 @@ def test_an_adjustment_on_physical_models(folder, tmp_path):
     xy = np.stack([camera.project(ground) for camera in turned], axis=1) + rng.normal(0, 0.02, (len(ground), 3, 2))
     assert len(ground) > 150
     half = len(ground) // 2
-    tracks = Tracks(
-        np.tile(np.arange(3), half),
-        np.repeat(np.arange(half), 3),
-        xy[:half].reshape(-1, 2),
-        np.full(3 * half, 0.02),
-    )
     stems = [path.stem for path in sorted(folder.glob("*.tif"))]
-    write_matches(tmp_path / "ties.csv", tracks, stems)
+    write_matches(tmp_path / "ties.csv", tied(xy[:half], 0.02), stems)
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
     result = adjust(images(folder), tmp_path / "out", options)
-    view, point = np.tile(np.arange(3), len(ground) - half), np.repeat(np.arange(len(ground) - half), 3)
 
     def miss(cameras):
-        found = triangulate(cameras, view, point, xy[half:].reshape(-1, 2), alt=150.0)
+        found = triangulate(cameras, *rows_of(xy[half:]), alt=150.0)
         return np.sqrt(np.nanmean(found.residuals**2))
 
     fresh = [read_rpc(tmp_path / "out" / f"{stem}_RPC.TXT") for stem in stems]
@@ -178,8 +171,7 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     xy += rng.normal(0, 0.1, xy.shape)
     count = len(xy)
     assert count > 100
-    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy.reshape(-1, 2), np.full(2 * count, 0.1))
-    write_matches(tmp_path / "ties.csv", tracks, ["a", "b"])
+    write_matches(tmp_path / "ties.csv", tied(xy, 0.1), ["a", "b"])
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
     given = [f"{tmp_path / name}.tif,model=physical,altitudes=0:1000" for name in "ab"]
     result = adjust(given, tmp_path / "out", options)

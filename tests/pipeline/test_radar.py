@@ -12,10 +12,10 @@ from barpc.fit import fit_rpc
 from barpc.pipeline import adjust
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.scene import Tracks
 from barpc.sensor.curve import Curve
 from barpc.sensor.sicd import open_sicd
 from barpc.simulate import Look, fly
+from tests.everywhere import tied
 from tests.geotiffs import write_blank
 from tests.sensor.radar_documents import SIZE, document
 
@@ -40,9 +40,8 @@ def test_a_radar_image_is_adjusted_beside_optical_ones(tmp_path):
     rng, count = np.random.default_rng(2), 120
     ground = TARGET + rng.uniform(-1, 1, (2 * count, 3)) * [1.5e-3, 1.5e-3, 80.0]
     xy = np.stack([camera.project(ground) for camera in truth], axis=1)
-    ties = xy[:count].reshape(-1, 2) + rng.normal(0, 0.05, (3 * count, 2))
-    index = np.tile(np.arange(3), count), np.repeat(np.arange(count), 3)
-    write_matches(tmp_path / "ties.csv", Tracks(*index, ties, np.full(3 * count, 0.05)), ["a", "b", "radar"])
+    ties = tied(xy[:count] + rng.normal(0, 0.05, (count, 3, 2)), 0.05)
+    write_matches(tmp_path / "ties.csv", ties, ["a", "b", "radar"])
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True, adjust=AdjustOptions(fixed=("a", "b")))
     result = adjust(images, tmp_path / "out", options)
     fresh = read_rpc(tmp_path / "out" / "radar_RPC.TXT")
