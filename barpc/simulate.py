@@ -22,9 +22,9 @@ from barpc.scene import BoolArray, GroundPoints, IntArray, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve, about_middle, rotation_matrix
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
 
 __all__ = ["BlockOptions", "BlockTruth", "Look", "SimulatedBlock", "fly", "recentred", "simulate_block"]
 

@@ -35,8 +35,8 @@ import barpc
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.errors import BarpcError, BarpcWarning
 from barpc.pipeline import RunOptions
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center
 from barpc.sensor.rpc import altitude_range
 from barpc.simulate import simulate_block
 

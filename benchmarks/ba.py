@@ -53,7 +53,7 @@ from barpc.ba.solving.solve import State, camera_step, minimise
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.curve import rotation_matrix
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 
 PEER = {"ftol": 1e-4, "xtol": 1e-10}

@@ -39,8 +39,8 @@ from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_un
 from barpc.base.statistics import SURE
 from barpc.fit import fit_rpc
 from barpc.scene import IntArray, Tracks, View
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center
 from barpc.simulate import Look, fly
 
 SIZE, GSD = (20000, 12000), 0.5

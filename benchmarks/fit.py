@@ -33,6 +33,7 @@ from barpc.fit.poles import smallest_denominator
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC
 from tests.fit.cameras import Camera, random_points, synthetic, vendor
+from tests.geotiffs import write_image
 
 Space = Literal["image", "ground"]
 PECULIAR = "rpc_formats/md_ov_rpc.txt"
@@ -214,15 +215,12 @@ def outside(cameras: list[Camera], peer: Peer) -> None:
 
 
 def files(camera: Camera, folder: Path) -> None:
-    import rasterio
 
     from barpc.rpcio import write_rpc_copy
 
     rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
     ground, _ = random_points(camera, 2000, np.random.default_rng(3))
-    image = folder / "image.tif"
-    with rasterio.open(image, "w", driver="GTiff", width=8, height=8, count=1, dtype="uint8") as file:
-        file.write(np.zeros((1, 8, 8), np.uint8))
+    image = write_image(folder / "image.tif", np.zeros((8, 8), np.uint8))
     write_rpc(rpc, folder / "image_RPC.TXT", overwrite=True)
     write_rpc_copy(rpc, image, folder / "copy.tif", overwrite=True)
     tag = np.abs(read_rpc(folder / "copy.tif").project(ground) - rpc.project(ground)).max()

@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import resource
+import sys
 import tempfile
 import time
 import warnings
@@ -26,27 +27,13 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from barpc.ba import BlockPrior, adjust_tracks, block_prior
 from barpc.base.geodesy import Array
-from barpc.scene import IntArray, Tracks, View
-from barpc.simulate import SimulatedBlock, simulate_block
-
-
-def part(block: SimulatedBlock, chosen: IntArray, of: int | None = None) -> tuple[list[View], Tracks]:
-    """Return some views of a block, ascending, and their tie points; with `of` those of the one at this place."""
-    tracks = block.tracks.select(np.isin(block.tracks.view, chosen))
-    if of is not None:
-        seen = np.bincount(tracks.point, tracks.view == chosen[of], minlength=tracks.num_points) > 0
-        tracks = tracks.select(seen[tracks.point])
-    view = np.searchsorted(chosen, tracks.view)
-    return [block.views[i] for i in chosen], Tracks(view, tracks.point, tracks.xy, tracks.sigma)
-
-
-def corners(view: View) -> Array:
-    """Return the ground (8, 3) in the corners of a view at either end of its altitudes."""
-    right, low = view.size[0] - 1.0, view.size[1] - 1.0
-    at = np.array([[0.0, 0.0], [right, 0.0], [right, low], [0.0, low]])
-    return np.concatenate([view.sensor.localize(at, np.full(4, alt)) for alt in view.alt_range])
+from barpc.scene import Tracks, View
+from barpc.simulate import simulate_block
+from tests.ba.grown import corners, part
 
 
 def added(
@@ -73,7 +60,7 @@ def row(count: int, per_view: int, seed: int, whole: bool, hold_out: bool) -> st
         )
         near = np.unique(part(block, every, new)[1].view)
         at = int(np.searchsorted(near, new))
-        given = (folder, *part(block, near, at), at, hold_out)
+        given = (folder, *part(block, near, new), at, hold_out)
         seconds, peak, image, sigma = pool.apply(added, given)
     text = f"{count:6d} + 1  {len(near) - 1:4d}  {seconds:6.2f}  {peak:5.0f}"
     if not whole:

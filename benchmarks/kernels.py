@@ -27,8 +27,8 @@ import numpy as np
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
 
 Job = tuple[Callable[[], Any], int]
 """What to run, and how many points it works on."""

@@ -41,6 +41,7 @@ from benchmarks.dsm import nmad  # noqa: E402
 from benchmarks.real import ROOT, measured  # noqa: E402
 from benchmarks.real_crops import load_tool  # noqa: E402
 from benchmarks.real_sets import as_rasterio  # noqa: E402
+from tests.geotiffs import write_image  # noqa: E402
 
 SIDE, SMALL, GSD, CRS, GEOID = 2048, 256, 0.5, 32631, 51.0
 """Of the made images [px], of a map's pixel [m], EPSG code; height of the geoid at Mont Ventoux [m]."""
@@ -108,14 +109,11 @@ def made_images(data: Path, place: Path) -> tuple[list[Path], Path]:
     images, dem = [place / f"made_{side}.tif" for side in (SMALL, SIDE)], place / "ellipsoidal.tif"
     with rasterio.open(data / "dem/N44E005.hgt") as file:
         heights, layout = file.read(1).astype(np.float32) + np.float32(GEOID), file.profile
-    with rasterio.open(dem, "w", **layout | {"driver": "GTiff", "dtype": "float32"}) as file:
-        file.write(heights, 1)
+    write_image(dem, heights, **layout | {"driver": "GTiff", "dtype": "float32"})
     rpcs = as_rasterio(read_rpc(data / "optical/phr_ventoux/left_image.geom"), CORNER)
     for image, side in zip(images, (SMALL, SIDE), strict=True):
         pixels = np.stack(np.meshgrid(*2 * [np.arange(1, side + 1, dtype=np.float32)]))  # 0 is no data
-        with rasterio.open(image, "w", "GTiff", side, side, 2, dtype="float32", nodata=0, tiled=True) as file:
-            file.write(pixels)
-            file.rpcs = rpcs
+        write_image(image, pixels, nodata=0, tiled=True, rpcs=rpcs)
     return images, dem
 
 

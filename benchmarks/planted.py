@@ -46,7 +46,9 @@ from barpc.base.geodesy import ground_from_ecef  # noqa: E402
 from barpc.pipeline.loading import load_views  # noqa: E402
 from barpc.scene import View  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
+from tests.everywhere import rows_of  # noqa: E402
+from tests.geotiffs import write_image  # noqa: E402
 
 Array = npt.NDArray[np.float64]
 
@@ -204,10 +206,8 @@ def measured(clean: Clean, plant: Plant, size: tuple[int, int], sensors: Sequenc
     xy, seen = _shown(clean, plant.view, size, plant)
     xy = xy[seen & (np.abs(xy[:, plant.axis] - plant.start + 0.5) > _EDGE)]
     places = np.stack(_places(clean, plant.view, xy, plant), axis=1)  # (N, V, 2)
-    count, views = places.shape[:2]
-    number = np.tile(np.arange(views), count), np.repeat(np.arange(count), views)
-    found = triangulate(sensors, *number, places.reshape(-1, 2), alt=clean.altitude)
-    off = found.residuals.reshape(count, views, 2)
+    found = triangulate(sensors, *rows_of(places), alt=clean.altitude)
+    off = found.residuals.reshape(places.shape)
     apart = np.linalg.norm(off[:, :, None] - off[:, None], axis=-1).max(axis=(1, 2))
     worst = 0.0
     for axis in (0, 1):
@@ -242,19 +242,13 @@ def _written(plant: Plant, source: str, folder: Path) -> tuple[Path, tuple[int, 
         pixels = file.read(1)
     kept = np.iinfo(pixels.dtype)
     warped = np.clip(np.rint(plant.pixels(pixels.astype(np.float64))), kept.min, kept.max).astype(pixels.dtype)
-    path, shape = folder / Path(source).name, (warped.shape[1], warped.shape[0])
-    plain = {"driver": "GTiff", "count": 1, "dtype": pixels.dtype, "width": shape[0], "height": shape[1]}
-    with rasterio.open(path, "w", **plain) as file:
-        file.write(warped, 1)
-    return path, shape
+    return write_image(folder / Path(source).name, warped), warped.shape[::-1]
 
 
 def planted(clean: Clean, plant: Plant, size: float, folder: Path) -> Result:
     """Plant an error, run, and measure."""
     views, one = list(clean.views), clean.views[plant.view]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        path, shape = _written(plant, one.path, folder)
+    path, shape = _written(plant, one.path, folder)
     views[plant.view] = replace(one, path=str(path), size=shape)
     result, said, seconds = run(views)
     names = [view.name for view in clean.views]

@@ -52,8 +52,8 @@ from benchmarks.real_sets import (  # noqa: E402
     formula,
     of_folder,
     scenes,
-    write_image,
 )
+from tests.geotiffs import write_image  # noqa: E402
 
 Cameras = dict[str, Path]
 """Files by the stems of the images."""
@@ -344,7 +344,7 @@ def _rows_of_corners(xml: Path, check: Path, place: Path) -> Iterator[Row]:
     seen = np.array([[0.0, 0.0], [right, 0.0], [right, last], [0.0, last]])
     rpcs = as_rasterio(read_rpc(xml), np.zeros(2))
     ground = [(said[f"{one}LON"], said[f"{one}LAT"], rpcs.height_off + up) for up in (-100, 100) for one in CORNERS]
-    write_image(place / "rpc.tif", np.ones((8, 8), np.uint8), rpcs)
+    write_image(place / "rpc.tif", np.ones((8, 8), np.uint8), rpcs=rpcs, nodata=0)
     yield Row("delivered", across(formula(check).Rpc(place / "rpc.tif").project(np.array(ground)), seen))
     np.savetxt(place / "points.csv", ground, delimiter=",", header="lon,lat,alt", comments="", fmt="%.10f")
     command = [sys.executable, "-m", "barpc", "project", f"{xml},model=physical", "--points", str(place / "points.csv")]

@@ -62,7 +62,8 @@ import barpc  # noqa: E402
 from barpc.base.geodesy import Array, ecef_from_ground  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
 from benchmarks.real import check_points, measured  # noqa: E402
-from benchmarks.real_sets import Change, Scene, as_rasterio, change_tag, of_folder, write_image  # noqa: E402
+from benchmarks.real_sets import Change, Scene, as_rasterio, change_tag, of_folder  # noqa: E402
+from tests.geotiffs import write_image  # noqa: E402
 
 STEP = 16  # px between independent points
 FEWEST = 30  # points of a pair
@@ -101,7 +102,7 @@ class Image:
         col, row, width, height = window
         path, rpcs = folder / f"{self.name}.tif", as_rasterio(self.rpc, np.array([col, row]))
         rpcs.err_bias, rpcs.err_rand = self.rpc.err_bias, self.rpc.err_rand
-        write_image(path, self.pixels[row : row + height, col : col + width], rpcs)
+        write_image(path, self.pixels[row : row + height, col : col + width], rpcs=rpcs, nodata=0)
         return path
 
 

@@ -12,7 +12,6 @@ import importlib.util
 import itertools
 import json
 import sys
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,7 +25,6 @@ import numpy as np
 import rasterio
 import rasterio.rpc
 import rasterio.warp
-from rasterio.errors import NotGeoreferencedWarning
 from scipy import ndimage
 
 from barpc.base.geodesy import Array
@@ -34,6 +32,7 @@ from barpc.fit import fit_rpc_points
 from barpc.rpcio import read_rpc
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
+from tests.geotiffs import write_image
 from tests.scenes.render import Radiometry, expose, render
 from tests.scenes.terrain import Buildings, Grid, Plane, Terrain
 from tests.scenes.texture import Date, make_surfaces
@@ -153,16 +152,6 @@ def changed(rpcs: rasterio.rpc.RPC, middle: Array, change: Change, ground: Array
     return rasterio.rpc.RPC(**fields)
 
 
-def write_image(path: Path, band: Array, rpcs: rasterio.rpc.RPC) -> None:
-    """Write an image of one band that has an RPC and no geotransform."""
-    layout = {"width": band.shape[1], "height": band.shape[0], "count": 1, "dtype": band.dtype, "nodata": 0}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", "GTiff", **layout) as file:
-            file.write(band, 1)
-            file.rpcs = rpcs
-
-
 def as_rasterio(rpc: RPC, corner: Array) -> rasterio.rpc.RPC:
     """An RPC for the part of its image that begins at a corner (2,) [px]."""
     names = [f"{axis}_{part}_coeff" for axis in ("samp", "line") for part in ("num", "den")]
@@ -189,10 +178,10 @@ def rendered_pass(data: Path, place: Path) -> Scene:
     for number, path in enumerate(sorted((data / "passes/phr_toulouse").glob("*.XML"))):
         corner = np.floor(read_rpc(path).project(middle)) - PASS_SIZE // 2
         rpcs, image = as_rasterio(read_rpc(path), corner), place / f"toulouse_{number}.tif"
-        write_image(image, np.ones((PASS_SIZE, PASS_SIZE), np.uint16), rpcs)
+        write_image(image, np.ones((PASS_SIZE, PASS_SIZE), np.uint16), rpcs=rpcs, nodata=0)
         exact.append(tool.Rpc(image))
         seen = render(read_rpc(image), (PASS_SIZE, PASS_SIZE), surface)
-        write_image(image, expose(seen.brightness, Radiometry(), rng), rpcs)
+        write_image(image, expose(seen.brightness, Radiometry(), rng), rpcs=rpcs, nodata=0)
         change_tag(image, Change(tuple(rng.normal(0.0, 5.0, 2))))
         images.append(image)
     ties = []
@@ -250,7 +239,9 @@ def two_dates(images: tuple[Path, ...], place: Path) -> Scene:
     cols, rows, alts = (one.ravel() for one in np.meshgrid(*axes, np.linspace(-500.0, 1500.0, 7)))
     at = np.column_stack([cols, rows])
     made, level, gcps = place / "s2_image.tif", place / "level.tif", place / "points.geojson"
-    write_image(made, band, as_rasterio(fit_rpc_points(ground(at, alts), at).rpc, np.zeros(2)))  # exact to 1e-6 px
+    write_image(
+        made, band, rpcs=as_rasterio(fit_rpc_points(ground(at, alts), at).rpc, np.zeros(2)), nodata=0
+    )  # exact to 1e-6 px
     change_tag(made, Change((3.0, -4.0)))
     seen, there = correlated(band, first)
     features = [
@@ -260,9 +251,7 @@ def two_dates(images: tuple[Path, ...], place: Path) -> Scene:
     gcps.write_text(json.dumps({"features": features}))
     coarse = transform * rasterio.Affine.translation(-50, -50) * rasterio.Affine.scale(100)
     heights = np.zeros((size[1] // 100 + 2, size[0] // 100 + 2), np.float32)
-    layout = {"width": heights.shape[1], "height": heights.shape[0], "count": 1, "dtype": "float32"}
-    with rasterio.open(level, "w", "GTiff", **layout, crs=crs, transform=coarse) as file:
-        file.write(heights, 1)
+    write_image(level, heights, crs=crs, transform=coarse)
     options = "--reference", str(reference.resolve()), "--dem", str(level), "--geoid", "none"
     return Scene("", (made,), options, gcps=gcps)
 

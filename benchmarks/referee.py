@@ -49,7 +49,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.ba import AdjustOptions, adjust_tracks
@@ -59,9 +58,13 @@ from barpc.rasters.dem import Dem
 from barpc.scene import BoolArray, GroundPoints, Tracks, View
 from barpc.sensor import SensorModel
 from barpc.sensor.curve import Curve
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look, fly
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tests.geotiffs import write_blank
 
 SHARED = Path(os.environ.get("BARPC_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 PLACE = (5.45, 44.5)
@@ -501,20 +504,8 @@ def run(scene: Scene, **options: Any) -> tuple[tuple[SensorModel, ...], Any]:
         folder = Path(name)
         paths = []
         for view in scene.views:
-            path = folder / view.path
-            with rasterio.open(
-                path,
-                "w",
-                driver="GTiff",
-                width=view.size[0],
-                height=view.size[1],
-                count=1,
-                dtype="uint8",
-                sparse_ok=True,
-            ):
-                pass
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
-            paths.append(path)
+            paths.append(write_blank(folder / view.path, view.size))
         write_matches(folder / "ties.npz", scene.tracks, [view.name for view in scene.views])
         given = {"images": "none", "matches": str(folder / "ties.npz"), "matches_only": True, **options}
         if scene.gcps is not None:

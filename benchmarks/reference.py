@@ -31,7 +31,8 @@ from barpc.base.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rasters.dem import Dem  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
+from tests.everywhere import rows_of  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402
 from tests.scenes.season import other_season, write_dem, write_reference  # noqa: E402
 
@@ -71,14 +72,7 @@ def errors(scene: Scene, folder: Path, images: list[Path]) -> tuple[np.ndarray, 
     size = np.array(scene.options.size)
     inside = np.array([((xy > 0) & (xy < size - 1)).all(axis=1) for xy in seen]).all(axis=0)
     ground, image = ground[inside], np.array(seen)[:, inside]
-    n, views = len(ground), len(images)
-    found = triangulate(
-        sensors,
-        np.tile(np.arange(views), n),
-        np.repeat(np.arange(n), views),
-        image.transpose(1, 0, 2).reshape(-1, 2),
-        alt=scene.options.alt,
-    )
+    found = triangulate(sensors, *rows_of(image.swapaxes(0, 1)), alt=scene.options.alt)
     offset = found.points - ecef_from_ground(ground)
     return np.einsum("nij,nj->ni", enu_basis(ground), offset).mean(axis=0), ground
 

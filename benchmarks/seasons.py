@@ -40,17 +40,18 @@ from barpc.base.options import RunOptions, TieOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rpcio import read_rpc  # noqa: E402
 from barpc.scene import View  # noqa: E402
-from barpc.sensor.geometry import epipolar_offset  # noqa: E402
 from barpc.sensor.rpc import altitude_range  # noqa: E402
+from barpc.sensor.triangulation import epipolar_offset  # noqa: E402
 from barpc.tie import find_tracks, match_pairs  # noqa: E402
 from barpc.tie.matchers.features import join_keypoints  # noqa: E402
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine  # noqa: E402
 from barpc.tie.patches.oriented import TEMPLATE_REACH, register_oriented  # noqa: E402
 from barpc.tie.pixels import read_pixels  # noqa: E402
+from tests.geotiffs import write_image  # noqa: E402
 from tests.scenes import ImageOptions  # noqa: E402
 from tests.scenes.redrawn import redrawn  # noqa: E402
 from tests.scenes.season import SEASONS, _part, disguised  # noqa: E402
-from tests.tie.conftest import Rendered, write_image  # noqa: E402
+from tests.tie.conftest import Rendered  # noqa: E402
 from tests.tie.stages import common_tracks, select_pairs  # noqa: E402
 
 warnings.simplefilter("ignore")
@@ -101,10 +102,7 @@ def write(source: Path, target: Path, change: Change, seed: int, coarser: int) -
     for axis in ("line", "samp"):
         setattr(rpcs, f"{axis}_off", (getattr(rpcs, f"{axis}_off") + 0.5) / coarser - 0.5)
         setattr(rpcs, f"{axis}_scale", getattr(rpcs, f"{axis}_scale") / coarser)
-    layout = {"driver": "GTiff", "count": 1, "dtype": "uint16", "width": width, "height": height}
-    with rasterio.open(target, "w", **layout) as file:
-        file.write(np.rint(pixels).astype(np.uint16), 1)
-        file.rpcs = rpcs
+    write_image(target, np.rint(pixels).astype(np.uint16), rpcs=rpcs)
 
 
 def rms(a: Path, b: Path, ties: Path, coarser: int, judge: str | None, folder: Path) -> float:

@@ -24,17 +24,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.pushbroom import cpu
+
 POINTS = 25_000
-
-
-def cpu(call, repeats: int = 5) -> float:
-    """Median CPU seconds of a call."""
-    spent = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        spent.append(time.process_time() - start)
-    return float(np.median(spent))
 
 
 def peer_eos(annotation: str, data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -25,8 +25,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where barpc is installed as a package
@@ -39,6 +37,7 @@ from barpc.rpcio import WRITABLE
 from barpc.scene import View
 from barpc.simulate import Look, fly
 from barpc.workspace import Workspace
+from tests.geotiffs import write_image
 from tests.jitter import Delivered, jittered
 from tests.scenes.render import render
 from tests.scenes.terrain import Plane, make_terrain
@@ -136,11 +135,7 @@ def kinds(place: Path, shots, arguments):
     """Kind of camera file -> images and cameras, written into `place`."""
     size, fitted = (arguments.cols, arguments.rows), []
     for name, camera, image in shots:
-        path = place / f"{name}.tif"
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, "w", "GTiff", *size, 1, dtype="float32") as out:
-                out.write((GAIN * image).astype(np.float32), 1)
+        path = write_image(place / f"{name}.tif", (GAIN * image).astype(np.float32))
         view = View(name, str(path), size, camera.sensor, ALTS)
         fitted.append((view, fit_rpc(camera, size, ALTS, strict=False), camera))
     out = place / "out"

@@ -39,6 +39,7 @@ from barpc.export.targets import export_run
 from benchmarks.dsm import nmad
 from benchmarks.handover import S2P
 from benchmarks.real import ROOT, measured
+from tests.geotiffs import write_image
 
 CELL, FAR, PARTS = 1.0, 5.0, 3
 """Cells [m]; difference that is an error of matching [m]; parts of a scene a side."""
@@ -102,9 +103,7 @@ def level(path: Path, middle: tuple[float, float], height: float) -> Path:
     """A raster of one height [m] for a degree around a place: for CARS, which finds no disparities without any."""
     side, step = 100, 0.01
     place = Affine(step, 0.0, middle[0] - side * step / 2, 0.0, -step, middle[1] + side * step / 2)
-    with rasterio.open(path, "w", "GTiff", side, side, 1, "EPSG:4326", place, "float32") as file:
-        file.write(np.full((side, side), height, np.float32), 1)
-    return path
+    return write_image(path, np.full((side, side), height, np.float32), crs="EPSG:4326", transform=place)
 
 
 def surface(tool: Tool, run: Path, pair: Pair, place: Path) -> tuple[Path | None, float]:

@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,8 +30,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # tests, where bar
 
 import cv2
 import numpy as np
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 from scipy.interpolate import RectBivariateSpline
 from whole import ROOT, RUN, as_installed
 
@@ -40,15 +37,16 @@ from barpc.base.geodesy import metres_per_unit
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
-from barpc.scene import View
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
+from tests.geotiffs import write_blank, write_image
 from tests.pointio.stages import read_matches
 
 SIDE, GSD = 512, 20.0  # px, m: images of ten kilometres
 LAYOUT = {"size": (SIDE, SIDE), "gsd": GSD, "attitude": 5e-5, "overlap": 0.1}
 PICTURES = {"gsd": 2.0, "overlap": 0.5, "alt_range": (0.0, 60.0)}  # to be matched
+PACKED = {"compress": "deflate", "predictor": 2}
 
 
 @dataclass(frozen=True)
@@ -71,10 +69,13 @@ def write_block(folder: Path, num_views: int, tracks: int, blank: int | None = N
     layout = LAYOUT if blank is None else LAYOUT | {"size": (blank, blank), "gsd": GSD * SIDE / blank}
     block = simulate_block(num_views, tracks * num_views, seed=1, num_checks=0, **layout)
     ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)).astype(np.uint16)
-    paths = [
-        _write_image(folder, view, ramp + n) if blank is None else _write_blank(folder, view, blank)
-        for n, view in enumerate(block.views)
-    ]
+    paths = [folder / f"{view.name}.tif" for view in block.views]
+    for n, (path, view) in enumerate(zip(paths, block.views, strict=True)):
+        if blank is None:
+            write_image(path, ramp + n, **PACKED)
+        else:
+            write_blank(path, (blank, blank), dtype="uint16", tiled=True)
+        put_tag(path, view.sensor)
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
     listed.write_text("".join(f"{path.name}\n" for path in paths))
     return listed
@@ -96,7 +97,8 @@ def write_pictures(folder: Path, num_views: int, side: int) -> Path:
     for view, camera in zip(block.views, exact, strict=True):
         east, north = _seen(camera, side, origin).astype(np.float32)
         pixels = cv2.remap(ground, east, north, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        paths.append(_write_image(folder, view, pixels.astype(np.uint16)))
+        paths.append(write_image(folder / f"{view.name}.tif", pixels.astype(np.uint16), **PACKED))
+        put_tag(paths[-1], view.sensor)
     listed.write_text("".join(f"{path.name}\n" for path in paths))
     return listed
 
@@ -121,26 +123,6 @@ def _seen(camera: Corrected, side: int, origin: np.ndarray) -> np.ndarray:
     every = np.arange(side)
     splines = (RectBivariateSpline(nodes, nodes, axis.reshape(33, 33)) for axis in at.T)
     return np.stack([spline(every, every) for spline in splines])
-
-
-def _write_image(folder: Path, view: View, pixels: np.ndarray) -> Path:
-    path, (height, width) = folder / f"{view.name}.tif", pixels.shape
-    warnings.simplefilter("ignore", NotGeoreferencedWarning)
-    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint16"}
-    with rasterio.open(path, "w", compress="deflate", predictor=2, **profile) as image:
-        image.write(pixels, 1)
-    put_tag(path, view.sensor)
-    return path
-
-
-def _write_blank(folder: Path, view: View, side: int) -> Path:
-    path = folder / f"{view.name}.tif"
-    warnings.simplefilter("ignore", NotGeoreferencedWarning)
-    profile = {"driver": "GTiff", "width": side, "height": side, "count": 1, "dtype": "uint16", "tiled": True}
-    with rasterio.open(path, "w", sparse_ok=True, **profile):
-        pass  # tiles that nothing is written to take no room
-    put_tag(path, view.sensor)
-    return path
 
 
 def put_side_files(listed: Path, metadata: Path) -> None:

@@ -44,6 +44,7 @@ from barpc.tie import Area, Scope, TieOptions, find_tracks, link, match_pairs, r
 from barpc.tie.pairing.epipolar import coherent, epipolar_segments  # noqa: E402
 from barpc.tie.pixels import read_pixels, sample_stretch  # noqa: E402
 from barpc.workspace import Workspace  # noqa: E402
+from tests.geotiffs import write_image  # noqa: E402
 from tests.tie.stages import common_tracks, detect, select_pairs  # noqa: E402
 
 
@@ -216,12 +217,7 @@ def mirrored(path: Path, folder: str) -> Path:
     """An image turned over in its middle column, with its RPC: other ground at the same place."""
     with rasterio.open(path) as file:
         pixels, rpcs = file.read(1), file.rpcs
-    target = Path(folder) / f"mirrored_{path.stem}.tif"
-    layout = {"driver": "GTiff", "count": 1, "dtype": pixels.dtype}
-    with rasterio.open(target, "w", height=len(pixels), width=len(pixels[0]), **layout) as file:
-        file.write(np.ascontiguousarray(pixels[:, ::-1]), 1)
-        file.rpcs = rpcs
-    return target
+    return write_image(Path(folder) / f"mirrored_{path.stem}.tif", np.ascontiguousarray(pixels[:, ::-1]), rpcs=rpcs)
 
 
 def refused(views: list[View]) -> None:

@@ -44,7 +44,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np  # noqa: E402  (the thread counts come first)
-import rasterio  # noqa: E402
 
 import barpc  # noqa: E402
 from barpc.ba import adjust_tracks  # noqa: E402
@@ -55,11 +54,12 @@ from barpc.pointio.matches import write_matches  # noqa: E402
 from barpc.rpcio import write_rpc  # noqa: E402
 from barpc.scene import BoolArray  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402
-from barpc.sensor.geometry import triangulate  # noqa: E402
 from barpc.sensor.rpc import RPC  # noqa: E402
+from barpc.sensor.triangulation import triangulate  # noqa: E402
 from benchmarks.worlds_cameras import CHIPS, Array, Flaw, compass, ecef  # noqa: E402
 from benchmarks.worlds_dem import SINGLE, TOGETHER  # noqa: E402
 from benchmarks.worlds_families import FAMILIES, NAMES, PRIOR, Plan, World, draw, fly, make, step, wave  # noqa: E402
+from tests.geotiffs import write_blank  # noqa: E402
 
 GOOD_LEFT = 0.15
 DEM_AS_STATED = AdjustOptions(dem_sigma=SINGLE, dem_bias_sigma=TOGETHER)
@@ -89,13 +89,10 @@ def command(world: World) -> Outcome:
     start = time.process_time()
     with tempfile.TemporaryDirectory() as name:
         folder, paths = Path(name), []
-        shape = {"driver": "GTiff", "count": 1, "dtype": "uint8", "sparse_ok": True}
         for view in world.views:
-            with rasterio.open(folder / view.path, "w", width=view.size[0], height=view.size[1], **shape):
-                pass
             assert isinstance(view.sensor, RPC)
             write_rpc(view.sensor, folder / f"{view.name}_RPC.TXT")
-            paths.append(folder / view.path)
+            paths.append(write_blank(folder / view.path, view.size))
         write_matches(folder / "ties.npz", world.tracks, [view.name for view in world.views])
         given: dict[str, Any] = {
             "images": "none",

@@ -10,7 +10,8 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from barpc.pointio.gcp_formats import GCP_FORMATS, KNOWN
+from barpc.pointio.gcp_formats import GCP_FORMATS
+from barpc.pointio.gcp_tables import KNOWN
 from barpc.pointio.tables import COLUMNS
 from barpc.rasters.raster import DRIVERS, MOSAICS
 from barpc.rpcio.formats import CARRIERS, FORMATS

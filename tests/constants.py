@@ -69,7 +69,7 @@ SIZES = {
     "heights_measured": ("barpc.ba.result.MANY",),
     "slight_cut": ("barpc.ba.robust.rounds.SLIGHT",),
     "terms_kept": ("barpc.ba.robust.systematic_residuals.KEPT",),
-    "unknowns_tried": ("barpc.ba.robust.variances.SMALL",),
+    "unknowns_tried": ("barpc.ba.robust.posterior.SMALL",),
     "columns_kept": ("barpc.ba.solving.covariance.KEPT",),
     "dense_unknowns": ("barpc.ba.solving.covariance._DENSE_UNKNOWNS",),
     "fronts_in_memory": ("barpc.ba.solving.linear.IN_MEMORY",),

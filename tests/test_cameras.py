@@ -25,7 +25,7 @@ from barpc.base.geodesy import (
 from barpc.base.remote import Remote
 from barpc.cameras import EVERYWHERE as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
-from barpc.cli import cli, main
+from barpc.cli import cli
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.rpcio.grids import write_correction
 from barpc.scene import Camera
@@ -33,6 +33,7 @@ from barpc.sensor import SensorModel
 from barpc.sensor.csm import open_state
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import altitude_range
+from tests.cli.test_main import run
 from tests.pipeline.known import part
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 from tests.sensor.conftest import MODELS
@@ -40,13 +41,6 @@ from tests.sensor.linescan_files import Flight, isd
 from tests.sensor.terrasar_files import Terrasar
 from tests.sensor.test_csm import linescan
 from tests.sensor.test_csm import write as write_state
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    return int(stop.value.code or 0)
-
 
 # --- a camera that barpc does not know: an aerial frame camera, in one class and one row --------------------
 

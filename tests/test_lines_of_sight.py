@@ -6,11 +6,11 @@ import warnings
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio import Affine
 
 from barpc.base.errors import BarpcWarning
 from barpc.rasters.dem import Dem, localize_on_terrain
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 
 STEP = 30.0 / 111_195.0  # deg: posts of some 30 m
@@ -41,12 +41,8 @@ class Oblique:
 
 def dem(tmp_path, heights) -> Dem:
     """A DEM whose node (row, col) is at col, row of `Oblique` on the ground."""
-    path = tmp_path / "dem.tif"
-    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": "float32"}
     place = Affine(STEP, 0.0, WEST - STEP / 2, 0.0, -STEP, NORTH + STEP / 2)
-    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4979", transform=place, **shape) as out:
-        out.write(heights.astype(np.float32), 1)
-    return Dem.open(path)
+    return Dem.open(write_image(tmp_path / "dem.tif", heights.astype(np.float32), crs="EPSG:4979", transform=place))
 
 
 def first_met(slope: float, profile: np.ndarray, col: float, high: float) -> float:

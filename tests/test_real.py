@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import Affine
 from scipy import ndimage
 
@@ -17,6 +16,7 @@ from benchmarks.real import Row, across, features, held_out, matched, measured
 from benchmarks.real_sets import Change, as_rasterio, changed, correlated
 from benchmarks.surfaces import between, heights
 from tests.fit.cameras import synthetic_rpc
+from tests.geotiffs import write_image
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
@@ -38,11 +38,8 @@ def test_check_points_are_at_the_same_place_in_a_turned_image(turns: int) -> Non
 
 def surface(path: Path, values: np.ndarray, west: float, north: float) -> Path:
     path.parent.mkdir(exist_ok=True)
-    size = {"width": values.shape[1], "height": values.shape[0], "count": 1, "dtype": values.dtype}
-    place = {"crs": "EPSG:32631", "transform": Affine(1.0, 0.0, west, 0.0, -1.0, north), "nodata": -999.0}
-    with rasterio.open(path, "w", "GTiff", **size, **place) as file:
-        file.write(values, 1)
-    return path
+    place = Affine(1.0, 0.0, west, 0.0, -1.0, north)
+    return write_image(path, values, crs="EPSG:32631", transform=place, nodata=-999.0)
 
 
 def test_surfaces_are_compared_at_the_same_ground(tmp_path: Path) -> None:

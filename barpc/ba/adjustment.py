@@ -39,7 +39,7 @@ from barpc.base.options import OFF, AdjustOptions
 from barpc.base.process import one_blas_thread
 from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, SAMPLE
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
-from barpc.sensor.geometry import camera_center
+from barpc.sensor.centers import camera_center
 from barpc.sensor.radar import Radar
 
 

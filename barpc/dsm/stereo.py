@@ -38,9 +38,9 @@ from barpc.report.runfiles import PRIOR_FILE
 from barpc.report.summary.block import AXES
 from barpc.rpcio.formats import CORRECTION
 from barpc.scene import BoolArray, View
-from barpc.sensor.geometry import intersect_pair
 from barpc.sensor.radar import Radar
 from barpc.sensor.rational import monomials
+from barpc.sensor.triangulation import intersect_pair
 from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import (
     ACROSS,

@@ -12,8 +12,8 @@ import numpy as np
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array
-from barpc.export.shots import Sampled, Scene, Shot, Window
-from barpc.sensor.geometry import image_grid
+from barpc.export.shots import Scene, Shot, Window
+from barpc.sensor.sampler import Sample, image_grid
 
 _DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
 _PINHOLE_STEPS = 100  # at most
@@ -36,7 +36,7 @@ class Pinhole:
         return np.asarray(seen[:, :2] / seen[:, 2:] * self.focal + self.center)
 
 
-def fit_camera(samples: Sampled, sight: Array, far: float | None = None, skewed: bool = False) -> Array:
+def fit_camera(samples: Sample, sight: Array, far: float | None = None, skewed: bool = False) -> Array:
     """Return the projective camera (3, 4) that shows the points nearest to their image points, in least squares.
 
     A camera (a.X + a4, b.X + b4) / (c.X + 1) has no skew where (a x c).(b x c) = 0. From the direct linear
@@ -51,8 +51,8 @@ def fit_camera(samples: Sampled, sight: Array, far: float | None = None, skewed:
         behind the ground, as an image says little of its distance
     skewed : bool, any skew will do
     """
-    span, middle = np.abs(samples.world).max(), samples.image.mean(axis=0)
-    world, image = samples.world / span, samples.image - middle
+    span, middle = np.abs(samples.ground).max(), samples.image.mean(axis=0)
+    world, image = samples.ground / span, samples.image - middle
     unknowns = np.linalg.lstsq(_derivative(world, image, np.ones(len(world))), image.ravel(), rcond=None)[0]
     for _ in range(_PINHOLE_STEPS):
         depth = world @ unknowns[8:] + 1.0
@@ -116,7 +116,7 @@ def pinhole_of(scene: Scene, shot: Shot) -> tuple[Pinhole, float]:
     samples, checked = scene.samples(shot), scene.samples(shot, checked=True)
     sight, far = scene.sight_of(shot)
     found = [pinhole_camera(fit_camera(samples, sight, times and times * far)) for times in _DISTANCE_FACTORS]
-    shown = [(checked.error(one.project(checked.world)), n) for n, one in enumerate(found) if (one.focal > 0).all()]
+    shown = [(checked.compare(one.project), n) for n, one in enumerate(found) if (one.focal > 0).all()]
     error, best = min(shown, default=(np.inf, 0))
     if not np.isfinite(error):
         raise InputError(f"{shot.name}: shows the ground mirrored, or no pinhole camera comes near its RPC")
@@ -244,5 +244,4 @@ def _error(scene: Scene, shot: Shot, size: tuple[int, ...], pinhole: Pinhole, ho
     inside = ((image >= -0.5) & (image <= np.array(shot.size) - 0.5)).all(axis=1)
     ground = shot.rpc.localize(image[inside], alt[inside])
     seen = np.isfinite(ground).all(axis=1)
-    missed = pinhole.project(scene.world(ground[seen])) + 0.5 - nodes[inside][seen]
-    return float(np.linalg.norm(missed, axis=1).max())
+    return Sample(scene.world(ground[seen]), nodes[inside][seen] - 0.5).compare(pinhole.project)

@@ -27,8 +27,11 @@ from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import CARRIERS
 from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.scene import IntArray
-from barpc.sensor.geometry import GRID_NODES, camera_center, footprint, image_grid, triangulate
+from barpc.sensor.centers import camera_center
+from barpc.sensor.geometry import footprint
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
+from barpc.sensor.triangulation import triangulate
 
 Window = tuple[int, int, int, int]
 """col, row of the first pixel, width, height [px]."""
@@ -36,18 +39,6 @@ Window = tuple[int, int, int, int]
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
 _TAIL_PERCENT = 0.5  # per cent of the tie points at either end that do not count for it
-
-
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """Points (N, 3) of the scene [m] and where an image shows them (N, 2) [px]."""
-
-    world: Array
-    image: Array
-
-    def error(self, projected: Array) -> float:
-        """Return the largest distance [px] of projections (N, 2) from where the image shows the points."""
-        return float(np.linalg.norm(projected - self.image, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +116,7 @@ class Scene:
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
-    def samples(self, shot: Shot, part: Window | None = None, checked: bool = False) -> Sampled:
+    def samples(self, shot: Shot, part: Window | None = None, checked: bool = False) -> Sample:
         """Return the points over an image, or a part of it, and altitudes; to measure errors on, more of them."""
         nodes = (2 * GRID_NODES[0] - 1, 2 * GRID_NODES[1] - 1) if checked else GRID_NODES  # between them, too
         col, row, *size = part or (0, 0, *shot.size)
@@ -135,7 +126,7 @@ class Scene:
         known = np.isfinite(ground).all(axis=1)
         if known.sum() < 12:
             raise InputError(f"{shot.name}: its RPC sees no ground between {self.alt_range} m")
-        return Sampled(self.world(ground[known]), image[known])
+        return Sample(self.world(ground[known]), image[known])
 
     def middle(self, shot: Shot) -> Array:
         """Return the ground (3,) in the middle of a shot, at the altitude of the origin."""

@@ -17,9 +17,9 @@ import numpy as np
 
 from barpc.base.fields import field_values
 from barpc.base.geodesy import Array, parts, wrap_longitude
-from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import NEGLIGIBLE_FIT_ERROR, Scattered
 
 _ALTITUDE_POWERS = np.arange(1, 8)  # of altitudes
 _CAUSE_CELLS = 4  # along each side: where all errors are in one of them, they are in one place
@@ -195,7 +195,7 @@ class RpcFit:
 # --- causes of misfit -----------------------------------------------------------------------------------------
 
 
-def reason(rpc: RPC, sample: Sample) -> Reason | None:
+def reason(rpc: RPC, sample: Scattered) -> Reason | None:
     """Return the main dependence of an RPC's errors at the points of a sample; None where they are not finite."""
     ground, points = sample.ground[: sample.count], sample.points[: sample.count]
     error = rpc.project(ground) - points[:, :2]
@@ -240,7 +240,7 @@ def _along(left: Array, bases: list[Array], place: Array) -> float:
     return 1.0 - rest / float((left**2).sum() / len(left))
 
 
-def _layered(left: Array, bases: list[Array], points: Array, sample: Sample) -> float:
+def _layered(left: Array, bases: list[Array], points: Array, sample: Scattered) -> float:
     """Return the share of errors (N, 2) that goes by the altitude, otherwise from place to place of the image."""
     away = (points[:, :2] - (np.array(sample.size) - 1) / 2) / (max(sample.size) / 2)
     low, high = sample.alt_range

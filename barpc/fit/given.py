@@ -17,11 +17,12 @@ from barpc.base.geodesy import CHUNK, Array, metres_per_unit
 from barpc.base.options import FitOptions
 from barpc.fit.certificate import RpcFit, roundtrip
 from barpc.fit.methods import FitSolution, normalization, solve
-from barpc.fit.points import Errors, checked_points, column_ranges, screened
+from barpc.fit.points import checked_points, column_ranges, screened
 from barpc.fit.refit import accepted, best_method, certified, wrong_axes_of_grid
 from barpc.fit.system import FitProblem
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Errors
 
 WHOLE = 40
 """Points that determine the 39 unknowns of each coordinate of a whole RPC, and one to spare."""
@@ -137,7 +138,7 @@ def _certified_on_points(
         for residual in solution.leave_one_out() if left_out is None else left_out:
             errors.add(residual)
     loop = roundtrip(solution.rpc, ground[:: max(1, len(ground) // CHUNK)])
-    fit = certified(solution, errors, errors.largest, loop, size)
+    fit = certified(solution, errors, loop, size)
     rpc = _limited_to_altitudes(fit.rpc, ground[:, 2])
     return replace(fit, rpc=rpc, height_px=_height_unknown(ground, image, float(fit.rmse_cnp.max())))
 

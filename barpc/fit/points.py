@@ -1,31 +1,18 @@
-"""The points of a fit: sampled from a sensor model, or given and looked at first (shapes, numbers, geometry).
-
-Points that the fit has not seen are drawn one a cell of the image and at an altitude of its own each, with more along
-its edges; where the error is largest more are drawn around the worst, closer and closer.
-"""
+"""The points of a fit: a grid of a sensor model, or given and looked at first (shapes, numbers, geometry)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cache
 
 import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import FitError, InputError
-from barpc.base.geodesy import MAX_COORDINATE, Array, BoolArray, as_numbers, metres_per_unit, parts, wrap_longitude
+from barpc.base.geodesy import MAX_COORDINATE, Array, as_numbers, metres_per_unit, parts, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.sensor import SensorModel
-from barpc.sensor.corrected import Corrected
 from barpc.sensor.geometry import LEAST_RANGE, footprint
-from barpc.sensor.rpc import RPC
 
-NEGLIGIBLE_FIT_ERROR = 1e-6  # px: what no other method is tried on, and no round trip is held to
-SAMPLE_CELLS = 45
-"""Along each side of the image: 2025 points of the whole."""
-_EDGE_POINTS = 12  # points along each edge of the image, at either end of the altitudes
-_WORST, _AROUND, _ROUNDS = 16, 8, 5  # points that are looked around at, new ones around each, rounds, ever nearer
 _DEM_SAMPLES = 400  # of a DEM along each side of the image
 _RANGES = (("longitude", -360.0, 720.0), ("latitude", -90.0, 90.0), ("altitude", -12e3, 100e3))
 _ONE_ALTITUDE = 1e-3  # metres
@@ -186,131 +173,3 @@ def _is_mirrored(jacobian: Array) -> bool:
     a, b = np.linalg.norm(jacobian, axis=1)
     square = 0.5 < a / b < 2.0 and abs(jacobian[0] @ jacobian[1]) < 0.5 * a * b
     return bool(square and np.linalg.det(jacobian) > 0)  # rows run down: a view from above is < 0
-
-
-# --- points that the fit has not seen ----------------------------------------------------------------------
-
-
-@dataclass
-class Errors:
-    """Running root mean square and largest error of (N, 2) residuals [px]."""
-
-    count: int = 0
-    squares: Array = field(default_factory=lambda: np.zeros(2))
-    largest: Array = field(default_factory=lambda: np.zeros(2))
-    # (k, 3) col, row [px], altitude [m] of the largest
-    worst: Array = field(default_factory=lambda: np.empty((0, 3)))
-
-    def add(self, residual: Array) -> None:
-        """Add residuals (N, 2) [px]; one that is NaN makes the result NaN."""
-        if len(residual):
-            self.count += len(residual)
-            self.squares = self.squares + np.einsum("ij,ij->j", residual, residual)
-            self.largest = np.maximum(self.largest, np.abs(residual.T).max(axis=1))
-
-    @property
-    def rmse(self) -> Array:
-        """Root mean square (2,) [px]."""
-        return np.asarray(np.sqrt(self.squares / self.count)) if self.count else np.full(2, np.nan)
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Points of a model all over an image of `size` (width, height) and a range of altitudes."""
-
-    model: SensorModel
-    size: tuple[int, int]
-    alt_range: tuple[float, float]
-    points: Array  # (N, 3) col, row [px], altitude [m] with a ground point; those all over the image come first
-    ground: Array  # (N, 3) lon, lat [deg], alt [m]
-    count: int  # of those all over the image
-    missing: float  # part of the image and the altitudes without a ground point
-
-    @classmethod
-    def of(
-        cls,
-        model: SensorModel,
-        size: tuple[int, int],
-        alt_range: tuple[float, float],
-        cells: int = SAMPLE_CELLS,
-        seed: int = 0,
-    ) -> Sample:
-        """Sample a model at one random point in each of `cells` x `cells` parts of an image, and along its edges."""
-        if min(size) < 1:
-            raise FitError(f"image size {size[0]} x {size[1]}: nothing to fit over")
-        points = _scaled(_scattered(cells, seed), size, alt_range)
-        ground, known = _on_ground(model, points)
-        inside = known[: cells**2]
-        share = float(inside.mean())
-        return cls(model, size, alt_range, points[known], ground[known], int(inside.sum()), 1.0 - share)
-
-    def also(self, points: Array) -> Sample:
-        """Return the sample with more points (M, 3) col, row [px], altitude [m] around which to search for errors."""
-        ground, known = _on_ground(self.model, points)
-        more = np.concatenate([self.points, points[known]]), np.concatenate([self.ground, ground[known]])
-        return replace(self, points=more[0], ground=more[1])
-
-    def contradiction(self) -> float:
-        """Return the largest distance [px] from where the model projects its ground; infinite where it fails.
-
-        At the altitudes that were asked for, whatever altitudes it gave back.
-        """
-        asked = np.column_stack([self.ground[:, :2], self.points[:, 2]])
-        image = self.points[:, :2]
-        found = self.model.project(asked, image) if isinstance(self.model, Corrected) else self.model.project(asked)
-        return float(_finite_size(found - image).max(initial=0.0))
-
-    def errors(self, rpc: RPC) -> tuple[Errors, Array]:
-        """Return an RPC's errors at the points, and the largest (2,) [px] around; infinite where it has no image."""
-        return self.sought(lambda ground, points: rpc.project(ground) - points[:, :2])
-
-    def sought(self, off: Callable[[Array, Array], Array]) -> tuple[Errors, Array]:
-        """Return an RPC's errors (N, 2) [px] at ground points (N, 3) and their (N, 3) col, row, altitude."""
-        points, miss = self.points, _finite_size(off(self.ground, self.points))
-        errors = Errors()
-        errors.add(miss[: self.count])
-        rng, reach = np.random.default_rng(1), np.array([1.0 / SAMPLE_CELLS, 1.0 / SAMPLE_CELLS, 0.25])
-        unit = (points - _scaled(np.zeros(3), self.size, self.alt_range)) / self._span
-        for _ in range(_ROUNDS if float(miss.max(initial=0.0)) > NEGLIGIBLE_FIT_ERROR else 0):
-            worst = np.unique(np.concatenate([np.argsort(-miss[:, axis], kind="stable")[:_WORST] for axis in range(2)]))
-            near = unit[np.repeat(worst, _AROUND)] + reach * rng.uniform(-1.0, 1.0, (len(worst) * _AROUND, 3))
-            near = near.clip(0.0, 1.0)
-            at = _scaled(near, self.size, self.alt_range)
-            ground, known = _on_ground(self.model, at)
-            found = _finite_size(off(ground[known], at[known]))
-            unit, miss, reach = np.concatenate([unit, near[known]]), np.concatenate([miss, found]), reach / 2
-        if len(miss):
-            errors.worst = _scaled(unit[miss.argmax(axis=0)], self.size, self.alt_range)
-        return errors, miss.max(axis=0, initial=0.0)
-
-    @property
-    def _span(self) -> Array:
-        return np.array([*self.size, max(self.alt_range[1] - self.alt_range[0], 1e-9)], dtype=np.float64)
-
-
-@cache
-def _scattered(cells: int, seed: int) -> Array:
-    """Return a random place in each of `cells` x `cells` parts of an image, then places along its edges, in 0 .. 1."""
-    rng = np.random.default_rng(seed)
-    cell = np.stack(np.meshgrid(*[np.arange(cells)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    inside = np.column_stack([cell, rng.permutation(len(cell))]) + rng.random((len(cell), 3))
-    inside /= [cells, cells, len(cell)]
-    t, ends = np.linspace(0.0, 1.0, _EDGE_POINTS), (0.0, 1.0)
-    edges = [(*at, h) for u in t for end in ends for at in ((u, end), (end, u)) for h in ends]
-    return np.concatenate([inside, edges])
-
-
-def _on_ground(model: SensorModel, points: Array) -> tuple[Array, BoolArray]:
-    """Return the ground (N, 3) of points (N, 3) col, row [px], altitude [m], and where there is any (N,)."""
-    ground = model.localize(points[:, :2], points[:, 2])
-    return ground, np.asarray(np.isfinite(ground).all(axis=1))
-
-
-def _finite_size(values: Array) -> Array:
-    return np.nan_to_num(np.abs(values), nan=np.inf)
-
-
-def _scaled(unit: Array, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Return the col, row, altitude (..., 3) of places in 0 .. 1."""
-    low, high = alt_range
-    return np.asarray(unit * [*size, high - low] + [-0.5, -0.5, low])

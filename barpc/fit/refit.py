@@ -13,21 +13,14 @@ from barpc.base.geodesy import WGS84_A, Array, ecef_from_ground, wrap_longitude
 from barpc.base.options import FitOptions
 from barpc.fit.certificate import RpcFit, coverage, reason, roundtrip
 from barpc.fit.methods import FitSolution, solve
-from barpc.fit.points import (
-    NEGLIGIBLE_FIT_ERROR,
-    Errors,
-    Sample,
-    column_ranges,
-    control_points,
-    screened,
-    widened,
-)
+from barpc.fit.points import column_ranges, control_points, screened, widened
 from barpc.fit.poles import MIN_DENOMINATOR_RATIO
 from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import nodes_of
 from barpc.sensor.geometry import LEAST_RANGE
 from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import NEGLIGIBLE_FIT_ERROR, Errors, Scattered
 
 _ABOUT = 1.1  # times the error
 _MAX_MISSING_SHARE = 0.1  # part of the image without a ground point, at most
@@ -91,8 +84,8 @@ def _fit_model(
     def attempt(method: str, source: SensorModel = model) -> RpcFit:
         solution = solve(*_points_for_method(source, size, alt_range, options, method), options, method)
         loop, beyond = roundtrip(solution.rpc, sample.ground), 1.0 - 0.05 ** (1.0 / sample.count)
-        errors = sample.errors(solution.rpc)
-        return replace(certified(solution, *errors, loop, size, beyond), contradiction=contradiction, axes=axes)
+        errors = sample.compare(solution.rpc.project)
+        return replace(certified(solution, errors, loop, size, beyond), contradiction=contradiction, axes=axes)
 
     try:
         fit = best_method(attempt, options, False, exact=True)
@@ -112,9 +105,9 @@ def fit_only(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, 
     return solve(*_points_for_method(model, size, widened(alt_range), options, "ridge"), options, "ridge").rpc
 
 
-def _check_sample(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Sample:
+def _check_sample(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Scattered:
     """Return the check points of a model; FitError where it has no ground for too much of its image."""
-    sample = Sample.of(model, size, alt_range)
+    sample = Scattered.over(model, size, alt_range)
     if sample.missing > _MAX_MISSING_SHARE:
         raise FitError(
             f"the model has no ground point for {sample.missing:.0%} of the image over altitudes "
@@ -140,7 +133,7 @@ def _points_for_method(
 ) -> tuple[Array, Array]:
     """Return the ground (N, 3) and image points (N, 2) for a method."""
     if method == "gauss-newton":  # what an RPC cannot follow has any frequency: scattered points alias none
-        scattered = Sample.of(model, size, alt_range, _SCATTERED_CELLS, seed=1)
+        scattered = Scattered.over(model, size, alt_range, _SCATTERED_CELLS, seed=1)
         ground, image = scattered.ground, scattered.points[:, :2]
     else:
         grid = control_points(model, size, alt_range, options)
@@ -160,9 +153,9 @@ def innermost(model: object) -> object:
 
 
 def certified(
-    solution: FitSolution, seen: Errors, largest: Array, loop: float, size: tuple[int, int] | None, beyond: float = 1.0
+    solution: FitSolution, seen: Errors, loop: float, size: tuple[int, int] | None, beyond: float = 1.0
 ) -> RpcFit:
-    """Return the fit with its certificate: errors on the check points, the largest (2,) [px] found near them."""
+    """Return the fit with its certificate: errors on the check points, the largest found near them."""
     problem, rpc = solution.problem, solution.rpc
     ground, image = problem.ground, problem.image
     used = Errors()
@@ -175,7 +168,7 @@ def certified(
         rmse_cnp=used.rmse,
         max_cnp=used.largest,
         rmse_ckp=seen.rmse,
-        max_ckp=largest,
+        max_ckp=seen.largest,
         beyond=beyond,
         min_denominator=solution.region.smallest(rpc.coeffs[1::2]),
         roundtrip=loop,

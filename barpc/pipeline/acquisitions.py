@@ -16,6 +16,7 @@ from barpc.report.outcome import Carried
 from barpc.scene import BoolArray, Camera, View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import image_grid
 from barpc.tie.pixels import read_pixels
 
 _SAME = 0.01  # px: RPCs of bands are equal to 1e-8, of other images of a pass they differ by 50 and more
@@ -84,16 +85,15 @@ def _same_rays(sensor: SensorModel, ends: Array) -> BoolArray:
 
 def _image_map(one: View, other: View) -> tuple[Array, Array] | None:
     """Return the scale and shift (2,) from an image to another whose camera is equal up to these; None of others."""
-    col, row = (np.linspace(0.0, side - 1.0, 5) for side in one.size)
-    at = np.stack(np.meshgrid(col, row, np.linspace(*one.alt_range, 3), indexing="ij"), axis=-1).reshape(-1, 3)
-    seen = other.sensor.project(one.sensor.localize(at[:, :2], at[:, 2]))
+    at, alt = image_grid(one.size, one.alt_range, (5, 3))
+    seen = other.sensor.project(one.sensor.localize(at, alt))
     if not np.isfinite(seen).all():
         return None
-    middle = at[:, :2].mean(axis=0)
-    apart = at[:, :2] - middle
+    middle = at.mean(axis=0)
+    apart = at - middle
     step = (apart * seen).sum(axis=0) / (apart**2).sum(axis=0)
     start = seen.mean(axis=0) - step * middle
-    off = np.abs(at[:, :2] * step + start - seen).max()
+    off = np.abs(at * step + start - seen).max()
     return (step, start) if off < _SAME * max(1.0, *step) and (step > 0).all() else None
 
 

@@ -16,7 +16,7 @@ from barpc.base.errors import BarpcError, DisconnectedError, InputError, TiePoin
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.tasks import Progress, Work
-from barpc.pipeline.calibrate import common_errors, refuse_strange
+from barpc.pipeline.calibrations import common_errors, refuse_strange
 from barpc.pipeline.earlier import Earlier, GrowingRun, chosen_pairs, of_new
 from barpc.pipeline.exchanged import exchanged_cameras
 from barpc.pipeline.inputs import (
@@ -33,7 +33,7 @@ from barpc.pointio.names import pair_name
 from barpc.rasters.dem import Dem
 from barpc.report.outcome import MANY_REJECTED, WHOLE_PIXELS, pair_ties
 from barpc.scene import BoolArray, Reference, View
-from barpc.sensor.geometry import CameraCenter, camera_centers
+from barpc.sensor.centers import CameraCenter, camera_centers
 from barpc.tie import Scope, find_tracks, read_area
 from barpc.tie.reference import Accuracy, ReferenceControl, register_views
 from barpc.workspace import Workspace

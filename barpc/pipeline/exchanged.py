@@ -17,7 +17,8 @@ from barpc.base.geodesy import CHUNK
 from barpc.base.statistics import robust_spread
 from barpc.report.outcome import PairTies, pair_ties
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import Several, convergence_angle, epipolar_offset
+from barpc.sensor.geometry import Several, convergence_angle
+from barpc.sensor.triangulation import epipolar_offset
 
 _SCATTER = 0.1  # px across epipolar lines: less does not matter
 _FEWER = 5.0  # times less scatter with the cameras exchanged: 10 to 360 of three public sets, 1 of right cameras

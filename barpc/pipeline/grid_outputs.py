@@ -14,11 +14,10 @@ import numpy as np
 
 from barpc.base.atomic import write_text
 from barpc.base.errors import BarpcError, FitError, OutputError, RpcError
-from barpc.base.geodesy import Array
 from barpc.base.options import RunOptions
 from barpc.base.tasks import Progress, ordered
 from barpc.fit import RpcFit
-from barpc.fit.points import Sample, widened
+from barpc.fit.points import widened
 from barpc.fit.refit import fit_only
 from barpc.pipeline.executor import CachingExecutor
 from barpc.pipeline.proof import REOPENED
@@ -32,6 +31,7 @@ from barpc.sensor.csm import is_writable, open_state, state_text
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Errors, Scattered
 from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -41,9 +41,7 @@ MISFIT = 0.02
 
 Written = dict[str, dict[str, float | str]]
 """File -> consumer -> difference to P_BA [px], or why it does not read it."""
-Miss = tuple[float, float, Array]
-"""RMS and largest distance to a camera [px], and where that is: (M, 3) col, row [px], altitude [m]."""
-Misses = dict[str, Miss]  # file -> how far it is off the camera that it holds
+Misses = dict[str, Errors]  # file -> how far it is off the camera that it holds
 
 
 @dataclass(frozen=True)
@@ -126,12 +124,12 @@ def _write_grids(
         again = [(view, model, errors, folder) for (view, _, model, _), errors in pairs]
         written = ordered(fresh, verify_grids, again, "verify grids", progress)
     for errors, seen in zip(made, written, strict=True):
-        for name, (rms, largest, _) in errors.items():
+        for name, off in errors.items():
             read = seen[name]["barpc"]
-            worst = max(largest, read) if isinstance(read, float) else largest
+            worst = max(off.far, read) if isinstance(read, float) else off.far
             if not worst <= MISFIT:
                 why = "it has no refraction" if name.endswith(STATE) else "at steps?"
-                logger.warning("%s: errors of %.3g px RMS, up to %.3g px (%s)", name, rms, worst, why)
+                logger.warning("%s: errors of %.3g px RMS, up to %.3g px (%s)", name, off.rms, worst, why)
     return written
 
 
@@ -139,15 +137,15 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
     """Write the grids of a view into a temporary folder; return the errors of each [px]."""
     place, alts = Path(room) / view.name, widened(view.alt_range)
     place.mkdir(parents=True, exist_ok=True)
-    sample, errors = Sample.of(model, view.size, alts), Misses()
+    sample, errors = Scattered.over(model, view.size, alts), Misses()
     try:
         if files.state:
             text = state_text(model, view.size, alts)
             write_text(place / (view.name + STATE), text, overwrite=True)
-            errors[view.name + STATE] = _largest_miss(sample, open_state(place / (view.name + STATE))[0])
+            errors[view.name + STATE] = sample.compare(open_state(place / (view.name + STATE))[0].project)
         if files.grids:
             grid = DirectGrid.of(model, view.size, alts)
-            errors[view.name + GRID_SUFFIX] = _largest_miss(sample, grid)
+            errors[view.name + GRID_SUFFIX] = sample.compare(grid.project)
             write_grid(grid, place / (view.name + GRID_SUFFIX), overwrite=True)
             rpc, lacking, errors[view.name + CORRECTION] = grid_correction(rpc, sample)
             write_correction(lacking, rpc, place / (view.name + CORRECTION), overwrite=True)
@@ -156,14 +154,14 @@ def make_grids(view: View, rpc: RPC, model: SensorModel, files: GridFiles, room:
     return errors
 
 
-def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss]:
+def grid_correction(rpc: RPC, sample: Scattered) -> tuple[RPC, CorrectionGrid, Errors]:
     """Return an RPC and its correction grid, and the errors of both together against the camera of a sample.
 
     The correction of `rpc` may depend on the altitude, where its denominators absorb errors along the rows. Then that
     of the camera without its displacements in the image and their grid are better together: the better is returned.
     """
     model, size, alts = sample.model, sample.size, sample.alt_range
-    found: list[tuple[float, float, Array, RPC, CorrectionGrid]] = []
+    found: list[tuple[Errors, RPC, CorrectionGrid]] = []
     failed: BarpcError | None = None
     for given in (rpc, None):
         try:
@@ -172,15 +170,15 @@ def grid_correction(rpc: RPC, sample: Sample) -> tuple[RPC, CorrectionGrid, Miss
         except (RpcError, FitError) as error:
             failed = error
             continue
-        found.append((*_largest_miss(sample, Displaced(one, lacking)), one, lacking))
-        if found[-1][1] <= LINEAR:
+        found.append((sample.compare(Displaced(one, lacking).project), one, lacking))
+        if found[-1][0].far <= LINEAR:
             break
     if not found:
         assert failed is not None
         raise failed
     # the largest error is at a step, if there is one
-    rms, largest, where, best, lacking = min(found, key=lambda row: row[0])
-    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, (rms, largest, where)
+    errors, best, lacking = min(found, key=lambda row: row[0].rms)
+    return replace(best, err_bias=rpc.err_bias, err_rand=rpc.err_rand), lacking, errors
 
 
 def _undisplaced(model: Any) -> Any:
@@ -191,27 +189,20 @@ def _undisplaced(model: Any) -> Any:
     return plain if isinstance(model, Displaced) else replace(model, sensor=plain)
 
 
-def _largest_miss(sample: Sample, camera: SensorModel) -> Miss:
-    """Return the largest error of a camera against the model of a sample."""
-    errors, largest = sample.sought(lambda ground, at: camera.project(ground) - at[:, :2])
-    return float(np.linalg.norm(errors.rmse)), float(np.linalg.norm(largest)), errors.worst
-
-
 def verify_grids(view: View, model: SensorModel, errors: Misses, folder: str) -> Written:
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads other errors than theirs.
 
     Errors at the same points are compared: a narrow step between them may be found or missed.
     """
-    every, written = Sample.of(model, view.size, widened(view.alt_range)), Written()
-    for name, (rms, _, where) in errors.items():
-        sample = every.also(where)  # the same points as when it was written
+    every, written = Scattered.over(model, view.size, widened(view.alt_range)), Written()
+    for name, off in errors.items():
         path = Path(folder) / name
-        readings = verify_grid(path, sample)
+        readings = verify_grid(path, every.also(off.worst))  # the same points as when it was written
         for reading in readings:
-            same = reading.rms == rms or abs(reading.rms - rms) <= REOPENED  # infinite: rows are lost there
+            same = reading.rms == off.rms or abs(reading.rms - off.rms) <= REOPENED  # infinite: rows are lost there
             if reading.consumer in ("barpc", "gdal") and not same:
                 raise OutputError(
-                    f"{path}: {reading.consumer} reads it with errors of {reading.rms:.3g} px RMS, not {rms:.3g}"
+                    f"{path}: {reading.consumer} reads it with errors of {reading.rms:.3g} px RMS, not {off.rms:.3g}"
                     f"{f' ({reading.note})' if reading.note else ''}; is the disk full, or another RPC file beside it?"
                 )
         written[name] = {one.consumer: one.note or one.max_error for one in readings}

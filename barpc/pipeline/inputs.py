@@ -33,7 +33,8 @@ from barpc.rasters.vertical import ELLIPSOIDAL, FLAT, NO_GEOID, geoid_file, metr
 from barpc.report import Run
 from barpc.report.runfiles import IMAGES, PRIOR_FILE, table_path
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Tracks, View
-from barpc.sensor.geometry import footprint, ground_sample_distance, triangulate
+from barpc.sensor.geometry import footprint, ground_sample_distance
+from barpc.sensor.triangulation import triangulate
 from barpc.tie import Matches
 from barpc.tie.matchers.matcher import hook_files
 from barpc.tie.pairing.epipolar import grouped

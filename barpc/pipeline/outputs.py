@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import OutputError
-from barpc.base.geodesy import Array
 from barpc.base.manifest import LAST, REPORT_FILE, SUMS
 from barpc.base.options import RunOptions
 from barpc.base.tasks import Progress
@@ -32,8 +31,8 @@ from barpc.report.tables import TABLES, gcps_geojson, map_layers
 from barpc.rpcio import CARRIERS, WRITABLE, sidecars, write_camera
 from barpc.scene import View
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import ground_grids
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample
 from barpc.workspace import Workspace, own_files
 
 MATCH_FILES = ("matches.csv", "matches.npz")
@@ -83,17 +82,15 @@ def make_files(view: View, rpc: RPC, images: str, formats: Sequence[str], folder
 
 def verify_group(group: Sequence[tuple[Sequence[str], View, RpcFit, SensorModel]]) -> list[Written]:
     """Return the results of `verify_files` for some views, whose cameras are evaluated together."""
-    grids = ground_grids([(model, view.size, view.alt_range) for _, view, _, model in group])
-    return [verify_files(*one, grid) for one, grid in zip(group, grids, strict=True)]
+    samples = Sample.grids([(model, view.size, view.alt_range) for _, view, _, model in group])
+    return [verify_files(paths, fit, sample) for (paths, _, fit, _), sample in zip(group, samples, strict=True)]
 
 
-def verify_files(
-    paths: Sequence[str], view: View, fit: RpcFit, model: SensorModel, grid: Array | None = None
-) -> Written:
+def verify_files(paths: Sequence[str], fit: RpcFit, sample: Sample) -> Written:
     """Open the files of a view as their consumers do; OutputError where barpc or GDAL reads another camera."""
     largest = float(np.linalg.norm(fit.max_ckp)) + REOPENED
     written: Written = {Path(path).name: {} for path in paths}
-    readings = verify([Path(path) for path in paths], model, view.size, view.alt_range, grid)
+    readings = verify(paths, sample)
     for reading in sorted(readings, key=lambda one: one.consumer != "barpc"):  # what barpc finds says more
         own = reading.consumer.partition(",")[0] in ("barpc", "gdal")  # which reads texts beside an image
         if own and not reading.max_error <= 2 * largest:

@@ -23,6 +23,7 @@ from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import format_for, hidden_by
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
+from barpc.sensor.sampler import Sample
 
 if TYPE_CHECKING:
     from barpc.base.tasks import Progress
@@ -181,12 +182,12 @@ def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
     """Read the camera of a file as a reader finds it: another file beside it may go before."""
     points = np.array(view.certified)
     try:
-        off = np.linalg.norm(open_camera(path).model.project(points[:, :3]) - points[:, 3:], axis=1)
+        off = Sample(points[:, :3], points[:, 3:]).compare(open_camera(path).model.project)
     except (BarpcError, OSError) as error:
         return Proved("camera", name, MISSING if not path.exists() else CHANGED, str(error))
-    if off.max() <= stated + REOPENED:
+    if off <= stated + REOPENED:
         return Proved("camera", name, SAME)
-    far = f"differs from the certified camera by {off.max():.3g} px, {stated:.1g} stated"
+    far = f"differs from the certified camera by {off:.3g} px, {stated:.1g} stated"
     return Proved("camera", name, CHANGED, far)
 
 

@@ -29,7 +29,7 @@ from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.acquisitions import one_each
 from barpc.pipeline.adjusting import agreeing, scope_of, tied_and_adjusted, with_own_cameras, with_ties
-from barpc.pipeline.calibrate import calibrated, calibrations_of
+from barpc.pipeline.calibrations import calibrated, calibrations_of
 from barpc.pipeline.earlier import Earlier, GrowingRun, added, images_table, join_earlier, movers
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import uuid
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -30,20 +30,15 @@ from rasterio.transform import RPCTransformer
 from barpc.base.errors import OutputError, out_of_memory
 from barpc.base.geodesy import Array, wrap_longitude
 from barpc.cameras import open_camera
-from barpc.fit.points import NEGLIGIBLE_FIT_ERROR, Sample
 from barpc.rasters.raster import GDAL_OPTIONS
 from barpc.rasters.vrt import Named, Vrt, read_vrt, vrt_text
 from barpc.rpcio import Carrier, format_for, read_rpc, sidecars
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
-from barpc.sensor import SensorModel
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import DirectGrid
-from barpc.sensor.geometry import ground_grids
+from barpc.sensor.sampler import NEGLIGIBLE_FIT_ERROR, Projection, Sample, Scattered
 
 READING_TOLERANCE = NEGLIGIBLE_FIT_ERROR  # Largest difference [px] between a file and its model that passes
-
-Projection = Callable[[Array], Array]
-"""Ground points (N, 3) [deg, deg, m] -> image points (N, 2) [px], centre of the first pixel = (0, 0)."""
 
 
 @dataclass(frozen=True)
@@ -66,63 +61,32 @@ class Reading:
         return bool(self.max_error <= READING_TOLERANCE)
 
 
-def control_grid(model: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the ground points (N, 3) over an image and its altitudes, and where `model` sees them (N, 2) [px]."""
-    return _ground_and_image(ground_grids([(model, size, alt_range)])[0])
+def verify(paths: Sequence[Path | str], sample: Sample) -> list[Reading]:
+    """Open the files of one image as their consumers do, and compare their projections with a camera's sample.
 
-
-def _ground_and_image(grid: Array) -> tuple[Array, Array]:
-    return np.ascontiguousarray(grid[:, :3]), grid[:, 3:]
-
-
-def difference(model: SensorModel, other: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> float:
-    """Return the largest distance [px] between two cameras of an image and its altitudes; NaN if blind."""
-    ground, image = control_grid(model, size, alt_range)
-    return _max_difference(other.project, ground, image) if len(ground) else float("nan")
-
-
-def _max_difference(project: Projection, ground: Array, image: Array) -> float:
-    return float(np.linalg.norm(project(ground) - image, axis=1).max())
-
-
-def verify(
-    paths: Sequence[Path | str],
-    model: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    grid: Array | None = None,
-) -> list[Reading]:
-    """Open the files of one image as their consumers do, and compare their projections with the model.
-
-    `model` is the camera that they should hold, over an image of `size` (width, height) [px] and `alt_range` [m above
-    the ellipsoid], `grid` its `ground_grids` where that is known. Returns a reading for each file and each consumer
-    that reads its kind and is installed; OutputError where the model sees no point of its own image.
+    Returns a reading for each file and each consumer that reads its kind and is installed; OutputError where the
+    camera sees no point of its own image.
     """
-    ground, image = control_grid(model, size, alt_range) if grid is None else _ground_and_image(grid)
-    if not len(ground):
+    if not len(sample.ground):
         raise OutputError("hand-off: the model projects no ground point into its own image")
 
     def measured(_: Consumer, read: Projection) -> tuple[float, float]:
-        return _max_difference(read, ground, image), float("nan")
+        return sample.compare(read), float("nan")
 
-    return [reading for path in map(Path, paths) for reading in _consumer_readings(path, _consumers(path), measured)]
+    return [reading for path in map(Path, paths) for reading in _consumer_readings(path, measured)]
 
 
-def verify_grid(path: Path, sample: Sample) -> list[Reading]:
+def verify_grid(path: Path, sample: Scattered) -> list[Reading]:
     """Open a file of more than an RPC as its consumers do, and find its largest error against a model's sample.
 
     It is a localisation grid, a correction grid or a camera state, by the end of its name.
     """
-    model = sample.model
 
     def measured(consumer: Consumer, read: Projection) -> tuple[float, float]:
-        def off(ground: Array, at: Array) -> Array:
-            return (model.project(read(at)) if consumer.locates else read(ground)) - at[:, :2]
+        errors = sample.compare(read, consumer.locates)
+        return errors.far, errors.rms
 
-        errors, largest = sample.sought(off)
-        return float(np.linalg.norm(largest)), float(np.linalg.norm(errors.rmse))
-
-    return _consumer_readings(path, _grid_consumers(path), measured)
+    return _consumer_readings(path, measured)
 
 
 def projection_by(tool: str, path: Path) -> Projection:
@@ -148,21 +112,20 @@ _MACHINE = frozenset(
 
 
 def _consumers(path: Path) -> dict[str, Consumer]:
-    """Return the tools that read a file of an RPC, those that are not installed too; barpc last."""
+    """Return the tools that read a file, those that are not installed too; barpc last."""
+    for end, consumers in _GRIDS.items():
+        if path.name.endswith(end):
+            return consumers
     row = format_for(path)
     return {name: CONSUMERS[name] for name in (*(() if row is None else row.consumers), "barpc")}
 
 
 def _tools_of(path: Path) -> dict[str, bool]:
     """Return the tools besides barpc that read a file, and whether they are installed."""
-    of_grid = path.name.endswith((GRID_SUFFIX, CORRECTION, STATE_END))
-    found = _grid_consumers(path) if of_grid else _consumers(path)
-    return {name: one.installed for name, one in found.items() if one.package != "barpc"}
+    return {name: one.installed for name, one in _consumers(path).items() if one.package != "barpc"}
 
 
-def _consumer_readings(
-    path: Path, consumers: Mapping[str, Consumer], measure: Callable[[Consumer, Projection], tuple[float, float]]
-) -> list[Reading]:
+def _consumer_readings(path: Path, measure: Callable[[Consumer, Projection], tuple[float, float]]) -> list[Reading]:
     """Read a file with all consumers; those that are not barpc get it in a folder of its own.
 
     OutputError where the machine and not the file is to blame; whatever else a reader raises is its finding.
@@ -170,7 +133,7 @@ def _consumer_readings(
     found = []
     with ExitStack() as stack:
         lent = cache(lambda: stack.enter_context(_lent(path)))
-        for name, consumer in consumers.items():
+        for name, consumer in _consumers(path).items():
             if not consumer.installed:
                 continue
             error, rms = float("nan"), float("nan")
@@ -399,9 +362,4 @@ _GRIDS: dict[str, dict[str, Consumer]] = {
     },
     CORRECTION: {"gdal": Consumer("rasterio", _gdal_correction), "barpc": Consumer("barpc", _own_grid)},
     STATE_END: {"barpc": Consumer("barpc", _own_grid)},
-    "": {"gdal": Consumer("rasterio", _gdal_raster), "barpc": CONSUMERS["barpc"]},
 }
-
-
-def _grid_consumers(path: Path) -> dict[str, Consumer]:
-    return next(consumers for end, consumers in _GRIDS.items() if path.name.endswith(end))

@@ -17,7 +17,8 @@ from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, TABLE, Kind, read_head
-from barpc.pointio.gcp_formats import GcpTable, read_geojson, read_tags
+from barpc.pointio.gcp_formats import read_geojson, read_tags
+from barpc.pointio.gcp_tables import GcpTable
 from barpc.pointio.tables import (
     COLUMNS,
     GROUND_SIGMA,

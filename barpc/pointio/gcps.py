@@ -19,7 +19,8 @@ import numpy as np
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, BoolArray, HeightDatum
 from barpc.base.safe_io import TABLE, read_head
-from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, GcpTable, Row, open_gcps
+from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, open_gcps
+from barpc.pointio.gcp_tables import GcpTable, Row
 from barpc.pointio.names import ViewNames
 from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
 from barpc.rasters.crs import crs_of

@@ -22,8 +22,9 @@ from barpc.report.summary import Summary
 from barpc.report.summary.views import COVERAGE_CELLS, ViewEntry
 from barpc.report.summary.words import enu, median, metres
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import image_grid, triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample, image_grid
+from barpc.sensor.triangulation import triangulate
 
 _MOTION_NODES = 3  # along each side of an image: places at which the motion of the ground is measured
 _NO_EFFECT = ("overwrite", "keep_going")  # Options that do not change a finished run
@@ -110,8 +111,8 @@ def _rpc_difference(runs: tuple[FinishedRun, FinishedRun], views: tuple[ViewEntr
     if first is None or second is None:
         return [None, None]
     with np.errstate(all="ignore"):  # where the second has no value there is no difference
-        ground = first.localize(*image_grid(views[0].size, views[0].alt_range_m, (COVERAGE_CELLS, COVERAGE_CELLS)))
-        apart = second.project(ground) - first.project(ground)
+        (grid,) = Sample.grids([(first, views[0].size, views[0].alt_range_m)], (COVERAGE_CELLS, COVERAGE_CELLS))
+        apart = second.project(grid.ground) - grid.image
     apart = apart[np.isfinite(apart).all(axis=1)]
     if not len(apart):
         return [None, None]

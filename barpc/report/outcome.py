@@ -21,8 +21,10 @@ from barpc.fit import RpcFit
 from barpc.report.ranking import SMOOTH_LEFT
 from barpc.scene import BoolArray, Camera, GroundPoints, IntArray, Tracks, View, middle_altitude
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import CameraCenter, Several, Triangulation, triangulate
+from barpc.sensor.centers import CameraCenter
+from barpc.sensor.geometry import Several
 from barpc.sensor.image_corrections import Calibrated, ImageAffine, ImageCorrected
+from barpc.sensor.triangulation import Triangulation, triangulate
 from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.report import FINE_STRUCTURE

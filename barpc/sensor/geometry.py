@@ -1,42 +1,22 @@
-"""Geometry of any sensor model: footprint, lines of sight, view angles, triangulation, camera centre."""
+"""Geometry of any sensor model: footprint, lines of sight, view angles; many cameras in one go."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.errors import RpcError
-from barpc.base.geodesy import (
-    NEWTON_STEPS,
-    Array,
-    BoolArray,
-    IntArray,
-    ecef_from_ground,
-    enu_basis,
-    ground_from_ecef,
-    metres_per_unit,
-    wrap_longitude,
-)
+from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Corrections
-from barpc.sensor.curve import cross
 from barpc.sensor.rpc import RpcStack, localize_stack
 
 if TYPE_CHECKING:
     from barpc.sensor.radar import Radar
 
-CenterMethod = Literal["line", "projective", "nominal", "stated"]
-
-_RAYS = 41  # of a line
 LEAST_RANGE = 100.0  # of altitudes [m] between which a ray is drawn, or that an RPC is made for
-NOMINAL_ALTITUDE = 650e3  # orbit altitude [m] assumed where a model does not tell its own
-GRID_NODES = 11, 5  # of a grid over an image, along its sides and its altitudes
-PLAUSIBLE_ALTITUDE = (380e3, 1000e3)  # a camera centre regressed outside this range [m] is not believed
 
 
 def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
@@ -45,15 +25,6 @@ def image_border(size: tuple[int, int], per_side: int = 8) -> Array:
     t = np.arange(per_side)[:, None] / per_side
     sides = corners[:, None] + t * (np.roll(corners, -1, axis=0) - corners)[:, None]
     return np.asarray(sides.reshape(-1, 2) * size - 0.5)
-
-
-def image_grid(
-    size: tuple[int, int], alt_range: tuple[float, float], nodes: tuple[int, int] = GRID_NODES
-) -> tuple[Array, Array]:
-    """Return the image points (N, 2) [px] and altitudes (N,) [m] of a grid over an image, columns slowest."""
-    col, row = (np.linspace(0, side - 1, nodes[0]) for side in size)
-    grid = np.stack(np.meshgrid(col, row, np.linspace(*alt_range, nodes[1]), indexing="ij"), axis=-1)
-    return grid[..., :2].reshape(-1, 2), grid[..., 2].ravel()
 
 
 def footprint(sensor: SensorModel, size: tuple[int, int], alt: npt.ArrayLike) -> Array:
@@ -119,11 +90,16 @@ def view_angles(sensor: SensorModel, ground: Array) -> tuple[Array, Array]:
     return np.degrees(np.arctan2(np.hypot(east, north), up)), np.degrees(np.arctan2(east, north)) % 360.0
 
 
+def is_radar(sensor: SensorModel) -> TypeGuard[Radar]:
+    """Return whether a model knows where its beam comes from; none is loaded to ask."""
+    return hasattr(sensor, "to_radar")
+
+
 def _to_sensor(sensor: SensorModel, ground: Array) -> Array:
     """Return the east, north, up (..., 3) of the direction to the sensor, of any length."""
     if isinstance(sensor, Several):
         return sensor.each(_to_sensor, ground)
-    if _is_radar(sensor):
+    if is_radar(sensor):
         return np.asarray((enu_basis(ground) @ sensor.to_radar(ground)[..., None])[..., 0])
     return sight_enu(sensor, ground)
 
@@ -211,338 +187,3 @@ class Several:
         out = np.empty_like(found)
         out[..., self._order] = found
         return np.moveaxis(out, -1, 0)
-
-
-def ground_grids(
-    cameras: Sequence[tuple[SensorModel, tuple[int, int], tuple[float, float]]], nodes: tuple[int, int] = GRID_NODES
-) -> list[Array]:
-    """Return ground points over images and their altitudes and where their cameras see them: rows (n, 5) of each.
-
-    Of a grid (`image_grid`) of a camera, an image of its size and its altitudes; without points that it does not see.
-    """
-    grids = [image_grid(size, alt_range, nodes) for _, size, alt_range in cameras]
-    many = Several([model for model, _, _ in cameras], np.repeat(np.arange(len(grids)), nodes[0] ** 2 * nodes[1]))
-    image, alt = map(np.concatenate, zip(*grids, strict=True))
-    ground = many.localize(image, alt)
-    rows = np.hstack([ground, many.project(ground, image)]).reshape(len(grids), -1, 5)
-    return [one[np.isfinite(one[:, :3]).all(axis=1)] for one in rows]
-
-
-@dataclass(frozen=True, eq=False)
-class CameraCenter:
-    """Position of a camera, and how it was found."""
-
-    ecef: Array  # (3,) [m]
-    altitude: float
-    method: CenterMethod  # how it was found: "nominal" where "line" was not plausible, "stated" by a radar
-
-
-def camera_center(
-    sensor: SensorModel,
-    size: tuple[int, int],
-    alt_range: tuple[float, float],
-    how: Literal["line", "projective"] = "line",
-) -> CameraCenter:
-    """Estimate the camera centre by regression of a sensor model's rays.
-
-    One image line of a pushbroom camera IS a perspective camera, so its rays meet in one point, found by least
-    squares. A point outside `PLAUSIBLE_ALTITUDE` is replaced by one at `NOMINAL_ALTITUDE` on the central ray, and says
-    so in its ``method``. A projective camera regressed over the whole image, as in the paper, stands at about twice
-    the distance: the image is perspective across the track and affine along it. A radar states where it is.
-
-    Parameters
-    ----------
-    size : (width, height) [px]
-    alt_range : (low, high), altitudes [m] between which rays are drawn
-    how : the rays of the middle line, or a projective camera over image and altitudes
-
-    Raises
-    ------
-    RpcError
-        The model cannot be localised over its own image.
-    """
-    return camera_centers([sensor], [size], [alt_range], how)[0]
-
-
-def camera_centers(
-    sensors: Sequence[SensorModel],
-    sizes: Sequence[tuple[int, int]],
-    alt_ranges: Sequence[tuple[float, float]],
-    how: Literal["line", "projective"] = "line",
-) -> list[CameraCenter]:
-    """Estimate the centres of cameras: `camera_center` of each, in one go."""
-    number = [i for i, sensor in enumerate(sensors) if not _is_radar(sensor)]
-    ecef = np.full((len(sensors), 3), np.nan)
-    if how == "line":
-        some = [sensors[i] for i in number], [sizes[i] for i in number], [alt_ranges[i] for i in number]
-        ecef[number] = _centers_of_lines(*some)
-    else:
-        for i in number:
-            ecef[i] = _center_projective(sensors[i], sizes[i], alt_ranges[i])
-    altitude = ground_from_ecef(ecef)[:, 2].tolist()
-    found = []
-    for i, (sensor, size, alt_range) in enumerate(zip(sensors, sizes, alt_ranges, strict=True)):
-        low, high = PLAUSIBLE_ALTITUDE if how == "line" else (alt_range[1], np.inf)
-        if _is_radar(sensor):
-            found.append(_center_stated(sensor, size, alt_range))
-        elif low <= altitude[i] <= high:
-            found.append(CameraCenter(ecef[i], altitude[i], how))
-        else:
-            found.append(_center_nominal(sensor, size, alt_range, altitude[i]))
-    return found
-
-
-def _is_radar(sensor: SensorModel) -> TypeGuard[Radar]:
-    """Return whether a model knows where its beam comes from; none is loaded to ask."""
-    return hasattr(sensor, "to_radar")
-
-
-def _center_stated(sensor: Radar, size: tuple[int, int], alt_range: tuple[float, float]) -> CameraCenter:
-    point = sensor.localize((np.array(size) - 1) / 2.0, np.array(np.mean(alt_range)))
-    ecef = ecef_from_ground(point) + sensor.to_radar(point)
-    if not np.isfinite(ecef).all():
-        raise RpcError("camera centre: the model has no ground point at its image's centre")
-    return CameraCenter(ecef, float(ground_from_ecef(ecef)[2]), "stated")
-
-
-def _centers_of_lines(
-    sensors: Sequence[SensorModel], sizes: Sequence[tuple[int, int]], alt_ranges: Sequence[tuple[float, float]]
-) -> Array:
-    """Return the points (N, 3) nearest to the rays of every camera's middle line; NaN where one has none."""
-    side, ends = np.array(sizes, dtype=np.float64).reshape(-1, 2) - 1.0, np.array(alt_ranges).reshape(-1, 2)
-    n, m = len(side), _RAYS
-    image = np.empty((n, 2, m, 2))
-    image[..., 0] = side[:, :1, None] * np.linspace(0.0, 1.0, m)
-    image[..., 1] = side[:, 1:, None] / 2.0
-    alt = np.repeat(np.column_stack([ends[:, 0], np.maximum(ends[:, 1], ends[:, 0] + LEAST_RANGE)]), m)
-    ground = localize_stack(sensors, image.reshape(-1, 2), alt, 2 * m * np.arange(n + 1))
-    origin, end = ecef_from_ground(ground).reshape(n, 2, m, 3).swapaxes(0, 1)
-    direction = end - origin
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    shift = origin.mean(axis=1)
-    local = origin - shift[:, None]
-    normal = m * np.eye(3) - np.swapaxes(direction, 1, 2) @ direction
-    along = (direction * local).sum(axis=2, keepdims=True)
-    rhs = (local - along * direction).sum(axis=1)
-    seen = np.asarray(np.isfinite(normal).all(axis=(1, 2)))
-    inverse = np.linalg.pinv(np.where(seen[:, None, None], normal, 0.0), rcond=1e-15)
-    found = (inverse @ rhs[..., None])[..., 0] + shift
-    return np.where(seen[:, None], found, np.nan)
-
-
-def _center_projective(sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float]) -> Array:
-    """Return the centre (3,) of the matrix (3, 4) from ground to image points: its null space (Hartley, DLT)."""
-    image, alt = image_grid(size, alt_range)
-    ecef = ecef_from_ground(sensor.localize(image, alt))
-    if not np.isfinite(ecef).all():
-        return np.full(3, np.nan)
-    middle, spread = ecef.mean(axis=0), float(ecef.std())
-    world = np.column_stack([(ecef - middle) / spread, np.ones(len(ecef))])
-    col, row = ((image - image.mean(axis=0)) / image.std()).T
-    zero = np.zeros_like(world)
-    system = np.concatenate(
-        [np.hstack([world, zero, -col[:, None] * world]), np.hstack([zero, world, -row[:, None] * world])]
-    )
-    matrix = np.linalg.svd(np.linalg.qr(system)[1])[2][-1].reshape(3, 4)
-    return np.asarray(middle - spread * np.linalg.solve(matrix[:, :3], matrix[:, 3]))
-
-
-def _center_nominal(
-    sensor: SensorModel, size: tuple[int, int], alt_range: tuple[float, float], regressed: float
-) -> CameraCenter:
-    """Return the centre on the central ray at the nominal altitude, where the one regressed is at none plausible."""
-    middle = sensor.localize(np.array(size) / 2.0, np.array(alt_range[0]))
-    if not np.isfinite(regressed) and not np.isfinite(middle).all():
-        raise RpcError("camera centre: the model has no ground point at its image's centre")
-    image = np.array([(size[0] - 1) / 2, (size[1] - 1) / 2])
-    origin, direction = lines_of_sight(sensor, image, alt_range)
-    cosine = max(float(direction @ enu_basis(ground_from_ecef(origin))[2]), 0.3)
-    point = origin
-    for _ in range(6):  # the Earth curves away: a few steps along the ray reach the altitude
-        point = point + (NOMINAL_ALTITUDE - float(ground_from_ecef(point)[2])) / cosine * direction
-    return CameraCenter(np.asarray(point), float(ground_from_ecef(point)[2]), "nominal")
-
-
-def epipolar_offset(
-    sensor_a: SensorModel,
-    sensor_b: SensorModel,
-    image_a: Array,
-    image_b: Array,
-    alt: float | npt.ArrayLike = 0.0,
-    steps: int = 6,
-) -> tuple[Array, Array]:
-    """Return the distances of matches from their epipolar lines: the part of a mismatch that no altitude explains.
-
-    The altitude that brings the ray of a nearest to the point in b is found by Gauss-Newton along the
-    ray; the signed distance that is left, across the epipolar line, is the offset.
-
-    Parameters
-    ----------
-    image_a, image_b : (N, 2), col, row [px] of the matches
-    alt : float or (N,), first guess of the altitude [m]
-
-    Returns
-    -------
-    offset : (N,)
-        Signed distance in image b [px], positive to the right of the direction of rising altitude (columns to the
-        right, rows down: clockwise); NaN where the rays are parallel.
-    alt : (N,), the altitudes [m]
-    """
-    alt = np.array(np.broadcast_to(np.asarray(alt, dtype=np.float64), len(image_a)))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ground = sensor_a.localize(image_a, alt)
-        for step in range(steps + 1):
-            image, jacobian = sensor_a.project_jacobian(ground)
-            (p, q), (r, s), (u, v) = np.moveaxis(jacobian, 0, -1).swapaxes(0, 1)  # by lon, lat, alt
-            col, row = (image_a - image).T  # what is left of a step along the ray, which bends
-            det = p * s - q * r
-            ground[:, :2] += (np.stack([s * col - r * row, p * row - q * col]) / det).T
-            rise = np.stack([r * v - s * u, q * u - p * v, det]).T / det[:, None]  # ground units a metre of altitude
-            image, jacobian = sensor_b.project_jacobian(ground)
-            along = (jacobian @ rise[..., None])[..., 0]
-            miss = image_b - image
-            length2 = (along * along).sum(axis=1)
-            if step < steps:
-                more = (miss * along).sum(axis=1) / length2
-                alt += more
-                ground += rise * more[:, None]
-        offset = (along[:, 0] * miss[:, 1] - along[:, 1] * miss[:, 0]) / np.sqrt(length2)
-    return offset, alt
-
-
-_LAST_STEP = 1e-3  # m: intersections are quadratic, so that the next would be below 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Triangulation:
-    """Ground points intersected from tracks."""
-
-    points: Array  # (P, 3): ECEF [m]; NaN where fewer than two rays meet, parallel ones, or outside a model
-    residuals: Array  # (K, 2): projected - observed [px]; NaN for the rows of such points
-    ok: BoolArray  # (P,): whether the point is usable
-
-
-def triangulate(
-    sensors: Sequence[SensorModel],
-    view: npt.ArrayLike,
-    point: npt.ArrayLike,
-    xy: Array,
-    sigma: Array | None = None,
-    *,
-    alt: float | npt.ArrayLike = 0.0,
-    steps: int = NEWTON_STEPS,
-) -> Triangulation:
-    """Intersect the rays of tracks: batched Gauss-Newton on the reprojection error.
-
-    Parameters
-    ----------
-    sensors : sequence of SensorModel, one a view
-    view, point : (K,), view and track of each observation
-    xy : (K, 2), col, row [px]
-    sigma : (K,), optional, standard deviations [px]; equal if not given
-    alt : float or (P,), altitude [m] that the first guess is localised at
-    """
-    view, point = np.asarray(view, dtype=np.int64), np.asarray(point, dtype=np.int64)
-    xy = np.asarray(xy, dtype=np.float64)
-    num = int(point.max()) + 1 if len(point) else 0
-    if not num:
-        return Triangulation(np.empty((0, 3)), np.empty((0, 2)), np.empty(0, dtype=bool))
-    order = np.argsort(view, kind="stable")  # so that the rows of a view are a slice
-    at, goal = point[order], xy[order]
-    stack, bounds = RpcStack(sensors), np.searchsorted(view[order], np.arange(len(sensors) + 1))
-    weight = np.ones(len(xy)) if sigma is None else 1.0 / np.asarray(sigma, dtype=np.float64)[order]
-    left = np.empty((len(xy), 2))
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        ground, ok = _intersect((stack, bounds), at, goal, weight, np.broadcast_to(alt, num), steps)
-        left[order] = stack.seen(ground[at], bounds).T - goal
-    ok &= np.bincount(point, minlength=num) > 0
-    ok[point[~np.isfinite(left).all(axis=1)]] = False
-    ground[~ok] = np.nan
-    left[~ok[point]] = np.nan
-    return Triangulation(ecef_from_ground(ground), left, ok)
-
-
-def _intersect(
-    cameras: tuple[RpcStack, IntArray], point: IntArray, xy: Array, weight: Array, alt: Array, steps: int
-) -> tuple[Array, BoolArray]:
-    """Return ground points (P, 3) by Gauss-Newton from where a view sees a track at `alt`, and if there are any.
-
-    `cameras`: them and which rows are whose.
-    """
-    stack, bounds = cameras
-    ground = np.full((len(alt), 3), np.nan)
-    untried = np.arange(len(point))
-    while len(untried):
-        rows = np.sort(untried[np.unique(point[untried], return_index=True)[1]])
-        ground[point[rows]] = stack.localize(xy[rows], alt[point[rows]], np.searchsorted(rows, bounds)).T
-        untried = np.setdiff1d(untried, rows, assume_unique=True)
-        untried = untried[np.isnan(ground[point[untried], 0])]
-    ok, of_points = np.ones(len(ground), dtype=bool), partial(np.bincount, point, minlength=len(ground))
-    for _ in range(steps):
-        scale = metres_per_unit(ground)
-        image, jacobian = stack.seen_jacobian(ground[point], bounds)
-        residual = (image - xy.T) * weight
-        jacobian *= weight
-        step, ok = _normal_step(jacobian.swapaxes(0, 1), residual, scale.T, of_points)
-        ground -= step.T / scale
-        if not np.abs(step[:, ok]).max(initial=0.0) > _LAST_STEP:
-            break
-    return ground, ok
-
-
-def intersect_pair(pair: Sequence[SensorModel], image: Sequence[Array], alt: Array) -> Array:
-    """Return the ground points (n, 3) [deg, deg, m] of matches of two images, as `triangulate` finds their tracks.
-
-    Parameters
-    ----------
-    pair : two SensorModels
-    image : two arrays (n, 2), col, row [px] of the matches
-    alt : (n,), altitude [m] that the first guess is localised at
-
-    A point is NaN where the rays do not meet, or are parallel.
-    """
-    goal = np.concatenate([one.T for one in image])
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        ground = pair[0].localize(image[0], alt)
-        lost = np.isnan(ground[:, 0])
-        ground[lost] = pair[1].localize(image[1][lost], alt[lost])
-        for _ in range(NEWTON_STEPS):
-            scale = metres_per_unit(ground)
-            seen, slopes = zip(*(sensor.project_jacobian(ground) for sensor in pair), strict=True)
-            residual = np.concatenate([one.T for one in seen]) - goal
-            jacobian = np.concatenate([np.moveaxis(one, 0, -1) for one in slopes]).swapaxes(0, 1)
-            step, ok = _normal_step(jacobian, residual, scale.T)
-            ground -= step.T / scale
-            if not np.abs(step[:, ok]).max(initial=0.0) > _LAST_STEP:
-                break
-    ground[~ok | ~np.isfinite(residual).all(axis=0)] = np.nan
-    return ground
-
-
-def _normal_step(
-    jacobian: Array, residual: Array, scale: Array, of_points: Callable[[Array], Any] = np.asarray
-) -> tuple[Array, BoolArray]:
-    """Return Gauss-Newton steps (3, num) [m] and for which points the rays determine one.
-
-    `jacobian` (3, m, K) and `residual` (m, K) are weighted; `scale` (3, num): metres of a unit of lon, lat, alt;
-    `of_points` sums (K,) numbers of observations by point: each of m is one in one image, or all that there are.
-    """
-    num = scale.shape[1]
-
-    def total(u: Array, v: Array) -> Array:
-        weights = u[0] * v[0]
-        for one, other in zip(u[1:], v[1:], strict=True):
-            weights += one * other
-        return np.asarray(of_points(weights), dtype=np.float64)
-
-    normal = np.empty((3, 3, num))
-    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
-        normal[i, j] = normal[j, i] = total(jacobian[i], jacobian[j]) / (scale[i] * scale[j])
-    right = np.stack([total(by_axis, residual) / metres for by_axis, metres in zip(jacobian, scale, strict=True)])
-    cofactors = np.stack([cross(normal[i - 2], normal[i - 1]) for i in range(3)])  # Cramer: a step need not be exact
-    det, mean = (normal[0] * cofactors[0]).sum(axis=0), (normal[0, 0] + normal[1, 1] + normal[2, 2]) / 3
-    # parallel rays: the determinant against the trace; 1e-10 is 0.0006 degrees
-    ok = np.isfinite(det) & (det > 1e-10 * mean**3)
-    step = (cofactors * right).sum(axis=1) / det
-    step[:, ~ok] = 0.0
-    return step, ok

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from barpc.tie.matchers.report import PairReport
     from barpc.tie.pairing.area import Area, read_area
     from barpc.tie.pairing.overlaps import Pair, Scope
-    from barpc.tie.patches.register import refine
+    from barpc.tie.patches.links import refine
     from barpc.tie.reference import ReferenceControl
     from barpc.tie.tracks import TieResult, find_tracks, link, thin
 
@@ -47,7 +47,7 @@ __getattr__ = used_later(
         "PairReport": "barpc.tie.matchers.report",
         **dict.fromkeys(("Area", "read_area"), "barpc.tie.pairing.area"),
         **dict.fromkeys(("Pair", "Scope"), "barpc.tie.pairing.overlaps"),
-        "refine": "barpc.tie.patches.register",
+        "refine": "barpc.tie.patches.links",
         "ReferenceControl": "barpc.tie.reference",
         **dict.fromkeys(("TieResult", "find_tracks", "link", "thin"), "barpc.tie.tracks"),
     },

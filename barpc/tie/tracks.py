@@ -16,7 +16,7 @@ from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, kd_tree
 from barpc.base.tasks import Progress, Work, store_of
 from barpc.scene import BoolArray, IntArray, Tracks, View, connected_labels, middle_altitude, row_pairs
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.tie.detail import Seen, seen_detail
 from barpc.tie.matchers.features import KeypointFiles, locate, worth_a_first_look
 from barpc.tie.matchers.given import GivenMatches, beside_given, verify_given
@@ -40,8 +40,8 @@ from barpc.tie.pairing.overlaps import (
     several_dates,
 )
 from barpc.tie.pairing.resolution import Looks, finer
+from barpc.tie.patches.links import refine
 from barpc.tie.patches.oriented import MAX_PATCH_SHIFT
-from barpc.tie.patches.register import refine
 from barpc.tie.pixels import sample_stretch
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ from barpc.base.tasks import Progress
 from barpc.base.verb_options import ConvertOptions
 from barpc.cameras import ImageLike, open_camera
 from barpc.fit import FitOptions
-from barpc.fit.points import Sample, widened
+from barpc.fit.points import widened
 from barpc.pipeline.verify_outputs import Reading, unverified, verify, verify_grid
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster
@@ -45,6 +45,7 @@ from barpc.scene import Camera
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.geometry import image_border
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample, Scattered
 from barpc.tie import read_area
 from barpc.verbs.images import every, place_of
 from barpc.verbs.moving import moved, refitted
@@ -215,7 +216,7 @@ def _as_grid(camera: Camera, target: str, overwrite: bool) -> Converted:
     """Write a camera as a localisation grid, with the error of linear interpolation in it."""
     alts = widened(camera.alt_range)
     write_grid(DirectGrid.of(camera.model, camera.extent, alts), target, overwrite=overwrite)
-    readings = verify_grid(Path(target), Sample.of(camera.model, camera.extent, alts))
+    readings = verify_grid(Path(target), Scattered.over(camera.model, camera.extent, alts))
     off = [f"{one.consumer}: {one.note or one.max_error}" for one in readings if not one.max_error <= LINEAR]
     reasons = [f"{target} does not hold the camera to {LINEAR:g} px", *off] if off else []
     return Converted((Path(target),), tuple(readings), reasons=tuple(reasons))
@@ -338,7 +339,7 @@ def _hand_off(
                     rpc = write_crop(rpc, path, partial, window, overwrite=True)
                 else:
                     write_camera(rpc, partial, path, place=place, overwrite=True, size=size)
-        readings += verify(written, rpc, size, camera.alt_range)
+        readings += verify(written, Sample.grid(rpc, size, camera.alt_range))
         if window is None:
             reasons += _shadow_reasons(path, written)
             notes += unverified(written) if not paths else []

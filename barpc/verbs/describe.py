@@ -15,6 +15,7 @@ from barpc.cameras import ImageLike, open_camera
 from barpc.fit.poles import smallest_denominator
 from barpc.scene import Camera
 from barpc.sensor import geometry
+from barpc.sensor.centers import camera_center
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, exchanged, ground_at, terrain_of
@@ -156,7 +157,7 @@ def _geometry(camera: Camera, size: tuple[int, int], alt: float, at: tuple[float
         return report | {"problem": "no ground point at the image's centre"}
     incidence, azimuth = geometry.view_angles(model, center if at is None else np.array(at))
     metres, _ = geometry.ground_sample_distance(model, center)
-    stand = geometry.camera_center(model, size, camera.alt_range)
+    stand = camera_center(model, size, camera.alt_range)
     return report | {
         "incidence_deg": float(incidence),
         "azimuth_deg": float(azimuth),

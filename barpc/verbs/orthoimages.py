@@ -35,7 +35,8 @@ from barpc.rasters.vertical import WORDS, geoid_places
 from barpc.rasters.vrt import BLOCK_SIZE
 from barpc.report.finished import FinishedRun
 from barpc.scene import Camera
-from barpc.sensor.geometry import footprint, ground_sample_distance, image_grid
+from barpc.sensor.geometry import footprint, ground_sample_distance
+from barpc.sensor.sampler import image_grid
 from barpc.verbs.images import every, one_or_many, place_of
 from barpc.verbs.points import altitude_of, terrain_of
 from barpc.verbs.runs import run_folder

@@ -17,7 +17,7 @@ from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl
 from barpc.cameras import ImageLike, open_camera
 from barpc.scene import BoolArray, Camera
-from barpc.sensor import SensorModel, geometry
+from barpc.sensor import SensorModel, triangulation
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import one_or_many, place_of
 
@@ -159,7 +159,7 @@ def triangulate(images: Sequence[ImageLike | SensorModel], at: npt.ArrayLike) ->
     lead, xy = xy.shape[:-2], xy.reshape(-1, len(cameras), 2)
     point, view = np.nonzero(np.isfinite(xy).all(axis=2))
     models = [camera.model for camera in cameras]
-    found = geometry.triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
+    found = triangulation.triangulate(models, view, point, xy[point, view], alt=cameras[0].altitude)
     ground, error, count = np.full((len(xy), 3), np.nan), np.full(len(xy), np.nan), len(found.points)
     square = np.bincount(point, (found.residuals**2).sum(axis=1), minlength=count)
     ground[:count] = ground_from_ecef(found.points)

@@ -17,7 +17,7 @@ import numpy as np
 from barpc import RPC, read_rpc
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.geodesy import ecef_from_ground, enu_basis
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 
 HERE = Path(__file__).resolve().parent

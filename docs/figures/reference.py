@@ -20,7 +20,7 @@ sys.path.insert(0, str(HERE.parents[1]))
 from barpc.base.options import RunOptions  # noqa: E402
 from barpc.pipeline import adjust  # noqa: E402
 from barpc.rasters.dem import Dem  # noqa: E402
-from barpc.tie.patches.channels import Patch, Sheet, _picture  # noqa: E402
+from barpc.tie.patches.channels import Patch, Sheet, picture  # noqa: E402
 from tests.scenes import ImageOptions, Scene, write_scene  # noqa: E402
 from tests.scenes.season import other_season, write_dem, write_reference  # noqa: E402
 
@@ -51,9 +51,9 @@ def main() -> None:
         corner = middle[:2] + np.array([-0.5, 0.5]) * SIDE * 0.5 / np.array([78e3, 111e3])
         patch = Patch.on(terrain, corner, 0.5, (SIDE, SIDE), np.zeros(2))
         under = Sheet.read(str(sheet))
-        shown = [_picture(str(sheet), under.bands, under.size, under.image(patch.nodes()), patch.shape)[0]]
+        shown = [picture(str(sheet), under.bands, under.size, under.image(patch.nodes()), patch.shape)[0]]
         seen = [patch.image(view) for view in (delivered, adjusted)]
-        shown += [_picture(delivered.path, (1,), delivered.size, at, patch.shape)[0] for at in seen]
+        shown += [picture(delivered.path, (1,), delivered.size, at, patch.shape)[0] for at in seen]
     first, *others = map(grey, shown)
     rows, cols = np.indices(first.shape) // TILE
     panels = [first, *(np.where((rows + cols) % 2 == 0, first, other) for other in others)]

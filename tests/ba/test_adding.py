@@ -13,21 +13,11 @@ from barpc.ba.parameters.priors import EarlierScene
 from barpc.ba.result import moved_px
 from barpc.ba.solving.linear import Blocks
 from barpc.base.errors import DisconnectedError, InputError, TiePointError
-from barpc.base.geodesy import Array, ecef_from_ground
-from barpc.scene import IntArray, Tracks, View
+from barpc.base.geodesy import ecef_from_ground
+from barpc.scene import IntArray
 from barpc.sensor.geometry import ground_sample_distance
 from barpc.simulate import SimulatedBlock, simulate_block
-
-
-def part(made: SimulatedBlock, chosen: Any, new: Any = None) -> tuple[list[View], Tracks]:
-    """Some views, ascending, and their tie points; those that `new` ones observe only."""
-    chosen = np.asarray(chosen)
-    tracks = made.tracks.select(np.isin(made.tracks.view, chosen))
-    if new is not None:
-        seen = np.bincount(tracks.point, np.isin(tracks.view, new), minlength=tracks.num_points) > 0
-        tracks = tracks.select(seen[tracks.point])
-    view = np.searchsorted(chosen, tracks.view)
-    return [made.views[i] for i in chosen], Tracks(view, tracks.point, tracks.xy, tracks.sigma)
+from tests.ba.grown import corners, part
 
 
 def met(made: SimulatedBlock, have: IntArray, new: IntArray) -> IntArray:
@@ -39,12 +29,6 @@ def met(made: SimulatedBlock, have: IntArray, new: IntArray) -> IntArray:
 def add(made: SimulatedBlock, have: IntArray, new: IntArray, prior: BlockPrior, **given: Any) -> Adjustment:
     views, tracks = part(made, met(made, have, new), new)
     return adjust_tracks(views, tracks, prior=prior, known=np.ones(len(tracks), dtype=bool), **given)
-
-
-def corners(view: View) -> Array:
-    right, low = view.size[0] - 1.0, view.size[1] - 1.0
-    at = np.array([[0.0, 0.0], [right, 0.0], [right, low], [0.0, low]])
-    return np.concatenate([view.sensor.localize(at, np.full(4, alt)) for alt in view.alt_range])
 
 
 def random_prior(count: int, size: int = 3, less: int = 0) -> BlockPrior:

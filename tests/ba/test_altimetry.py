@@ -30,6 +30,7 @@ from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.scene import Altimetry, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
+from tests.everywhere import tied
 from tests.lanes import rest_slow
 
 SAMPLES = Path(__file__).parents[2] / "data_samples"
@@ -221,8 +222,7 @@ def scene() -> tuple[list[View], Tracks, np.ndarray]:
         seen = exact.project(true) + rng.normal(0, 0.1, (len(true), 2))
         rows.append(seen)
         views.append(View(f"v{number}", "", (1000, 1000), camera.model, camera.alt_range))
-    point, view = np.repeat(np.arange(900), 3), np.tile(np.arange(3), 900)
-    return views, Tracks(view, point, np.stack(rows, axis=1).reshape(-1, 2), np.full(2700, 0.1)), true
+    return views, tied(np.stack(rows, axis=1), 0.1), true
 
 
 @pytest.fixture(scope="module")

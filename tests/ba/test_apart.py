@@ -18,8 +18,8 @@ from barpc.ba.select.parts import Parts
 from barpc.base.errors import AdjustError
 from barpc.base.statistics import FEW
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.worlds import judge
 from benchmarks.worlds_families import World, make

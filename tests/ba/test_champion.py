@@ -15,7 +15,7 @@ from barpc.ba.select import champion, models
 from barpc.ba.select.champion import Bands, compared, is_closer
 from barpc.base.statistics import BANDS
 from barpc.scene import Tracks
-from barpc.sensor.geometry import epipolar_offset
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.simulate import simulate_block
 
 

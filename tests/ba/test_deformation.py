@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio import Affine
 
 from barpc import adjust, open_camera
@@ -22,6 +21,7 @@ from barpc.scene import GroundPoints, Terrain, Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block
 from tests.costs import once
+from tests.geotiffs import write_image
 
 LON, LAT, NOISE, SIZE = 5.4, 43.3, 0.05, (1200, 1200)
 UNIT = metres_per_unit(np.array([[LON, LAT, 200.0]]))[0, :2]
@@ -138,9 +138,8 @@ def test_a_drift_that_heights_alone_ask_for_is_held_to_what_tie_points_show(tmp_
     """A pair sees nothing of a drift about its base: a flat DEM would deform images of hills by 130 px, 229 sigma."""
     pair, dem = sorted(SAMPLES.glob("view_0[01].tif")), tmp_path / "flat.tif"
     lon, lat = open_camera(pair[0]).model.localize(np.array([[500.0, 500.0]]), np.array([130.0]))[0, :2]
-    profile = {"driver": "GTiff", "width": 60, "height": 60, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(dem, "w", **profile, transform=Affine(5e-4, 0.0, lon - 0.015, 0.0, -5e-4, lat + 0.015)) as file:
-        file.write(np.full((60, 60), 130.0, dtype=np.float32), 1)
+    place = Affine(5e-4, 0.0, lon - 0.015, 0.0, -5e-4, lat + 0.015)
+    write_image(dem, np.full((60, 60), 130.0, dtype=np.float32), transform=place, crs="EPSG:4326")
     found = adjust(pair, dem=dem, geoid="none", out_dir=tmp_path / "out").adjustment
     assert found is not None
     assert found.deformed is not None

@@ -27,7 +27,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen

@@ -12,8 +12,8 @@ from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.measures.views import _shared_errors, moved_in_space
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import intersect_pair
 from barpc.sensor.image_corrections import ColumnSpline
+from barpc.sensor.triangulation import intersect_pair
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.calibrate import PERFECT, Scene, Sensor, bent_as_said, crossing, in_track, scene
 from tests.ba.conftest import as_stated, centers_of, least_squares

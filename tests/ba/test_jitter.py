@@ -13,8 +13,8 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.result import block_prior
 from barpc.base.errors import InputError
 from barpc.fit import fit_rpc
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import Splined
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills

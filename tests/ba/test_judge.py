@@ -10,8 +10,8 @@ import pytest
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.scene import Tracks
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import Splined
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.costs import once
 from tests.lanes import rest_slow

@@ -20,8 +20,8 @@ from barpc.ba.solving.structure import make_structure
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import as_stated, centers_of, solve
 from tests.constants import chosen

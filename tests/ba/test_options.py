@@ -20,7 +20,7 @@ from barpc.ba.select import models
 from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import Tracks
-from barpc.sensor.geometry import camera_center
+from barpc.sensor.centers import camera_center
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import as_stated, centers_of
 from tests.constants import CONSTANTS, chosen

@@ -16,7 +16,7 @@ from barpc.fit import fit_rpc
 from barpc.report import Run, summarize
 from barpc.report.records import json_form
 from barpc.scene import GroundPoints, Tracks
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of
 from tests.lanes import rest_slow

@@ -19,8 +19,9 @@ from barpc.pointio.gcps import read_gcps
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View
-from barpc.sensor.geometry import epipolar_offset, triangulate
 from barpc.sensor.rpc import altitude_range
+from barpc.sensor.triangulation import epipolar_offset, triangulate
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 
 TRIPLET = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]
@@ -167,8 +168,7 @@ def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data
     if not with_geoid:
         with rasterio.open(path) as tile:
             profile, heights = tile.profile | {"driver": "GTiff"}, tile.read()
-        with rasterio.open(path := tmp_path / "unnamed.tif", "w", **profile) as out:
-            out.write(heights)
+        path = write_image(tmp_path / "unnamed.tif", heights, **profile)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BarpcWarning)
         dem = Dem.open(path, shared_data / "dem/egm96_15.gtx" if with_geoid else None)

@@ -15,7 +15,7 @@ from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePo
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, solve
 from tests.constants import chosen

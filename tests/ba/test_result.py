@@ -16,7 +16,7 @@ from barpc.ba.robust import rounds
 from barpc.ba.robust.variances import Variances
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import enu_basis, ground_from_ecef
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import solve
 from tests.constants import Sized

@@ -12,9 +12,11 @@ from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres
 from barpc.fit import fit_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor import SensorModel
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look, fly
+from tests.everywhere import rows_of
 from tests.sensor.s1_product import Product
 
 SIZE = (20000, 19000)
@@ -58,7 +60,7 @@ def scene() -> Scene:
     ground, check = (target + rng.uniform(-1, 1, (n, 3)) * spread for n in (300, 200))
     xy = np.stack([camera.project(ground) for camera in exact], axis=1)
     xy += rng.normal(size=xy.shape) * SIGMA[:, None]
-    tracks = Tracks(np.tile(np.arange(3), 300), np.repeat(np.arange(300), 3), xy.reshape(-1, 2), np.tile(SIGMA, 300))
+    tracks = Tracks(*rows_of(xy), np.tile(SIGMA, 300))
     return Scene(tuple(views), tuple(exact), np.array([*centers, middle]), tracks, ground, check)
 
 
@@ -99,8 +101,8 @@ def test_held_out_points_are_seen_where_the_exact_cameras_see_them_once_the_plac
     options = AdjustOptions(fixed=("radar",), noise_floor=1e-9)
     result = adjust_tracks(scene.views, scene.tracks, options, centers=scene.centers)
     image = np.stack([camera.project(scene.check) for camera in scene.exact], axis=1)
-    view, point = np.tile(np.arange(3), 200), np.repeat(np.arange(200), 3)
+    view, *seen = rows_of(image)
     for cameras, low, high in ((result.sensors, 0.0, 0.1), ([v.sensor for v in scene.views], 1.0, 100.0)):
-        residuals = triangulate(cameras, view, point, image.reshape(-1, 2)).residuals
+        residuals = triangulate(cameras, view, *seen).residuals
         optical = residuals[view < 2]
         assert low <= np.sqrt((optical**2).sum(axis=1).mean()) <= high

@@ -18,6 +18,7 @@ from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import Look, fly
 from tests.costs import once
+from tests.everywhere import tied
 
 ATTITUDE, POSITION, NOISE, SIZE = 5e-6, 2.0, 0.3, (10_000, 10_000)
 TARGET = np.array([5.5, 44.5, 900.0])
@@ -47,8 +48,7 @@ def pair(angle: float, seed: int, num: int = 1200) -> tuple[tuple[View, ...], Tr
     lon, lat = TARGET[:2, None] + rng.uniform(-0.025, 0.025, (2, num))
     ground = np.column_stack([lon, lat, relief(lon, lat)])
     xy = np.stack([camera.project(ground) + rng.normal(0, NOISE, (num, 2)) for camera in true], axis=1)
-    tracks = Tracks(np.tile([0, 1], num), np.repeat(np.arange(num), 2), xy.reshape(-1, 2), np.full(2 * num, NOISE))
-    return tuple(views), tracks, ground
+    return tuple(views), tied(xy, NOISE), ground
 
 
 def height(angle: float, seed: int, **options: float) -> tuple[float, float, Adjustment]:

@@ -16,7 +16,8 @@ from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.scene import GroundPoints
-from barpc.sensor.geometry import sight_enu, triangulate
+from barpc.sensor.geometry import sight_enu
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.referee import cases, judge, make
 from tests import distributions as stats

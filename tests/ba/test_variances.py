@@ -14,7 +14,8 @@ from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import CameraPrior, prior_sigmas
 from barpc.ba.parameters.unknowns import Unknowns
-from barpc.ba.robust.variances import PriorTest, QuadraticProblem, Variances, same_prior
+from barpc.ba.robust.posterior import QuadraticProblem
+from barpc.ba.robust.variances import PriorTest, Variances, same_prior
 from barpc.ba.solving.solve import State, minimise
 from barpc.base.errors import BarpcWarning
 from barpc.base.geodesy import ecef_from_ground

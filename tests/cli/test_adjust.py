@@ -14,6 +14,7 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
+from tests.geotiffs import write_image
 from tests.reliability.conftest import barpc as command
 from tests.reliability.trials import SAMPLES as VIEWS
 from tests.reliability.trials import SIDE
@@ -43,18 +44,8 @@ def crop(source, target, size=SIDE, *, dtype=None, count=1, change=None, rpc=Tru
     camera.line_off -= start
     if change is not None:
         pixels = change(pixels)
-    dtype = dtype or "uint16"
-    profile = {
-        "driver": "GTiff",
-        "width": pixels.shape[1],
-        "height": pixels.shape[0],
-        "count": count,
-        "dtype": dtype,
-    }
-    with rasterio.open(target, "w", **profile, rpcs=camera if rpc else None) as out:
-        for band in range(count):
-            out.write((pixels if band == 0 else np.zeros_like(pixels)).astype(dtype), band + 1)
-    return target
+    bands = np.stack([pixels] + [np.zeros_like(pixels)] * (count - 1)).astype(dtype or "uint16")
+    return write_image(target, bands, rpcs=camera if rpc else None)
 
 
 @pytest.fixture(scope="module")
@@ -207,8 +198,7 @@ def test_images_that_do_not_overlap(crops, tmp_path):
     with rasterio.open(crops[1]) as image:
         pixels, camera = image.read(), image.rpcs
     camera.long_off += 1.0
-    with rasterio.open(far, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16", rpcs=camera) as out:
-        out.write(pixels)
+    write_image(far, pixels, rpcs=camera)
     result = barpc("adjust", crops[0], far, "-o", tmp_path / "o")
     assert_refused(*result, tmp_path / "o", "view_00", "far", "overlap")
 

@@ -17,10 +17,10 @@ from barpc.base.errors import InputError, OutputError, Remark, UsageError
 from barpc.cameras import open_camera
 from barpc.cli import terminal as printing
 from barpc.cli.convert import _tell_readings
-from barpc.fit.points import Sample
 from barpc.pipeline.verify_outputs import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
+from barpc.sensor.sampler import Scattered
 from barpc.verbs import converting as module
 from barpc.verbs.converting import Converted, box_of, check_target, convert, window_of
 from tests.cli.test_main import run
@@ -370,7 +370,7 @@ def test_a_grid_that_does_not_hold_the_camera_ends_with_3(
 ) -> None:
     worst = worst / 0.01 * module.LINEAR
     reading = Reading(Path("x"), "gdal", worst, "" if worst == worst else "not read")
-    monkeypatch.setattr(module, "verify_grid", lambda path, sample: [reading] * isinstance(sample, Sample))
+    monkeypatch.setattr(module, "verify_grid", lambda path, sample: [reading] * isinstance(sample, Scattered))
     assert run("convert", f"{file},size=600:500", str(file.parent / "a_grid.tif")) == code
     error = capsys.readouterr().err
     assert ("does not hold the camera to" in error) == (code == 3)
@@ -442,8 +442,11 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
 ) -> None:
     asked = []
 
-    def verify(paths: Any, model: Any, size: Any, alts: Any) -> list[Reading]:
-        asked.append((sorted(path.name for path in paths), size, alts, all(path.is_file() for path in paths)))
+    def verify(paths: Any, sample: Any) -> list[Reading]:
+        image, alts = (np.array([one.min(axis=0), one.max(axis=0)]) for one in (sample.image, sample.ground[:, 2]))
+        size = tuple(np.rint(np.ptp(image, axis=0) + 1).astype(int).tolist())
+        names, there = sorted(path.name for path in paths), all(path.is_file() for path in paths)
+        asked.append((names, size, tuple(alts.tolist()), there))
         return [Reading(paths[0], "gdal", 2e-6), Reading(paths[1], "rpcm", NAN, "no field")]
 
     monkeypatch.setattr(module, "verify", verify)

@@ -12,10 +12,10 @@ import rasterio
 from rasterio.control import GroundControlPoint
 from rasterio.crs import CRS
 
-from barpc.cli import main
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.sensor.rpc import RPC, altitude_range
 from barpc.sensor.sentinel1 import RangeDoppler
+from tests.cli.test_main import run
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.rpcio.conftest import make_rpc
 
@@ -23,13 +23,6 @@ from tests.rpcio.conftest import make_rpc
 @pytest.fixture(scope="module")
 def camera() -> Camera:
     return synthetic()
-
-
-def run(*args: object) -> int:
-    """Exit code of the command."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    return int(stop.value.code or 0)
 
 
 def table(path: Path, camera: Camera, noise: float = 0.0) -> Path:

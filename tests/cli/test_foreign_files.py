@@ -7,18 +7,17 @@ import io
 import json
 import os
 import struct
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 
 from barpc.base.declarations import declared
 from barpc.base.options import RunOptions
 from barpc.cli import main
 from barpc.cli.flags import flag_name
+from tests.geotiffs import write_image
 from tests.pointio.test_gcp_formats import geopackage_of, shapefile_of
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
@@ -27,8 +26,7 @@ RNG = np.random.default_rng(1)
 
 
 def picture(path: Path, driver: str) -> None:
-    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", driver, 64, 64, 1, dtype="uint8") as file:
-        file.write(np.full((1, 64, 64), 7, np.uint8))
+    write_image(path, np.full((64, 64), 7, np.uint8), driver=driver)
 
 
 def written(data: bytes) -> Callable[[Path], object]:

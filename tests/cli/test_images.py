@@ -12,17 +12,11 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.cameras import open_camera
-from barpc.cli import main
 from barpc.cli.flags import image_paths
 from barpc.rpcio import find_rpc, write_rpc, write_rpc_copy
 from barpc.verbs.images import expanded
+from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture

@@ -19,9 +19,10 @@ from barpc.cli.process import interruptible
 from barpc.verbs.workers import THREADS
 
 
-def run(*args: str) -> int:
+def run(*args: object) -> int:
+    """Exit code of the command."""
     with pytest.raises(SystemExit) as stop:
-        main(list(args))
+        main([str(arg) for arg in args])
     assert isinstance(stop.value.code, int)
     return stop.value.code
 

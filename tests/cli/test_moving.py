@@ -17,7 +17,7 @@ from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.rpcio import read_rpc, write_rpc_copy
 from barpc.scene import Camera
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.verbs.moving import moved
 from tests.cli.test_main import run
 from tests.rpcio.conftest import make_rpc, write_image

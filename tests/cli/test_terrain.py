@@ -16,6 +16,7 @@ from barpc.cameras import open_camera
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
 from barpc.verbs.points import altitude_of, exchanged
+from tests import geotiffs
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import make_rpc, write_image
@@ -35,17 +36,7 @@ def dem(tmp_path: Path) -> Path:
     lon = 5.2 + step * (np.arange(250) + 0.5)
     heights = np.tile(60 + 1000 * (lon - 5.4), (250, 1)).astype(np.float64)
     where = rasterio.Affine(step, 0, 5.2, 0, -step, 43.5)
-    shape = {
-        "width": 250,
-        "height": 250,
-        "count": 1,
-        "dtype": "float64",
-        "crs": "EPSG:4979",
-        "transform": where,
-    }
-    with rasterio.open(path, "w", driver="GTiff", **shape) as out:
-        out.write(heights, 1)
-    return path
+    return geotiffs.write_image(path, heights, crs="EPSG:4979", transform=where)
 
 
 @pytest.fixture(scope="module")

@@ -14,21 +14,16 @@ import numpy as np
 import pytest
 
 from barpc.base.verb_options import DsmOptions
-from barpc.cli import main
 from barpc.cli.terminal import Lines, progress_told
 from barpc.dsm import stereo, surface
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
-from barpc.sensor.geometry import base_to_height, triangulate
+from barpc.sensor.geometry import base_to_height
+from barpc.sensor.triangulation import triangulate
+from tests.cli.test_main import run
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 
 POINT = ["5.4005", "43.1995", "200"]
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture

@@ -196,6 +196,12 @@ def test_the_checks_notice_what_does_not_exist(tmp_path):
     assert found("barpc.rpcio.FORMATS")
 
 
+@pytest.mark.parametrize("package", ["barpc", "barpc.fit", "barpc.pipeline", "barpc.report", "barpc.tie"])
+def test_every_name_that_a_package_imports_when_used_is_there(package: str) -> None:
+    module = importlib.import_module(package)
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
 def test_the_names_are_read_from_pages_that_have_them():
     assert sum(len(names(page)) for page in PRESENT) > 60
     assert sum(len(paths(page)) for page in PRESENT) > 40

@@ -43,6 +43,10 @@ class Rendered:
         with rasterio.open(path) as file:
             place = file.transform
             tile = Tile(file.crs.to_wkt(), place.c, place.f, place.a, (file.width, file.height), (0.0, 1.0))
+        return self.truth_in(tile)
+
+    def truth_in(self, tile: Tile) -> np.ndarray:
+        """The same in each cell of a tile."""
         ground = []
         for shot, picture in zip(self.scene.shots, self.pictures, strict=True):
             row, col = np.nonzero(np.isfinite(picture.altitude))

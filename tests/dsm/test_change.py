@@ -17,8 +17,9 @@ from barpc.dsm.stereo import CameraErrors
 from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
+from tests.everywhere import rows_of
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.files import _write_image
@@ -27,11 +28,8 @@ DATES = (0, 1), (2, 3)
 
 
 def heights(sensors, seen, pair, ground):
-    num = len(ground)
-    xy = np.stack([seen[k] for k in pair], axis=1).reshape(-1, 2)
-    found = triangulate(
-        [sensors[k] for k in pair], np.tile([0, 1], num), np.repeat(np.arange(num), 2), xy, alt=ground[:, 2]
-    )
+    rows = rows_of(np.stack([seen[k] for k in pair], axis=1))
+    found = triangulate([sensors[k] for k in pair], *rows, alt=ground[:, 2])
     return ground_from_ecef(found.points)[:, 2]
 
 

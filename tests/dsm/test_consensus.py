@@ -17,7 +17,6 @@ from barpc.dsm.stereo import (
     block_of_images,
     consensus,
     finite_median,
-    gathered,
     surface_tile,
 )
 from barpc.dsm.surface import Grid
@@ -254,13 +253,7 @@ def test_few_cells_are_grossly_wrong_and_hardly_any_is_lost(kind, tmp_path, monk
     alts = float(np.nanmin(shown)) - 10.0, float(np.nanmax(shown)) + 10.0
     block = block_of_images(found.paths, alts)
     ((_, tile, (group,)),) = Grid(block, DsmOptions(alt=alts)).tiles
-    ground = []
-    for shot, picture in zip(scene.shots, found.pictures, strict=True):
-        row, col = np.nonzero(np.isfinite(picture.altitude))
-        at = np.column_stack([col, row]).astype(np.float64)
-        ground.append(shot.exact.localize(at, picture.altitude[row, col].astype(np.float64)))
-    every = np.concatenate(ground)
-    truth = gathered(tile, tile.on_map(every), np.ones(len(every)))[0]
+    truth = found.truth_in(tile)
     low = minimum_filter(np.where(np.isfinite(truth), truth, np.inf), 3)
     high = maximum_filter(np.where(np.isfinite(truth), truth, -np.inf), 3)
     pairs = [(block.views[i], block.views[j]) for i, j in group]

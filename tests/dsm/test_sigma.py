@@ -14,11 +14,13 @@ from barpc.dsm import stereo
 from barpc.dsm.stereo import CameraErrors, Tile, noise_of_mean
 from barpc.dsm.surface import shaded
 from barpc.scene import View
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, intersect_pair, triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import intersect_pair, triangulate
 from barpc.tie.patches.dense import WINDOW, DenseMatches, epipolar_frame
 from tests.dsm.conftest import ALTS
+from tests.everywhere import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +52,7 @@ def test_a_height_moves_as_its_derivative_says_when_a_camera_does(unknown, views
         translation[part - 3] = 1.0
     moved = Corrected(views[view].sensor, Correction(rotation, translation, prior.center[view]))
     sensors = [moved if k == view else views[k].sensor for k in pair]
-    num = len(ground)
-    found = triangulate(
-        sensors,
-        np.tile([0, 1], num),
-        np.repeat(np.arange(num), 2),
-        np.stack(seen, 1).reshape(-1, 2),
-        alt=230.0,
-    )
+    found = triangulate(sensors, *rows_of(np.stack(seen, 1)), alt=230.0)
     change = ground_from_ecef(found.points)[:, 2] - ground[:, 2]
     stated = errors.rows([[pair]], ground)[:, view * 6 + part]
     np.testing.assert_allclose(change, stated, atol=2e-3 * max(1.0, np.abs(stated).max()))

@@ -28,6 +28,7 @@ from barpc.report.runfiles import run_key
 from barpc.rpcio import read_rpc
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.workspace import Workspace, own_files
+from tests.cli.test_main import run
 from tests.dsm.conftest import ALTS, SMALL
 from tests.lanes import rest_slow
 from tests.scenes import Scene
@@ -35,12 +36,6 @@ from tests.scenes.files import _write_image
 from tests.sensor.s1_product import Product
 
 OPTIONS = DsmOptions(alt=ALTS)
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    return int(stop.value.code or 0)
 
 
 def nmad(values: np.ndarray) -> float:

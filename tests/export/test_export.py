@@ -25,7 +25,7 @@ from barpc.export.shots import read_scene
 from barpc.export.targets import TARGETS, _link_image, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.sensor.geometry import image_grid
+from barpc.sensor.sampler import image_grid
 from tests.lanes import rest_slow
 from tests.sealing import seal
 
@@ -256,7 +256,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     seen = [r for r in rows_of(southern / "tables/observations.csv") if r["track"] == track]
     noise = float(comment.split("noise ")[1].split(" px")[0])
     from barpc.base.geodesy import ecef_from_ground, enu_basis
-    from barpc.sensor.geometry import triangulate
+    from barpc.sensor.triangulation import triangulate
 
     models = [read_rpc(southern / f"{r['view']}_RPC.TXT") for r in seen if r["used"] == "1"]
     xy = np.array([[float(r["col"]), float(r["row"])] for r in seen if r["used"] == "1"])

@@ -10,8 +10,9 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.export import pinholes
 from barpc.export.pinholes import Pinhole, fit_camera, pinhole_camera
-from barpc.export.shots import Sampled, Scene, read_scene
+from barpc.export.shots import Scene, read_scene
 from barpc.sensor.curve import rotation_matrix
+from barpc.sensor.sampler import Sample
 
 TURN = rotation_matrix(np.array([np.pi - 0.2, 0.1, 0.05]))  # looks down
 TRUE = Pinhole(np.array([9000.0, 8500.0]), np.array([480.0, 300.0]), TURN, np.array([20.0, -10.0, 6000.0]))
@@ -23,7 +24,7 @@ def world(num: int = 60) -> np.ndarray:
     return np.random.default_rng(0).uniform(-400, 400, (num, 3)) * [1.0, 1.0, 0.2]
 
 
-def fit_pinhole(samples: Sampled, sight: np.ndarray, far: float | None = None) -> Pinhole:
+def fit_pinhole(samples: Sample, sight: np.ndarray, far: float | None = None) -> Pinhole:
     return pinhole_camera(fit_camera(samples, sight, far))
 
 
@@ -33,16 +34,16 @@ def test_a_pinhole_divides_by_the_depth():
 
 
 def test_the_error_is_the_largest_distance():
-    samples = Sampled(np.zeros((3, 3)), np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
-    assert samples.error(np.array([[0.0, 1.0], [4.0, 5.0], [2.0, 2.0]])) == 5.0
+    samples = Sample(np.zeros((3, 3)), np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))
+    assert samples.compare(lambda _: np.array([[0.0, 1.0], [4.0, 5.0], [2.0, 2.0]])) == 5.0
 
 
 @pytest.mark.parametrize("held", [False, True])
 def test_a_pinhole_is_found_where_there_is_one(held):
     points = world()
-    samples = Sampled(points, TRUE.project(points))
+    samples = Sample(points, TRUE.project(points))
     found = fit_pinhole(samples, SIGHT, FAR if held else None)
-    assert samples.error(found.project(points)) < 1e-7
+    assert samples.compare(found.project) < 1e-7
     assert found.focal == pytest.approx(TRUE.focal, rel=1e-8)
     assert found.center == pytest.approx(TRUE.center, abs=1e-4)
     assert found.rotation == pytest.approx(TRUE.rotation, abs=1e-8)
@@ -53,7 +54,7 @@ def test_a_pinhole_is_as_far_as_it_is_held_and_shows_the_right_side():
     """Points seen along parallel rays, in axes that are not perpendicular, as an image with a skew shows them."""
     points = world()
     image = points @ np.array([[2.0, 0.02, 0.3], [0.0, -2.0, 0.4]]).T + [480.0, 300.0]
-    samples, sight = Sampled(points, image), np.array([0.0, 0.0, 1.0])
+    samples, sight = Sample(points, image), np.array([0.0, 0.0, 1.0])
     errors = []
     for far in (7e5, 1.4e6, 1.4e7):
         found = fit_pinhole(samples, sight, far)
@@ -62,7 +63,7 @@ def test_a_pinhole_is_as_far_as_it_is_held_and_shows_the_right_side():
         assert np.linalg.det(found.rotation) == pytest.approx(1.0)
         forward, depth = found.rotation[2], found.translation[2]
         assert -(forward @ sight) / depth == pytest.approx(1 / far)
-        errors.append(samples.error(found.project(points)))
+        errors.append(samples.compare(found.project))
     assert errors[0] < 0.5
     assert errors[1] == pytest.approx(errors[0] / 2, rel=0.1)  # an affine image is seen from far away
     assert errors[2] == pytest.approx(errors[0] / 20, rel=0.1)
@@ -71,12 +72,12 @@ def test_a_pinhole_is_as_far_as_it_is_held_and_shows_the_right_side():
 def test_a_mirrored_image_has_no_focal_lengths_of_one_sign():
     points = world()
     image = points @ np.array([[2.0, 0.02, 0.3], [0.0, 2.0, 0.4]]).T
-    assert (fit_pinhole(Sampled(points, image), np.array([0.0, 0.0, 1.0]), 7e5).focal < 0).tolist() == [False, True]
+    assert (fit_pinhole(Sample(points, image), np.array([0.0, 0.0, 1.0]), 7e5).focal < 0).tolist() == [False, True]
 
 
 def test_a_camera_at_infinity_is_refused_by_its_numbers_not_by_a_failure():
     points = world()
-    found = fit_pinhole(Sampled(points, points[:, :2] * [2.0, -2.0]), np.array([0.0, 0.0, 1.0]))
+    found = fit_pinhole(Sample(points, points[:, :2] * [2.0, -2.0]), np.array([0.0, 0.0, 1.0]))
     assert not ((found.focal > 0).all() and (found.focal < 1e9).all())
 
 
@@ -87,7 +88,7 @@ def test_the_same_points_give_the_same_bytes_wherever_they_lie_in_memory():
     for shift in range(0, 64, 8):
         held = np.zeros(points.nbytes + 64, np.uint8)[shift:][: points.nbytes].view(float).reshape(points.shape)
         held[:] = points
-        one = fit_pinhole(Sampled(held, image.copy()), SIGHT)
+        one = fit_pinhole(Sample(held, image.copy()), SIGHT)
         found.add(b"".join(part.tobytes() for part in (one.focal, one.center, one.rotation, one.translation)))
     assert len(found) == 1
 
@@ -96,7 +97,7 @@ def test_a_pinhole_of_noisy_points_is_where_their_squares_are_least():
     """No unknown that is moved lessens the sum of squares: of its parabola, the bottom is there."""
     points = world(200)
     noise = np.random.default_rng(1).normal(0, 0.5, (200, 2))
-    samples = Sampled(points, TRUE.project(points) + noise)
+    samples = Sample(points, TRUE.project(points) + noise)
     found = fit_pinhole(samples, SIGHT)
 
     def cost(step: np.ndarray) -> float:
@@ -127,7 +128,7 @@ def test_a_skewed_camera_is_found_where_there_is_one():
     )
     points = world()
     seen = np.column_stack([points, np.ones(len(points))]) @ camera.T
-    found = fit_camera(Sampled(points, seen[:, :2] / seen[:, 2:]), SIGHT, skewed=True)
+    found = fit_camera(Sample(points, seen[:, :2] / seen[:, 2:]), SIGHT, skewed=True)
     assert found / found[2, 3] == pytest.approx(camera / camera[2, 3], rel=1e-6, abs=1e-9)
 
 

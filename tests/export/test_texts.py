@@ -24,9 +24,10 @@ from barpc.export import pinholes
 from barpc.export import shots as scene
 from barpc.export.colmap import colmap
 from barpc.export.light import UnknownTimeError, dated
-from barpc.export.shots import Sampled, Scene, pairs_of, read_scene, relative_link
+from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import read_rpc
-from barpc.sensor.geometry import camera_center, image_grid
+from barpc.sensor.centers import camera_center
+from barpc.sensor.sampler import Sample, image_grid
 
 OUT = Path("/elsewhere/out")
 HOW = ExportOptions()
@@ -125,7 +126,7 @@ def test_samples_lie_on_a_grid_over_image_and_altitudes(south):
         found = south.samples(shot, checked=checked)
         image, alt = image_grid(shot.size, south.alt_range, nodes)
         assert found.image == pytest.approx(image)
-        assert found.world == pytest.approx(south.world(shot.rpc.localize(image, alt)))
+        assert found.ground == pytest.approx(south.world(shot.rpc.localize(image, alt)))
     assert len(south.samples(shot).image) == 11 * 11 * 5
     with pytest.raises(InputError, match="sees no ground"):
 
@@ -442,7 +443,7 @@ def test_points_are_written_with_their_covariance(south):
     assert alone.decode().splitlines()[2].endswith(",,,,,,")  # what one image shows is not known
     unknown = made_of.points(with_summary(south, scene=None), OUT, HOW)["points.csv"]
     assert unknown.decode().splitlines()[0].endswith("is known to [m]: unknown")
-    assert isinstance(south.samples(south.shots[0]), Sampled)
+    assert isinstance(south.samples(south.shots[0]), Sample)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from barpc.base.errors import BarpcError
 from barpc.base.geodesy import Array, ecef_from_ground
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center
 from barpc.sensor.rpc import RPC, altitude_range
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -13,6 +14,9 @@ from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_e
 from barpc.fit import RpcFit
 from barpc.simulate import Look, fly
 from tests.fit.cameras import synthetic_rpc
+
+FLAT = SimpleNamespace(localize=lambda image, alt: np.column_stack([image, alt]), project=lambda ground: ground[:, :2])
+"""A camera whose image is the ground."""
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ import pytest
 from scipy.optimize import least_squares
 
 from barpc.fit import FitOptions, RpcFit, fit_rpc, fit_rpc_points
-from barpc.fit.points import SAMPLE_CELLS, Sample
 from barpc.fit.poles import Region, smallest_denominator
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import SAMPLE_CELLS, Scattered
 from tests.costs import once
 from tests.fit.cameras import synthetic
-from tests.fit.models import Bent, bump, hard, pushbroom, waves
+from tests.fit.models import FLAT, Bent, bump, hard, pushbroom, waves
 from tests.lanes import rest_slow
 
 EASY = ("wide pushbroom", "frame, k1 0.02", "waves 0.25")  # that are fitted in a moment, one of each kind
@@ -181,7 +181,7 @@ def test_a_pole_between_the_points_of_a_lattice_is_not_missed():
 
 def test_points_are_all_over_the_image_and_its_altitudes():
     camera = synthetic()
-    sample = Sample.of(camera.model, camera.size, camera.alt_range)
+    sample = Scattered.over(camera.model, camera.size, camera.alt_range)
     inside = sample.points[: sample.count]
     cells = np.floor((inside[:, :2] + 0.5) / camera.size * SAMPLE_CELLS).astype(int)
     assert len(np.unique(cells, axis=0)) == SAMPLE_CELLS**2  # one each
@@ -189,19 +189,19 @@ def test_points_are_all_over_the_image_and_its_altitudes():
     assert max(b - a for a, b in pairwise(heights.tolist())) < 3 * np.ptp(heights) / len(heights)
     corners = {(col, row) for col in (-0.5, 19999.5) for row in (-0.5, 18999.5)}
     assert corners <= {(col, row) for col, row, _ in sample.points.tolist()}
-    again = Sample.of(camera.model, camera.size, camera.alt_range)
+    again = Scattered.over(camera.model, camera.size, camera.alt_range)
     np.testing.assert_array_equal(again.points, sample.points)
 
 
 def test_an_rpc_without_an_image_point_has_no_largest_error():
     camera = synthetic()
-    sample = Sample.of(camera.model, camera.size, camera.alt_range)
+    sample = Scattered.over(camera.model, camera.size, camera.alt_range)
 
     class Blind:
         def project(self, ground):
             return np.full((len(ground), 2), np.nan)
 
-    assert np.isinf(sample.errors(Blind())[1]).all()
+    assert np.isinf(sample.compare(Blind().project).largest).all()
 
 
 def test_a_method_that_is_asked_for_is_the_only_one_tried():
@@ -217,14 +217,16 @@ def test_a_method_that_is_asked_for_is_the_only_one_tried():
 
 def test_what_was_seen_once_is_seen_again() -> None:
     """A step is narrower than points lie apart: who looks for it with another camera is told where it was seen."""
-    sample = Sample.of(synthetic().rpc, (9000, 8000), (0.0, 400.0))
+    sample = Scattered.over(FLAT, (9000, 8000), (0.0, 400.0))
 
-    def off(_: np.ndarray, at: np.ndarray) -> np.ndarray:
-        return np.where(abs(at[:, :1] - 4321.7) < 1e-3, [[0.09, 0.0]], 1e-6)
+    def read(at: np.ndarray) -> np.ndarray:
+        return at[:, :2] + np.where(abs(at[:, :1] - 4321.7) < 1e-3, [[0.09, 0.0]], 1e-6)
 
-    assert sample.sought(off)[1].max() < 1e-5
+    assert sample.compare(read).largest.max() < 1e-5
     there = np.array([[4321.7, 777.0, 55.0]])
-    errors, largest = sample.also(there).sought(off)
-    np.testing.assert_allclose(largest, [0.09, 1e-6])
+    errors = sample.also(there).compare(read)
+    np.testing.assert_allclose(errors.largest, [0.09, 1e-6], atol=1e-11)
     np.testing.assert_allclose(errors.worst[0], there[0], atol=1e-9)
-    np.testing.assert_allclose(errors.rmse, 1e-6)  # of the points all over the image: the new one is none of them
+    np.testing.assert_allclose(
+        errors.rmse, 1e-6, atol=1e-11
+    )  # of the points all over the image: the new one is none of them

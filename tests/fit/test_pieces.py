@@ -16,7 +16,6 @@ from barpc.fit.certificate import coverage, roundtrip
 from barpc.fit.given import relative_weight
 from barpc.fit.methods import METHODS
 from barpc.fit.points import (
-    Errors,
     control_points,
     screened,
     spaced,
@@ -26,6 +25,7 @@ from barpc.fit.poles import smallest_denominator
 from barpc.fit.refit import innermost
 from barpc.fit.system import FitProblem, expected_size, noise_scaled, solution
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Errors
 from tests.constants import CONSTANTS, chosen
 from tests.fit.cameras import Camera, random_points, synthetic_rpc
 from tests.fit.models import Bent, made, waves

@@ -28,7 +28,7 @@ from barpc.cli.flags import image_paths
 from barpc.cli.project import given_points
 from barpc.cli.terminal import print_comparison
 from barpc.export.targets import export_run
-from barpc.pipeline.calibrate import read_calibration
+from barpc.pipeline.calibrations import read_calibration
 from barpc.pipeline.inputs import read_pairs
 from barpc.pointio.correspondences import read_correspondences
 from barpc.pointio.gcps import read_gcps

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
+from tests.everywhere import rows_of
 from tests.reliability.trials import SAMPLES, crop
 
 FOLDER = SAMPLES[0].parent
@@ -78,10 +79,7 @@ def errors_at_check_points(sensors: Any, truth: dict[str, Any]) -> tuple[float, 
     Reprojecting an intersection removes what tie points cannot tell: where the scene is as a whole.
     """
     ground, image = exact(truth)
-    n, views = image.shape[:2]
-    result = triangulate(
-        sensors, np.tile(np.arange(views), n), np.repeat(np.arange(n), views), image.reshape(-1, 2), alt=250.0
-    )
+    result = triangulate(sensors, *rows_of(image), alt=250.0)
     assert result.ok.all()
     offset = (result.points - ecef_from_ground(ground)).mean(axis=0)
     return float(np.sqrt((result.residuals**2).mean())), enu_basis(ground.mean(axis=0)) @ offset

@@ -15,6 +15,7 @@ from barpc.pipeline.acquisitions import one_each
 from barpc.pipeline.loading import load_views
 from barpc.sensor.rpc import RPC
 from barpc.simulate import simulate_block
+from tests.geotiffs import write_image
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
@@ -29,10 +30,7 @@ def band(view: Path, path: Path, step: int = 4, *, turned: bool = False) -> Path
     pixels = pixels[: side * step, : side * step].reshape(side, step, side, step).mean(axis=(1, 3))
     pixels = 3000.0 - 0.7 * pixels  # a band in which bright is dark
     rpc = barpc.read_rpc(view).window(0, 0, step, step)
-    shape = {"width": side, "height": side, "count": 1, "dtype": "uint16"}
-    with rasterio.open(path, "w", driver="GTiff", **shape, rpcs=rpc.to_rasterio()) as image:
-        image.write((pixels[::-1, ::-1] if turned else pixels).astype(np.uint16), 1)
-    return path
+    return write_image(path, (pixels[::-1, ::-1] if turned else pixels).astype(np.uint16), rpcs=rpc.to_rasterio())
 
 
 @pytest.mark.nightly

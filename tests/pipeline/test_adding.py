@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from barpc.rpcio.images import put_tag
 from barpc.scene import Tracks
 from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block
+from tests.geotiffs import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 COUNT = 12  # four sites in a square, three views each
@@ -40,12 +40,10 @@ def archive(made: SimulatedBlock, tmp_path_factory) -> Path:
     """The block's images, of noise, with their RPCs, and its tie points."""
     folder, rng = tmp_path_factory.mktemp("archive"), np.random.default_rng(0)
     for view in made.views:
-        path, (width, height) = folder / f"{view.name}.tif", view.size
-        how = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": "uint8"}
-        with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", **how, compress="deflate") as image:
-            image.write(np.tile(rng.integers(0, 255, (1, 20, 20), dtype=np.uint8), (1, height // 20, width // 20)))
+        width, height = view.size
+        pixels = np.tile(rng.integers(0, 255, (20, 20), dtype=np.uint8), (height // 20, width // 20))
         assert isinstance(view.sensor, RPC)
-        put_tag(path, view.sensor)
+        put_tag(write_image(folder / f"{view.name}.tif", pixels, compress="deflate"), view.sensor)
     write_matches(folder / "ties.npz", made.tracks, [view.name for view in made.views])
     return folder
 

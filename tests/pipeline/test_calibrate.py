@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from click.testing import CliRunner, Result
 
 import barpc
@@ -23,16 +21,8 @@ from barpc.base.statistics import SURE
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import (
-    _FinishedRun,
-    _may_be_covariance,
-    _OnLine,
-    _refuse_unsure,
-    _row_direction,
-    calibrations_of,
-    common_errors,
-    read_calibration,
-)
+from barpc.pipeline.calibrate import _FinishedRun, _OnLine, _refuse_unsure, _row_direction
+from barpc.pipeline.calibrations import _may_be_covariance, calibrations_of, common_errors, read_calibration
 from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.pointio.matches import write_matches
 from barpc.report import Run
@@ -43,6 +33,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, parts, scene
+from tests.geotiffs import write_blank
 from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
@@ -55,9 +46,7 @@ def files(made: Scene, folder: Path, sensor: str = "SIM1") -> list[Path]:
     folder.mkdir(parents=True)
     names = []
     for view in made.views:
-        path, how = folder / f"{view.name}.tif", {"driver": "GTiff", "count": 1, "dtype": "uint8", "sparse_ok": True}
-        with warnings.catch_warnings(action="ignore"):
-            rasterio.open(path, "w", width=view.size[0], height=view.size[1], **how).close()
+        path = write_blank(folder / f"{view.name}.tif", view.size)
         assert isinstance(view.sensor, RPC)
         put_tag(path, view.sensor)
         if sensor:

@@ -21,6 +21,7 @@ from barpc.pipeline.loading import load_views
 from barpc.tie.pairing.epipolar import coherent, epipolar_segments
 from tests.pointio.stages import read_matches
 from tests.pointio.test_foreign import binary
+from tests.tie.stages import common_tracks
 
 from .conftest import check_points
 from .known import SAMPLES as IMAGES
@@ -42,9 +43,7 @@ def noisy(shared_data: Path, folder: Path, *pairs: tuple[str, str]) -> Path:
 
 def spread(views, tracks, i: int, j: int) -> float:
     """Across the epipolar lines [px], both ends together."""
-    a, b = tracks.view == i, tracks.view == j
-    _, rows_a, rows_b = np.intersect1d(tracks.point[a], tracks.point[b], return_indices=True)
-    first, second = tracks.xy[a][rows_a], tracks.xy[b][rows_b]
+    first, second = common_tracks(tracks, i, j)
     return robust_spread(coherent(first, epipolar_segments(views[i], views[j], first).errors(second)[:, 1])[1])
 
 

@@ -23,7 +23,6 @@ from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import adjust, check
 from barpc.pipeline import grid_outputs as grids
 from barpc.pipeline.grid_outputs import grid_names, write_grids
-from barpc.pipeline.verify_outputs import difference
 from barpc.rpcio import read_rpc
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.rpcio.grids import read_correction, write_correction
@@ -31,6 +30,7 @@ from barpc.scene import View
 from barpc.sensor.csm import STATE_END
 from barpc.sensor.direct_grid import LINEAR
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline, Splined
+from barpc.sensor.sampler import Sample, Scattered
 from barpc.simulate import Look, fly
 from barpc.workspace import Workspace, own_files
 from tests.fit.cameras import synthetic
@@ -262,12 +262,12 @@ def read_as(monkeypatch, **rms: float) -> list:
 def test_a_reader_sees_the_error_that_was_seen_in_writing(tmp_path, view, monkeypatch, rms, fine) -> None:
     asked = read_as(monkeypatch, **rms)
     where = np.array([[3.0, 4.0, 5.0], [6.0, 7.0, 8.0]])
-    errors = {"a" + GRID_SUFFIX: (0.005, 0.01, where)}
+    errors = {"a" + GRID_SUFFIX: SimpleNamespace(rms=0.005, worst=where)}
     model = make_rpc()
     if fine:
         found = grids.verify_grids(view, model, errors, str(tmp_path))
         assert found == {"a" + GRID_SUFFIX: {name: 2 * px for name, px in rms.items()}}
-        count = len(grids.Sample.of(model, view.size, grids.widened(view.alt_range)).points)
+        count = len(Scattered.over(model, view.size, grids.widened(view.alt_range)).points)
         assert asked == [("a" + GRID_SUFFIX, count + 2)]
         return
     ((name, px),) = rms.items()
@@ -290,7 +290,7 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
         place = Path(room) / view.name
         place.mkdir(parents=True)
         (place / "a.x").write_text("grid")
-        return {"a.x": (0.007, written, np.zeros((0, 3)))}
+        return {"a.x": SimpleNamespace(rms=0.007, far=written)}
 
     monkeypatch.setattr(grids, "make_grids", made)
     monkeypatch.setattr(grids, "verify_grids", lambda *given: {"a.x": {"barpc": read, "gdal": 9.0}})
@@ -316,14 +316,14 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
 def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, largest, rms, chosen, tried) -> None:
     assert LINEAR == 0.005
     names = ("given", "plain")
-    known = {name: (one, big) for name, one, big in zip(names, rms, largest, strict=True)}
+    known = {name: SimpleNamespace(rms=one, far=big) for name, one, big in zip(names, rms, largest, strict=True)}
     rpcs = {name: replace(make_rpc(), err_bias=5.0, err_rand=float(n)) for n, name in enumerate(names)}
     given = replace(rpcs["given"], err_bias=1.5, err_rand=0.25)
     asked: list[str] = []
 
     def fit(model, size, alts):
         assert (model, size, alts) == ("model", (10, 20), (100.0, 300.0))
-        if known["plain"][0] is None:
+        if known["plain"].rms is None:
             asked.append("plain")
             raise FitError("no fit")
         return rpcs["plain"]
@@ -333,16 +333,14 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
         asked.append("given" if rpc is given else "plain")
         return asked[-1]
 
-    where = np.zeros((1, 3))
     monkeypatch.setattr(grids, "fit_only", fit)
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
-    monkeypatch.setattr(grids, "Displaced", lambda rpc, lacking: lacking)
-    monkeypatch.setattr(grids, "_largest_miss", lambda sample, camera: (*known[camera], where))
-    sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
+    monkeypatch.setattr(grids, "Displaced", lambda rpc, lacking: SimpleNamespace(project=lacking))
+    sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0), compare=known.get)
     rpc, lacking, miss = grids.grid_correction(given, sample)  # type: ignore[arg-type]
     assert asked == list(names[:tried])
     assert lacking == chosen
-    assert miss == (*known[chosen], where)
+    assert miss is known[chosen]
     assert (rpc.err_bias, rpc.err_rand) == (1.5, 0.25)
 
 
@@ -355,10 +353,10 @@ def test_what_is_added_to_the_rpc_of_a_displaced_camera_is_of_no_altitude(inner)
         bent = ColumnSpline(camera.size[0], np.random.default_rng(1).normal(0, 0.3, (12, 2)))
         model = replace(model, sensor=Calibrated(camera.rpc, bent))
     model = Splined(model, RowSpline(np.zeros((0, 2)), periods=[9000.0], amplitudes=[[[0.5, 0.35], [-0.35, 0.5]]]))
-    sample = grids.Sample.of(model, camera.size, camera.alt_range)
+    sample = Scattered.over(model, camera.size, camera.alt_range)
     options = FitOptions(method="gauss-newton")
     followed = fit_rpc(model, camera.size, camera.alt_range, options=options, strict=False).rpc
-    rpc, lacking, (rms, largest, _) = grids.grid_correction(followed, sample)
+    rpc, lacking, errors = grids.grid_correction(followed, sample)
     image = np.random.default_rng(3).uniform([100.0, 100.0], np.array(camera.size) - 100.0, (2000, 2))
 
     def rest(rpc, alt):
@@ -367,8 +365,8 @@ def test_what_is_added_to_the_rpc_of_a_displaced_camera_is_of_no_altitude(inner)
     assert np.abs(rest(rpc, 0.0) - rest(rpc, 1000.0)).max() < 1e-6 < np.abs(rest(rpc, 0.0)).max()
     assert np.abs(rest(followed, 0.0) - rest(followed, 1000.0)).max() > 0.1
     for alt in camera.alt_range:
-        assert np.linalg.norm(lacking.at(image) - rest(rpc, alt), axis=1).max() < 1.2 * largest
-    assert rms < 0.5 * LINEAR
+        assert np.linalg.norm(lacking.at(image) - rest(rpc, alt), axis=1).max() < 1.2 * errors.far
+    assert errors.rms < 0.5 * LINEAR
 
 
 def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> None:
@@ -387,26 +385,25 @@ def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> N
 
 def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     rpc = make_rpc()
-    sample = grids.Sample.of(rpc, (2000, 1900), (30.0, 300.0), cells=5)
-    beside = SimpleNamespace(project=lambda ground: rpc.project(ground) + [3.0, -4.0])
-    rms, largest, where = grids._largest_miss(sample, beside)  # type: ignore[arg-type]
-    assert rms == pytest.approx(5.0, abs=1e-5)
-    assert largest == pytest.approx(5.0, abs=1e-5)
-    assert where.shape[1] == 3
+    errors = Scattered.over(rpc, (2000, 1900), (30.0, 300.0), cells=5).compare(rpc.crop(-3.0, 4.0).project)
+    assert errors.rms == pytest.approx(5.0, abs=1e-5)
+    assert errors.far == pytest.approx(5.0, abs=1e-5)
+    assert errors.worst.shape[1] == 3
 
 
 def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch) -> None:
     """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
-    where, written = np.zeros((1, 3)), {}
+    of_grid, of_both, written = object(), object(), {}
+    compare = {"grid": of_grid}.get
     alts = grids.widened(view.alt_range)
 
     def grid(model, size, alt_range):
         assert (model, size, alt_range) == (rpc, SIZE, alts)
-        return "grid"
+        return SimpleNamespace(project="grid")
 
     def correction(given, sample):
-        assert (given, sample.model, sample.size, sample.alt_range) == (rpc, rpc, SIZE, alts)
-        return "better", "lacking", (0.3, 0.4, where)
+        assert (given, sample) == (rpc, over(rpc, SIZE, alts))
+        return "better", "lacking", of_both
 
     def recorded(kind):
         def write(*given, overwrite):
@@ -414,17 +411,20 @@ def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monke
 
         return write
 
+    def over(model, size, alt_range):
+        return SimpleNamespace(model=model, size=size, alt_range=alt_range, compare=compare)
+
     rpc = make_rpc()
     (tmp_path / "a").mkdir()
     monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
     monkeypatch.setattr(grids, "grid_correction", correction)
-    monkeypatch.setattr(grids, "_largest_miss", lambda sample, camera: (0.1, 0.2, where))
+    monkeypatch.setattr(grids, "Scattered", SimpleNamespace(over=over))
     for kind in ("grid", "correction"):
         monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))
     errors = grids.make_grids(view, rpc, rpc, grids.GridFiles(grids=True), str(tmp_path))
     known = {
-        "a" + GRID_SUFFIX: ((0.1, 0.2, where), ("grid", "grid", True)),
-        "a" + CORRECTION: ((0.3, 0.4, where), ("correction", "lacking", "better", True)),
+        "a" + GRID_SUFFIX: (of_grid, ("grid", SimpleNamespace(project="grid"), True)),
+        "a" + CORRECTION: (of_both, ("correction", "lacking", "better", True)),
     }
     assert errors == {name: miss for name, (miss, _) in known.items()}
     assert written == {f"a/{name}": row for name, (_, row) in known.items()}
@@ -511,7 +511,7 @@ def test_verbs_understand_grids(block, tmp_path):
     assert (code, json.loads(text)[-1]["consumer"]) == (0, "barpc")
     assert open_camera(tmp_path / f"c{GRID_SUFFIX}").model.lonlat.shape == open_camera(grid).model.lonlat.shape
     one, other = open_camera(rpc), open_camera(grid)
-    assert difference(one.model, other.model, (256, 256), one.alt_range) < 1e-3
+    assert Sample.grid(one.model, (256, 256), one.alt_range).compare(other.model.project) < 1e-3
     assert said("fit", grid)[0] == 0
 
 

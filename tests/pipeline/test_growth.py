@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.base.errors import BarpcError
 from barpc.base.geodesy import ground_from_ecef
@@ -21,9 +18,11 @@ from barpc.pointio.matches import write_matches
 from barpc.report import Run, verdict
 from barpc.rpcio import formats
 from barpc.rpcio.images import put_tag
-from barpc.sensor.geometry import Several, epipolar_offset
+from barpc.sensor.geometry import Several
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.simulate import SimulatedBlock, simulate_block
+from tests.geotiffs import write_image
 
 SIDE = 256
 LAYOUT = {"size": (SIDE, SIDE), "gsd": 40.0, "attitude": 5e-5}
@@ -35,11 +34,7 @@ def write_block(folder: Path, num: int) -> tuple[SimulatedBlock, list[Path]]:
     paths = [folder / f"{view.name}.tif" for view in block.views]
     for n, (path, view) in enumerate(zip(paths, block.views, strict=True)):
         ramp = (np.add.outer(np.arange(SIDE), np.arange(SIDE)) + n).astype(np.uint16)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, "w", "GTiff", SIDE, SIDE, 1, dtype="uint16", compress="deflate") as image:
-                image.write(ramp, 1)
-        put_tag(path, view.sensor)
+        put_tag(write_image(path, ramp, compress="deflate"), view.sensor)
     write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
     os.utime(folder, (1e9, 1e9))  # nothing was written there for long
     return block, paths

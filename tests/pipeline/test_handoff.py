@@ -15,14 +15,11 @@ import rasterio
 
 from barpc.base.errors import OutputError
 from barpc.base.geodesy import Array
-from barpc.fit.certificate import Sample
 from barpc.pipeline import verify_outputs
 from barpc.pipeline.verify_outputs import (
     CONSUMERS,
     READING_TOLERANCE,
     _lent,
-    control_grid,
-    difference,
     unverified,
     verify,
     verify_grid,
@@ -42,6 +39,7 @@ from barpc.rpcio.grids import write_correction
 from barpc.scene import BoolArray
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample, Scattered
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -71,7 +69,7 @@ def test_every_file_is_read_by_another_tool_than_barpc_to_a_billionth_of_a_pixel
     if not any(CONSUMERS[tool].installed for tool in format_for(name).consumers):
         pytest.skip("none of the tools that read this format is installed")
     rpc = make_rpc()
-    readings = verify([write(rpc, image, tmp_path / "out", name)], rpc, SIZE, ALTITUDES)
+    readings = verify([write(rpc, image, tmp_path / "out", name)], Sample.grid(rpc, SIZE, ALTITUDES))
     assert {reading.consumer for reading in readings} > {"barpc"}
     for reading in readings:
         assert reading.passed, reading
@@ -81,7 +79,7 @@ def test_every_file_is_read_by_another_tool_than_barpc_to_a_billionth_of_a_pixel
 @pytest.mark.parametrize("name", NAMES)
 def test_a_file_of_another_camera_does_not_pass(name, image, tmp_path):
     rpc = make_rpc()
-    readings = verify([write(rpc.crop(0.5, 0.5), image, tmp_path / "out", name)], rpc, SIZE, ALTITUDES)
+    readings = verify([write(rpc.crop(0.5, 0.5), image, tmp_path / "out", name)], Sample.grid(rpc, SIZE, ALTITUDES))
     for reading in readings:
         assert not reading.passed
         assert reading.max_error == pytest.approx(np.hypot(0.5, 0.5), abs=1e-6)
@@ -91,7 +89,7 @@ def test_a_sidecar_that_hides_a_tag_is_caught_by_its_effect(image, tmp_path):
     rpc = make_rpc()
     path = write(rpc, image, tmp_path / "out", "a.tif")
     write_rpc(rpc.crop(0, 7), tmp_path / "out" / "a.RPB")
-    for reading in verify([path], rpc, SIZE, ALTITUDES):
+    for reading in verify([path], Sample.grid(rpc, SIZE, ALTITUDES)):
         assert reading.max_error == pytest.approx(7.0, abs=1e-6)
 
 
@@ -113,7 +111,7 @@ def test_a_foreign_reader_sees_a_raster_with_its_rpc_files_and_nothing_else(imag
 def test_a_file_that_a_tool_cannot_read_is_reported_with_its_reason(tmp_path):
     path = tmp_path / "a_RPC.TXT"
     path.write_text("LINE_OFF: 1\n")
-    readings = verify([path], make_rpc(), SIZE, ALTITUDES)
+    readings = verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))
     assert len(readings) >= 2
     for reading in readings:
         assert not reading.passed
@@ -133,9 +131,10 @@ def test_a_fault_of_the_machine_is_no_finding_about_a_file(image, tmp_path, monk
     monkeypatch.setattr(rasterio, "MemoryFile", lend)
     if refused:
         with pytest.raises(OutputError, match=r"a_RPC\.TXT: cannot be opened as gdal.* does \(so it is\)"):
-            verify([path], make_rpc(), SIZE, ALTITUDES)
+            verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))
     else:
-        assert [reading.passed for reading in verify([path], make_rpc(), SIZE, ALTITUDES)].count(False) == 1
+        readings = verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES))
+        assert [reading.passed for reading in readings].count(False) == 1
 
 
 def test_a_new_format_is_one_row_written_verified_and_offered(image, tmp_path, monkeypatch, capsys):
@@ -184,35 +183,20 @@ def test_a_format_that_no_installed_tool_reads_says_so(monkeypatch):
     assert "rpcm" in sentence
 
 
-def test_the_grid_covers_the_image_and_its_altitudes():
-    rpc = make_rpc()
-    ground, image = control_grid(rpc, SIZE, ALTITUDES)
-    np.testing.assert_allclose(image.min(axis=0), [0, 0], atol=1e-6)
-    np.testing.assert_allclose(image.max(axis=0), [SIZE[0] - 1, SIZE[1] - 1], atol=1e-6)
-    assert (ground[:, 2].min(), ground[:, 2].max()) == ALTITUDES
-
-
 def test_gdal_s_way_with_a_correction_puts_its_nodes_where_barpc_does_and_keeps_the_ends_beyond(tmp_path):
     rpc, rng = make_rpc(), np.random.default_rng(0)
     grid = CorrectionGrid(np.linspace(300.0, 1500.0, 5), np.linspace(100.0, 1600.0, 4), rng.normal(size=(4, 5, 2)))
     write_correction(grid, rpc, tmp_path / f"a{CORRECTION}")
-    found = verify_grid(tmp_path / f"a{CORRECTION}", Sample.of(Displaced(rpc, grid), SIZE, ALTITUDES))
+    found = verify_grid(tmp_path / f"a{CORRECTION}", Scattered.over(Displaced(rpc, grid), SIZE, ALTITUDES))
     assert {one.consumer for one in found} == {"gdal", "barpc"}
     for one in found:
         assert one.max_error < 1e-5, one  # the file holds four-byte numbers
 
 
-def test_two_cameras_differ_by_what_one_was_moved():
-    rpc = make_rpc()
-    assert difference(rpc, rpc, SIZE, ALTITUDES) == 0.0
-    assert difference(rpc, rpc.crop(3, 4), SIZE, ALTITUDES) == pytest.approx(5.0, abs=1e-9)
-    assert np.isnan(difference(rpc.crop(1e12, 0), rpc, SIZE, ALTITUDES))
-
-
 def test_a_model_that_sees_nothing_is_an_error():
     blind = make_rpc().crop(1e12, 1e12)
     with pytest.raises(OutputError, match="no ground point"):
-        verify([], blind, SIZE, ALTITUDES)
+        verify([], Sample.grid(blind, SIZE, ALTITUDES))
 
 
 def test_the_consumers_that_are_always_there_need_no_other_package():
@@ -258,7 +242,7 @@ def test_rpcm_is_asked_in_the_way_that_suits_the_file(name, reader, image, tmp_p
     rpcm.projection = lambda lon, lat, alt: rpc.project(np.column_stack([lon, lat, alt])).T
     monkeypatch.setitem(sys.modules, "rpcm.rpc_model", rpcm)
     project = CONSUMERS["rpcm"].open(path)
-    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    ground = Sample.grid(rpc, SIZE, ALTITUDES).ground
     np.testing.assert_array_equal(project(ground), rpc.project(ground))
     assert rpcm.asked[0] == reader
     content, *rest = rpcm.asked[1]
@@ -287,7 +271,7 @@ def test_shareloc_counts_from_the_corner_of_the_first_pixel_and_row_before_col(l
     rpc = make_rpc(lon=lon)
     model = shareloc(rpc)
     install(monkeypatch, model)
-    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    ground = Sample.grid(rpc, SIZE, ALTITUDES).ground
     found = CONSUMERS["shareloc"].open(tmp_path / "a.tif")(ground + [turn, 0.0, 0.0])
     np.testing.assert_allclose(found, rpc.project(ground), atol=1e-6 if turn else 1e-9)
     assert (str(tmp_path / "a.tif"),) in model.asked
@@ -319,7 +303,7 @@ def test_shareloc_asks_in_one_thread_and_leaves_as_many_as_there_were(monkeypatc
     model.inverse_loc = lambda *given: threads.append(10 * threads[-1]) or inverse(*given)
     install(monkeypatch, model)
     monkeypatch.setitem(sys.modules, "numba", numba)
-    CONSUMERS["shareloc"].open(tmp_path / "a.tif")(control_grid(rpc, SIZE, ALTITUDES)[0])
+    CONSUMERS["shareloc"].open(tmp_path / "a.tif")(Sample.grid(rpc, SIZE, ALTITUDES).ground)
     assert threads == [2, 1, 10, 2]
 
 
@@ -348,7 +332,7 @@ def test_what_shareloc_leaves_out_beyond_180_degrees_is_told(lon, takes, note, m
     named = {"shareloc": replace(CONSUMERS["shareloc"], package="numpy"), "barpc": CONSUMERS["barpc"]}
     monkeypatch.setattr("barpc.pipeline.verify_outputs._consumers", lambda _: named)
     write_rpc(rpc, tmp_path / "a.geom")
-    reading, own = verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES)
+    reading, own = verify([tmp_path / "a.geom"], Sample.grid(rpc, SIZE, ALTITUDES))
     assert own.passed
     assert reading.passed == (not note)
     assert note in reading.note
@@ -360,7 +344,7 @@ def test_orthority_counts_as_barpc_does(monkeypatch, tmp_path):
     model = Other(rpc)
     model.world_to_pixel = lambda columns: rpc.project(columns.T).T
     install(monkeypatch, model)
-    ground, _ = control_grid(rpc, SIZE, ALTITUDES)
+    ground = Sample.grid(rpc, SIZE, ALTITUDES).ground
     found = CONSUMERS["orthority"].open(tmp_path / "a.tif")(ground)
     np.testing.assert_array_equal(found, rpc.project(ground))
     assert ((str(tmp_path / "a.tif"),),) in model.asked

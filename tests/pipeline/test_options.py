@@ -20,7 +20,7 @@ from barpc.base.errors import BarpcError, FitError, InputError, OutputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import FitOptions
 from barpc.pipeline import AdjustResult, RunOptions, adjust
-from barpc.pipeline.calibrate import CALIBRATION_SCHEMA
+from barpc.pipeline.calibrations import CALIBRATION_SCHEMA
 from barpc.tie import TieOptions
 from tests.pipeline.known import part
 from tests.rasters.test_dem import write_dem, write_geoid

@@ -22,13 +22,14 @@ from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import outputs, verify_outputs
 from barpc.pipeline.inputs import PRIOR_FILE
 from barpc.pipeline.outputs import REOPENED, file_names, output_names, refuse_shadows, verify_files, write_views
-from barpc.pipeline.verify_outputs import CONSUMERS, Consumer, Reading, control_grid, difference, verify
+from barpc.pipeline.verify_outputs import CONSUMERS, Consumer, Reading, verify
 from barpc.report.page import can_render
 from barpc.report.summary import OutputEntry
 from barpc.report.tables import TABLES
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample
 from barpc.workspace import Workspace
 from tests.rpcio.conftest import make_rpc, write_image
 
@@ -132,12 +133,12 @@ def test_a_reading_may_be_off_by_twice_the_fit_s_largest_error(tmp_path, view, f
 
 
 def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit) -> None:
-    path = tmp_path / "scene_RPC.TXT"
+    path, sample = tmp_path / "scene_RPC.TXT", Sample.grid(make_rpc(), view.size, view.alt_range)
     write_rpc(fit.rpc, path)
-    assert verify_files([str(path)], view, fit, make_rpc())[path.name]["barpc"] < 1e-5
+    assert verify_files([str(path)], fit, sample)[path.name]["barpc"] < 1e-5
     path.write_text(path.read_text()[:400])
     with pytest.raises(OutputError, match="barpc reads it with an error of nan px"):
-        verify_files([str(path)], view, fit, make_rpc())
+        verify_files([str(path)], fit, sample)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +148,7 @@ def test_a_file_that_cannot_be_read_back_ends_the_run(tmp_path, view, fit) -> No
 def test_only_what_the_tool_itself_and_gdal_say_ends_the_run(tmp_path, view, fit, monkeypatch, consumer, ends) -> None:
     def says(paths, *_):
         names = dict.fromkeys(("barpc", "gdal", "other", consumer))
-        return [Reading(path, name, 9.0 if name == consumer else 0.0) for path in paths for name in names]
+        return [Reading(Path(path), name, 9.0 if name == consumer else 0.0) for path in paths for name in names]
 
     monkeypatch.setattr(outputs, "verify", says)
     with Workspace(tmp_path / "out") as run:
@@ -167,12 +168,13 @@ def test_a_reading_passes_up_to_a_millionth_of_a_pixel() -> None:
 
 def test_the_grid_spans_the_image_and_its_altitudes() -> None:
     rpc = make_rpc()
-    ground, image = control_grid(rpc, SIZE, ALTITUDES)
-    assert len(ground) == 11 * 11 * 5
-    np.testing.assert_allclose(image.min(axis=0), [0, 0], atol=1e-6)
-    np.testing.assert_allclose(image.max(axis=0), [1999, 1899], atol=1e-6)
-    assert sorted(set(ground[:, 2])) == [30.0, 97.5, 165.0, 232.5, 300.0]
-    assert difference(rpc, rpc.crop(3.0, 4.0), SIZE, ALTITUDES) == pytest.approx(5.0, abs=1e-9)
+    sample = Sample.grid(rpc, SIZE, ALTITUDES)
+    assert len(sample.ground) == 11 * 11 * 5
+    np.testing.assert_allclose(sample.image.min(axis=0), [0, 0], atol=1e-6)
+    np.testing.assert_allclose(sample.image.max(axis=0), [1999, 1899], atol=1e-6)
+    assert sorted(set(sample.ground[:, 2])) == [30.0, 97.5, 165.0, 232.5, 300.0]
+    assert sample.compare(rpc.project) < 1e-9
+    assert sample.compare(rpc.crop(3.0, 4.0).project) == pytest.approx(5.0, abs=1e-9)
 
 
 class Blind:
@@ -190,13 +192,11 @@ class Blind:
 
 
 def test_points_that_a_model_does_not_see_are_left_out_and_none_at_all_is_an_error(tmp_path) -> None:
-    ground, _ = control_grid(Blind(1000.0), SIZE, ALTITUDES)
-    assert len(ground) == 6 * 11 * 5
-    assert np.isnan(difference(Blind(-1.0), make_rpc(), SIZE, ALTITUDES))
+    assert len(Sample.grid(Blind(1000.0), SIZE, ALTITUDES).ground) == 6 * 11 * 5
     write_rpc(make_rpc(), tmp_path / "a_RPC.TXT")
-    assert verify([tmp_path / "a_RPC.TXT"], Blind(1000.0), SIZE, ALTITUDES)[-1].passed
+    assert verify([tmp_path / "a_RPC.TXT"], Sample.grid(Blind(1000.0), SIZE, ALTITUDES))[-1].passed
     with pytest.raises(OutputError, match="no ground point"):
-        verify([tmp_path / "a_RPC.TXT"], Blind(-1.0), SIZE, ALTITUDES)
+        verify([tmp_path / "a_RPC.TXT"], Sample.grid(Blind(-1.0), SIZE, ALTITUDES))
 
 
 def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -> None:
@@ -221,7 +221,7 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
     }
     monkeypatch.setattr(verify_outputs, "_consumers", lambda path: consumers)
     write_rpc(rpc, tmp_path / "A_RPC.TXT")
-    corner, nan, own = verify([tmp_path / "A_RPC.TXT"], rpc, SIZE, ALTITUDES)
+    corner, nan, own = verify([tmp_path / "A_RPC.TXT"], Sample.grid(rpc, SIZE, ALTITUDES))
     assert own.passed
     assert (corner.consumer, corner.note) == ("corner", "")
     assert corner.max_error == pytest.approx(5.0)
@@ -232,7 +232,7 @@ def test_the_largest_error_of_all_points_is_what_counts(tmp_path, monkeypatch) -
 def test_an_rpc_across_the_antimeridian_is_read_where_it_is(tmp_path) -> None:
     rpc = make_rpc(lon=179.9999)
     write_rpc(rpc, tmp_path / "a.geom")
-    for reading in verify([tmp_path / "a.geom"], rpc, SIZE, ALTITUDES):
+    for reading in verify([tmp_path / "a.geom"], Sample.grid(rpc, SIZE, ALTITUDES)):
         if reading.consumer == "shareloc":
             assert np.isnan(reading.max_error)
             assert "shareloc takes no longitude beyond 180 degrees" in reading.note
@@ -249,7 +249,7 @@ def test_a_keyword_list_of_another_kind_is_not_read(tmp_path, old, new) -> None:
     write_rpc(make_rpc(), path)
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
-    (keywords,) = (r for r in verify([path], make_rpc(), SIZE, ALTITUDES) if r.consumer == "keywords")
+    (keywords,) = (r for r in verify([path], Sample.grid(make_rpc(), SIZE, ALTITUDES)) if r.consumer == "keywords")
     assert not keywords.passed
     assert "not one of OSSIM's" in keywords.note
 

@@ -16,7 +16,7 @@ from barpc.pipeline.earlier import chosen_pairs
 from barpc.pipeline.inputs import input_files, read_pairs
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.tie import TieOptions, read_area
 from tests.pointio.stages import read_matches
 from tests.reliability.conftest import barpc

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import warnings
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 import barpc
 from barpc.base.errors import ImageError, InputError, RpcFormatError
@@ -21,12 +18,13 @@ from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.xml import write_maxar
-from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import Light
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look
+from tests.everywhere import rows_of, tied
+from tests.geotiffs import write_blank
 from tests.lanes import rest_slow
 from tests.rpcio.conftest import make_rpc, write_image
 from tests.sensor.linescan_files import Flight, dimap, isd
@@ -35,16 +33,6 @@ from tests.sensor.spot_files import Scene
 SIZE = (900, 6000)
 LOOKS = [Look(12.0, 12.0), Look(3.0, 100.0), Look(12.0, 192.0)]
 KINDS = {"maxar": (isd, "{}.XML"), "dimap": (dimap, "DIM_{}.XML")}
-
-
-def blank(path):
-    """An image in which nothing varies: no two such are compared."""
-    profile = {"driver": "GTiff", "width": SIZE[0], "height": SIZE[1], "count": 1, "dtype": "uint8"}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", **profile, compress="deflate") as out:
-            out.write(np.ones((1, SIZE[1], SIZE[0]), dtype=np.uint8))
-    return path
 
 
 @pytest.fixture(scope="module", params=rest_slow(KINDS))
@@ -56,7 +44,7 @@ def folder(request, tmp_path_factory):
         text, _ = write(Flight(size=SIZE, look=look, swing=0.0))
         (path / name.format(f"scene{k}")).write_text(text)
         stem = f"IMG_scene{k}" if request.param == "dimap" else f"scene{k}"
-        blank(path / f"{stem}.tif")
+        write_blank(path / f"{stem}.tif", SIZE)
     return path
 
 
@@ -81,20 +69,13 @@ def test_an_adjustment_on_physical_models(folder, tmp_path):
     xy = np.stack([camera.project(ground) for camera in turned], axis=1) + rng.normal(0, 0.02, (len(ground), 3, 2))
     assert len(ground) > 150
     half = len(ground) // 2
-    tracks = Tracks(
-        np.tile(np.arange(3), half),
-        np.repeat(np.arange(half), 3),
-        xy[:half].reshape(-1, 2),
-        np.full(3 * half, 0.02),
-    )
     stems = [path.stem for path in sorted(folder.glob("*.tif"))]
-    write_matches(tmp_path / "ties.csv", tracks, stems)
+    write_matches(tmp_path / "ties.csv", tied(xy[:half], 0.02), stems)
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
     result = adjust(images(folder), tmp_path / "out", options)
-    view, point = np.tile(np.arange(3), len(ground) - half), np.repeat(np.arange(len(ground) - half), 3)
 
     def miss(cameras):
-        found = triangulate(cameras, view, point, xy[half:].reshape(-1, 2), alt=150.0)
+        found = triangulate(cameras, *rows_of(xy[half:]), alt=150.0)
         return np.sqrt(np.nanmean(found.residuals**2))
 
     fresh = [read_rpc(tmp_path / "out" / f"{stem}_RPC.TXT") for stem in stems]
@@ -107,7 +88,7 @@ def test_an_adjustment_on_physical_models(folder, tmp_path):
 
 def test_the_rpc_stays_the_default(tmp_path):
     text, _ = isd(Flight(size=SIZE, swing=0.0))
-    image = blank(tmp_path / "a.tif")
+    image = write_blank(tmp_path / "a.tif", SIZE)
     (tmp_path / "a.XML").write_text(text)
     write_rpc(make_rpc(), tmp_path / "a.RPB")
     assert open_camera(image).format == "rpb"
@@ -181,7 +162,7 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     for name, look in zip("ab", LOOKS, strict=False):
         text, _ = isd(Flight(size=SIZE, look=look, swing=1e-4))
         (tmp_path / f"{name}.XML").write_text(text)
-        blank(tmp_path / f"{name}.tif")
+        write_blank(tmp_path / f"{name}.tif", SIZE)
         cameras.append(open_camera(tmp_path / f"{name}.XML", altitudes=(0.0, 1000.0)).model)
     rng = np.random.default_rng(2)
     ground = cameras[0].localize(rng.uniform(30, np.array(SIZE) - 30, (300, 2)), rng.uniform(0, 300, 300))
@@ -190,8 +171,7 @@ def test_a_run_on_swinging_platforms_ends_with_grids_that_hold_them(tmp_path):
     xy += rng.normal(0, 0.1, xy.shape)
     count = len(xy)
     assert count > 100
-    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy.reshape(-1, 2), np.full(2 * count, 0.1))
-    write_matches(tmp_path / "ties.csv", tracks, ["a", "b"])
+    write_matches(tmp_path / "ties.csv", tied(xy, 0.1), ["a", "b"])
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True)
     given = [f"{tmp_path / name}.tif,model=physical,altitudes=0:1000" for name in "ab"]
     result = adjust(given, tmp_path / "out", options)
@@ -218,7 +198,7 @@ def scene_text():
 )
 def test_an_image_of_a_scene_has_the_camera_beside_it(tmp_path, scene_text, names):
     image, file = (tmp_path / name for name in names)
-    blank(image)
+    write_blank(image, SIZE)
     file.write_text(scene_text)
     camera = open_camera(image)
     assert (camera.format, camera.path, camera.size) == ("spot physical model", file, SIZE)
@@ -240,13 +220,13 @@ def test_an_image_of_a_scene_has_the_camera_beside_it(tmp_path, scene_text, name
 def test_other_images_beside_a_scene_are_not_its_image(tmp_path, scene_text):
     (tmp_path / "METADATA.DIM").write_text(scene_text)
     with pytest.raises(ImageError, match="no RPC in the image and none beside it"):
-        open_camera(blank(tmp_path / "ortho.tif"))
+        open_camera(write_blank(tmp_path / "ortho.tif", SIZE))
     with pytest.raises(InputError, match=r"\(60, 40\) px large, its physical model in .* of \(900, 6000\)"):
         open_camera(write_image(tmp_path / "IMAGERY.TIF", (1, 40, 60)))
 
 
 def test_a_scene_of_another_level_is_refused_by_its_level(tmp_path, scene_text):
-    blank(tmp_path / "IMAGERY.TIF")
+    write_blank(tmp_path / "IMAGERY.TIF", SIZE)
     (tmp_path / "METADATA.DIM").write_text(scene_text.replace(">1A<", ">2A<"))
     for name in ("IMAGERY.TIF", "METADATA.DIM"):
         with pytest.raises(RpcFormatError, match=r"METADATA\.DIM: a scene of level 2A, resampled: only 1A has"):
@@ -263,7 +243,7 @@ def test_corners_of_another_scene_are_said_with_the_camera(tmp_path, scene_text)
 @pytest.mark.parametrize("mission", [4, pytest.param(5, marks=pytest.mark.slow)])
 def test_an_rpc_of_a_scene_is_that_of_its_orbit(tmp_path, mission):
     scene = Scene(mission, SIZE, center_line=3000, swath=(0.002, 0.0108), listed=40 * (mission == 5))
-    blank(tmp_path / "IMAGERY.TIF")
+    write_blank(tmp_path / "IMAGERY.TIF", SIZE)
     (tmp_path / "METADATA.DIM").write_text(scene.text())
     found = barpc.fit(tmp_path / "IMAGERY.TIF", tmp_path / "new" / "IMAGERY_RPC.TXT")
     image = np.array([[10.0, 5000.0], [450.0, 3000.0], [880.0, 20.0]])

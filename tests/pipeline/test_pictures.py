@@ -16,8 +16,8 @@ from barpc.base.errors import InputError
 from barpc.pipeline import pictures
 from barpc.pipeline.remake import remake_report
 from barpc.simulate import simulate_block
+from tests.geotiffs import write_image
 from tests.sealing import seal
-from tests.tie.conftest import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

@@ -14,6 +14,7 @@ from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.scene import View
 from benchmarks.planted import FOLLOWED, GOOD, Clean, Plant, clean, planted, plants, run
+from tests.geotiffs import write_image
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +87,7 @@ def moved(untouched: Clean, box: tuple[int, int, int, int], by: tuple[float, flo
             (left, top), (right, bottom) = ([box[::2], box[1::2]] + there).clip(0)
             part = np.s_[top:bottom, left:right]
             pixels[part] = np.rint(shifted[part]).clip(1, 60000)
-            path = folder / f"{view.name}.tif"
-            with rasterio.open(path, "w", **profile) as file:
-                file.write(pixels, 1)
+            path = write_image(folder / f"{view.name}.tif", pixels, **profile)
         views.append(replace(view, path=str(path)))
     return views
 

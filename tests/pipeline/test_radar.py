@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.fit import fit_rpc
 from barpc.pipeline import adjust
 from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.scene import Tracks
 from barpc.sensor.curve import Curve
 from barpc.sensor.sicd import open_sicd
 from barpc.simulate import Look, fly
+from tests.everywhere import tied
+from tests.geotiffs import write_blank
 from tests.sensor.radar_documents import SIZE, document
 
 TARGET, ALT = np.array([5.4, 43.3, 120.0]), (-100.0, 400.0)
 STATED = "<ErrorStatistics><CompositeSCP><Rg>3</Rg><Az>3</Az></CompositeSCP></ErrorStatistics></SICD>"
-
-
-def blank(path, size):
-    """An image in which nothing varies: no two such are compared."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        profile = {"driver": "GTiff", "width": size[0], "height": size[1], "count": 1, "dtype": "uint8"}
-        with rasterio.open(path, "w", **profile, compress="deflate") as out:
-            out.write(np.ones((1, size[1], size[0]), dtype=np.uint8))
-    return str(path)
 
 
 @pytest.mark.slow
@@ -45,16 +33,15 @@ def test_a_radar_image_is_adjusted_beside_optical_ones(tmp_path):
     orbit = radar.orbit.coeffs.copy()
     orbit[:, 0] += [1.5, -1.0, 2.0]
     truth.append(replace(radar, orbit=Curve(radar.orbit.knots, orbit)))
-    images = [blank(tmp_path / f"{name}.tif", (1200, 1200)) for name in "ab"]
+    images = [str(write_blank(tmp_path / f"{name}.tif", (1200, 1200))) for name in "ab"]
     for image, rpc in zip(images, truth, strict=False):
         write_rpc(rpc, image.replace(".tif", "_RPC.TXT"))
-    images.append(f"{blank(tmp_path / 'radar.tif', SIZE)},camera={tmp_path / 'radar.xml'}")
+    images.append(f"{write_blank(tmp_path / 'radar.tif', SIZE)},camera={tmp_path / 'radar.xml'}")
     rng, count = np.random.default_rng(2), 120
     ground = TARGET + rng.uniform(-1, 1, (2 * count, 3)) * [1.5e-3, 1.5e-3, 80.0]
     xy = np.stack([camera.project(ground) for camera in truth], axis=1)
-    ties = xy[:count].reshape(-1, 2) + rng.normal(0, 0.05, (3 * count, 2))
-    index = np.tile(np.arange(3), count), np.repeat(np.arange(count), 3)
-    write_matches(tmp_path / "ties.csv", Tracks(*index, ties, np.full(3 * count, 0.05)), ["a", "b", "radar"])
+    ties = tied(xy[:count] + rng.normal(0, 0.05, (count, 3, 2)), 0.05)
+    write_matches(tmp_path / "ties.csv", ties, ["a", "b", "radar"])
     options = RunOptions(matches=str(tmp_path / "ties.csv"), matches_only=True, adjust=AdjustOptions(fixed=("a", "b")))
     result = adjust(images, tmp_path / "out", options)
     fresh = read_rpc(tmp_path / "out" / "radar_RPC.TXT")

@@ -11,12 +11,13 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import fit_rpc
-from barpc.pipeline.verify_outputs import control_grid
 from barpc.rpcio import read_rpc
-from barpc.scene import Tracks, View
-from barpc.sensor.geometry import epipolar_offset, triangulate
+from barpc.scene import View
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
+from barpc.sensor.sampler import Sample
+from barpc.sensor.triangulation import epipolar_offset, triangulate
 from tests.constants import chosen
+from tests.everywhere import rows_of, tied
 from tests.lanes import rest_slow
 
 from .conftest import check_points
@@ -118,10 +119,10 @@ def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_
     chained = np.array([[*row, *by_place[tuple(row[:2])]] for row in second if tuple(row[:2]) in by_place])
     assert len(chained) > 300
 
-    view, point = np.tile([0, 1, 2], len(chained)), np.repeat(np.arange(len(chained)), 3)
+    chained = chained.reshape(-1, 3, 2)
 
     def errors(sensors):
-        residuals = triangulate(sensors, view, point, chained.reshape(-1, 2), alt=200.0).residuals
+        residuals = triangulate(sensors, *rows_of(chained), alt=200.0).residuals
         return (residuals.reshape(-1, 6) ** 2).mean(axis=1)
 
     folder = shared_data / "optical/phr_triplet_north"
@@ -132,9 +133,8 @@ def test_check_points_seen_in_three_images_are_met_to_a_tenth_of_a_pixel(shared_
     assert np.sqrt(np.sort(adjusted)[: int(0.99 * len(adjusted))].mean()) <= 0.10
     # with them, nobody can do better than cameras adjusted to the check points themselves
     views = [View(f"img_0{i}", "", (1024, 560), rpc, (0.0, 1000.0)) for i, rpc in enumerate(delivered, start=1)]
-    own = Tracks(view, point, chained.reshape(-1, 2), np.full(len(view), 0.1))
     with chosen(AdjustOptions, robust_threshold=1e9) as options:  # least squares of all
-        best = adjust_tracks(views, own, options, hold_out=False)
+        best = adjust_tracks(views, tied(chained, 0.1), options, hold_out=False)
     assert best.inlier.all()
     assert np.sqrt(adjusted.mean()) <= 1.01 * np.sqrt((best.residuals**2).mean())
 
@@ -157,11 +157,11 @@ def test_ventoux_with_little_overlap_is_met_within_five_hundredths_of_a_pixel(re
 def test_the_files_hold_p_ba_to_a_millionth_of_a_pixel(request, which):
     result, out = request.getfixturevalue(which)
     for view, model in zip(result.run.views, result.adjustment.sensors, strict=True):
-        ground, truth = control_grid(model, view.size, view.alt_range)
-        assert len(ground) == 11 * 11 * 5
-        assert np.abs(view.sensor.project(ground) - truth).max() > 0.05  # doing nothing does not pass
+        sample = Sample.grid(model, view.size, view.alt_range)
+        assert len(sample.ground) == 11 * 11 * 5
+        assert sample.compare(view.sensor.project) > 0.05  # doing nothing does not pass
         for name in (f"{view.name}.vrt", f"{view.name}_RPC.TXT"):
-            assert np.abs(read_rpc(out / name).project(ground) - truth).max() <= 1e-6
+            assert sample.compare(read_rpc(out / name).project) <= 1e-6
 
 
 @pytest.mark.parametrize("which", rest_slow(["ventoux_biased", "triplet", "ventoux"]))

@@ -14,6 +14,7 @@ from barpc.cli import main
 from barpc.pipeline import adjust
 from barpc.pointio.gcps import read_gcps
 from barpc.rpcio import read_rpc
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.pipeline.known import errors_at_check_points, part, whole
 from tests.scenes import ImageOptions, Scene
@@ -180,14 +181,10 @@ def coarser(path, step: float, folder):
         shape = file.height // times, file.width // times
         pixels = file.read(1)[: shape[0] * times, : shape[1] * times]
         pixels = pixels.reshape(shape[0], times, shape[1], times).mean(axis=(1, 3)).astype(pixels.dtype)
-        profile = {"width": shape[1], "height": shape[0], "count": 1, "dtype": pixels.dtype, "crs": file.crs}
         a, b, c, d, e, f = file.transform[:6]
         place = rasterio.Affine(times * a, times * b, c, times * d, times * e, f)
-        profile |= {"transform": place, "nodata": file.nodata}
-    coarse = folder / f"{path.stem}_{step:g}.tif"
-    with rasterio.open(coarse, "w", "GTiff", **profile) as file:
-        file.write(pixels, 1)
-    return coarse
+        how = {"crs": file.crs, "transform": place, "nodata": file.nodata}
+    return write_image(folder / f"{path.stem}_{step:g}.tif", pixels, **how)
 
 
 @pytest.mark.costs(4)
@@ -219,8 +216,7 @@ def test_a_geoid_that_was_left_out_is_the_reason(quickbird, shared_data, tmp_pat
     with rasterio.open(shared_data / "cross_sensor" / "ngi_2015" / "dem.tif") as file:
         profile, heights = file.profile, file.read(1)
     profile["crs"] = "+proj=tmerc +lat_0=0 +lon_0=25 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +axis=enu"
-    with rasterio.open(tmp_path / "dem.tif", "w", **profile) as file:
-        file.write(heights, 1)
+    write_image(tmp_path / "dem.tif", heights, **profile)
     result, rms = quickbird(5.0, dem=str(tmp_path / "dem.tif"))
     assert np.hypot(*rms) > 0.6
     (why,) = result.summary["reasons"]
@@ -242,8 +238,7 @@ def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, 
         "mirrored": heights[::-1],
         "one height": np.zeros_like(heights),
     }[wrong]
-    with rasterio.open(path, "w", **profile) as file:
-        file.write(np.where(known, made, heights), 1)
+    write_image(path, np.where(known, made, heights), **profile)
     result, rms = quickbird(10.0, dem=str(path), geoid=str(shared_data / "dem" / "egm96_15.gtx"))
     assert np.hypot(*rms) > 0.5
     assert not result.passed

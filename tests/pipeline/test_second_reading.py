@@ -20,6 +20,7 @@ import barpc
 from barpc.base.geodesy import Array
 from barpc.pipeline.run import AdjustResult
 from barpc.verbs import figures
+from tests.geotiffs import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 TOLERANCE = 0.005  # px
@@ -170,9 +171,7 @@ def test_fit(shared_data: Path, tmp_path: Path) -> None:
     width, height = camera.size
     at = np.stack(np.meshgrid(np.linspace(7, width - 9, 23), np.linspace(5, height - 8, 29)), axis=-1).reshape(-1, 2)
     parts = [camera.model.localize(at, np.full(len(at), alt)) for alt in (77.0, 333.0, 1010.0)]
-    image = tmp_path / "a.tif"
-    with rasterio.open(image, "w", driver="GTiff", width=1, height=1, count=1, dtype="uint8") as made:
-        made.write(np.zeros((1, 1, 1), dtype=np.uint8))
+    image = write_image(tmp_path / "a.tif", np.zeros((1, 1), dtype=np.uint8))
     off = by_gdal(image)(np.concatenate(parts)) - np.tile(at, (3, 1))
     assert abs(np.sqrt((off**2).sum(axis=1).mean()) - np.linalg.norm(fitted.rmse_ckp)) <= TOLERANCE
 

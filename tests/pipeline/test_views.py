@@ -23,6 +23,7 @@ from barpc.rpcio import write_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC
 from benchmarks.real_sets import as_rasterio
+from tests import geotiffs
 from tests.rpcio.conftest import make_rpc
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -32,15 +33,7 @@ WIDE, HIGH = 700, 90
 
 def placed(folder: Path, name: str, pixels: np.ndarray, shift: float = 0.0, **profile: object) -> Path:
     """An image of these pixels, its RPC beside it."""
-    path, bands = folder / f"{name}.tif", pixels.reshape(-1, *pixels.shape[-2:])
-    shape = {
-        "count": len(bands),
-        "height": bands.shape[1],
-        "width": bands.shape[2],
-        "dtype": str(bands.dtype),
-    }
-    with rasterio.open(path, "w", "GTiff", **shape, **profile) as out:
-        out.write(bands)
+    path = geotiffs.write_image(folder / f"{name}.tif", pixels, **profile)
     write_rpc(make_rpc().crop(900 + shift, 900), folder / f"{name}_RPC.TXT")
     return path
 

@@ -21,11 +21,12 @@ from rasterio.warp import transform
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import HeightDatum, ecef_from_ground
 from barpc.pointio.gcp_formats import GCP_FORMATS
-from barpc.pointio.gcp_formats import GCP_NAMES as NAMES_OF
+from barpc.pointio.gcp_tables import GCP_NAMES as NAMES_OF
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.tables import COLUMNS, degrees, guessed
 from barpc.report.geopackage import Layer, geopackage, point_shapes
 from barpc.scene import GroundPoints
+from tests.geotiffs import write_image
 
 NAMES = ["left", "right"]
 LON, LAT, ALT, COL, ROW = 5.4, 43.3, 240.0, 263.25, 889.75
@@ -128,10 +129,8 @@ US_FOOT = 1200 / 3937
 def geoid(tmp_path) -> str:
     """A geoid that lies 30 m below the ellipsoid everywhere."""
     path = tmp_path / "geoid.tif"
-    size = {"driver": "GTiff", "width": 4, "height": 3, "count": 1, "dtype": "float32"}
-    with rasterio.open(path, "w", crs="EPSG:4326", transform=rasterio.Affine(90, 0, -180, 0, -60, 90), **size) as file:
-        file.write(np.full((1, 3, 4), -30.0, np.float32))
-    return str(path)
+    place = rasterio.Affine(90, 0, -180, 0, -60, 90)
+    return str(write_image(path, np.full((3, 4), -30.0, np.float32), crs="EPSG:4326", transform=place))
 
 
 def known(found: GroundPoints) -> str | None:

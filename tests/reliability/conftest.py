@@ -17,6 +17,7 @@ import pytest
 import rasterio
 
 from barpc.cli import main
+from tests.geotiffs import write_image
 
 from .trials import SAMPLES, crop
 
@@ -85,11 +86,7 @@ def rewrite(
     if camera is not None:
         camera(rpcs)
     path.unlink()
-    shape = {"width": values.shape[1], "height": values.shape[0], "count": count, "dtype": dtype}
-    with rasterio.open(path, "w", driver="GTiff", rpcs=rpcs, **shape, **profile) as out:
-        for band in range(count):
-            out.write(values.astype(dtype), band + 1)
-    return path
+    return write_image(path, np.stack([values.astype(dtype)] * count), rpcs=rpcs, **profile)
 
 
 @pytest.fixture(autouse=True)

@@ -15,6 +15,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 import rasterio
 
+from tests.geotiffs import write_image
+
 SIDE = 160  # px; of the crops
 
 
@@ -130,10 +132,7 @@ def overviews_in_a_tiff(trap: Trap) -> bytes:
 def boxes_of_a_jp2(trap: Trap) -> bytes:
     """A JPEG 2000 image whose GML box takes its coordinate system from the server."""
     path = trap.canary.with_name("boxed.jp2")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with rasterio.open(path, "w", driver="JP2OpenJPEG", width=64, height=64, count=1, dtype="uint8") as out:
-            out.write(np.zeros((1, 64, 64), np.uint8))
+    write_image(path, np.zeros((64, 64), np.uint8), driver="JP2OpenJPEG")
     data = path.read_bytes()
     path.unlink()
     gml = (

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio import Affine
+
+from tests.geotiffs import write_image
 
 from .conftest import Said, barpc, hashes
 from .trials import SAMPLES, crop
@@ -36,10 +37,8 @@ TIES = {*SCENE, "calibrate", "report"}
 
 def grid(path: Path, metres: float) -> Path:
     """Heights around the samples."""
-    how = {"width": 40, "height": 40, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", driver="GTiff", transform=Affine(0.01, 0.0, 5.2, 0.0, -0.01, 43.5), **how) as file:
-        file.write(np.full((40, 40), metres, np.float32), 1)
-    return path
+    place = Affine(0.01, 0.0, 5.2, 0.0, -0.01, 43.5)
+    return write_image(path, np.full((40, 40), metres, np.float32), transform=place, crs="EPSG:4326")
 
 
 def replaced(path: Path, old: bytes, new: bytes) -> None:

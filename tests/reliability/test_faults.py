@@ -16,6 +16,7 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, write_rpc
+from tests.geotiffs import write_image
 
 from .conftest import assert_one_line, barpc, hashes, rewrite
 from .trials import SIDE
@@ -134,11 +135,8 @@ def everywhere(**where: float) -> Prepare:
 
 
 def dem(path: Path, west: float, north: float, height: float, crs: str | None = "EPSG:4979") -> Path:
-    grid = np.full((50, 50), height, np.float32)
-    place = {"transform": rasterio.Affine(0.01, 0, west, 0, -0.01, north)} | ({"crs": crs} if crs else {})
-    with rasterio.open(path, "w", driver="GTiff", width=50, height=50, count=1, dtype="float32", **place) as out:
-        out.write(grid, 1)
-    return path
+    place = rasterio.Affine(0.01, 0, west, 0, -0.01, north)
+    return write_image(path, np.full((50, 50), height, np.float32), transform=place, crs=crs)
 
 
 def terrain(height: float, shift: float = 0.0, crs: str | None = "EPSG:4979", *more: object) -> Prepare:
@@ -438,9 +436,7 @@ def strip_rpc(path: Path) -> None:
     with rasterio.open(path) as image:
         values = image.read(1)
     path.unlink()
-    shape = {"width": values.shape[1], "height": values.shape[0], "count": 1, "dtype": "uint16"}
-    with rasterio.open(path, "w", driver="GTiff", **shape) as out:
-        out.write(values, 1)
+    write_image(path, values)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ import pytest
 import rasterio
 
 from barpc.rpcio import read_rpc, write_rpc
+from tests.geotiffs import write_image
 from tests.lanes import diagonal, rest_slow
 
 from .conftest import Said, barpc, hashes
@@ -35,8 +36,7 @@ def trap(tmp_path: Path) -> Iterator[Trap]:
     canary, raster = outside / "canary.txt", outside / "canary.tif"
     canary.write_text(SECRET)
     for path in (raster, outside / "good.tif"):
-        with rasterio.open(path, "w", driver="GTiff", width=SIDE, height=SIDE, count=1, dtype="uint16") as out:
-            out.write(np.full((1, SIDE, SIDE), 4242, np.uint16))
+        write_image(path, np.full((SIDE, SIDE), 4242, np.uint16))
     with served(canary, raster) as found:
         libc = ctypes.CDLL(None, use_errno=True)
         watch = libc.inotify_init1(os.O_NONBLOCK) if hasattr(libc, "inotify_init1") else -1

@@ -35,6 +35,7 @@ import barpc.pipeline.calibrate
 import barpc.verbs.orthoimages  # noqa: F401
 from barpc.cli import main as barpc_main
 from barpc.workspace import code_version
+from tests.geotiffs import write_image
 
 SAMPLES = sorted((Path(__file__).resolve().parents[2] / "data_samples").glob("*.tif"))
 SIDE = 160  # px of a crop: a third of a second a run
@@ -48,10 +49,7 @@ def crop(source: Path, target: Path, side: int = SIDE, start: int = 300) -> Path
             pixels, rpcs = image.read(1, window=Window(start, start, side, side)), image.rpcs
         rpcs.samp_off -= start
         rpcs.line_off -= start
-        shape = {"width": side, "height": side, "count": 1, "dtype": "uint16"}
-        with rasterio.open(target, "w", driver="GTiff", rpcs=rpcs, **shape) as out:
-            out.write(pixels, 1)
-    return target
+    return write_image(target, pixels, rpcs=rpcs)
 
 
 def outputs(folder: Path) -> dict[str, bytes]:

@@ -16,7 +16,7 @@ from barpc.report import Run, Summary, verdict
 from barpc.report.records import json_form
 from barpc.rpcio import write_rpc
 from barpc.scene import View
-from barpc.sensor.geometry import camera_center
+from barpc.sensor.centers import camera_center
 from barpc.simulate import simulate_block
 from barpc.workspace import Workspace
 from tests.sealing import seal

@@ -23,8 +23,8 @@ from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.views import cell_numbers
 from barpc.scene import Tracks
-from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.tie.detail import Gap
 from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm

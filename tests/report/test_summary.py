@@ -22,7 +22,8 @@ from barpc.report.summary import published_schema
 from barpc.report.summary.views import ViewEntry
 from barpc.scene import middle_altitude
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import epipolar_offset, view_angles
+from barpc.sensor.geometry import view_angles
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.simulate import simulate_block
 from tests.lanes import rest_slow
 from tests.report.conftest import summarize

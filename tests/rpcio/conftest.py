@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.shutil import copy as raster_copy
 
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
 from barpc.rpcio.xml import rpc_items
 from barpc.sensor.rpc import RPC
+from tests import geotiffs
 
 
 def rpc_domain(rpc: RPC) -> str:
@@ -41,14 +39,8 @@ def rpc() -> RPC:
 
 def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile: object) -> Path:
     """A raster of known pixels; keywords go to rasterio."""
-    count, height, width = shape
     data = np.random.default_rng(5).integers(0, 60000, shape).astype(profile.pop("dtype", "uint16"))
-    options = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": data.dtype}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", **(options | profile)) as out:
-            out.write(data)
-    return path
+    return geotiffs.write_image(path, data, **profile)
 
 
 def pixels(path: Path) -> np.ndarray:

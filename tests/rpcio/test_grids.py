@@ -13,13 +13,13 @@ from scipy.interpolate import RegularGridInterpolator
 from barpc.base.errors import BarpcError, RpcError, RpcFormatError
 from barpc.base.geodesy import metres_per_unit
 from barpc.cameras import open_camera
-from barpc.fit.points import Sample
 from barpc.pipeline.verify_outputs import unverified, verify_grid
 from barpc.rpcio import read_rpc
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.rpcio.grids import read_correction, write_correction, write_grid
 from barpc.sensor.direct_grid import LINEAR, DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid, Displaced
+from barpc.sensor.sampler import Scattered
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc
 
@@ -33,7 +33,7 @@ def camera():
 
 @pytest.fixture(scope="module")
 def sample(camera):
-    return Sample.of(camera, SIZE, ALTS)
+    return Scattered.over(camera, SIZE, ALTS)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +161,7 @@ def test_consumers_find_the_error_of_a_grid_and_not_less(folder, camera, sample,
 def test_a_grid_across_the_antimeridian_is_read_by_all_but_shareloc_which_says_why(lon, across, tmp_path):
     rpc, size, alts = make_rpc(lon=lon), (2000, 1900), (30.0, 300.0)
     write_grid(DirectGrid.of(rpc, size, alts), tmp_path / f"a{GRID_SUFFIX}")
-    for reading in verify_grid(tmp_path / f"a{GRID_SUFFIX}", Sample.of(rpc, size, alts)):
+    for reading in verify_grid(tmp_path / f"a{GRID_SUFFIX}", Scattered.over(rpc, size, alts)):
         told = "shareloc takes no longitude beyond 180 degrees" in reading.note
         assert told == (across and reading.consumer == "shareloc")
         assert told or reading.max_error < LINEAR, reading

@@ -15,6 +15,7 @@ from barpc.base.geodesy import Array
 from barpc.pipeline.verify_outputs import CONSUMERS, verify
 from barpc.rpcio import read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.sensor.rpc import RPC, altitude_range
+from barpc.sensor.sampler import Sample
 from tests.lanes import rest_slow
 
 PRINTED = 0.51e-7
@@ -156,7 +157,7 @@ def test_what_is_written_of_a_vendor_s_rpc_reads_the_same_in_every_tool(file, sh
     write_rpc_vrt(rpc, pixels, tmp_path / "a.vrt")
     write_rpc_copy(rpc, pixels, tmp_path / "copy" / "a.tif")
     paths = [*(tmp_path / name for name in [*names, "a.vrt"]), tmp_path / "copy" / "a.tif"]
-    readings = verify(paths, rpc, _size(rpc), altitude_range(rpc))
+    readings = verify(paths, Sample.grid(rpc, _size(rpc), altitude_range(rpc)))
     assert {reading.path for reading in readings} == set(paths)
     for reading in readings:
         assert reading.max_error <= ROUNDING, reading

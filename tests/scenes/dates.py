@@ -11,8 +11,9 @@ import numpy as np
 
 from barpc.base.geodesy import Array
 from barpc.scene import BoolArray, View
-from barpc.sensor.geometry import triangulate
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
+from tests.everywhere import rows_of
 from tests.scenes.files import _write_image
 from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.render import expose, render
@@ -95,10 +96,8 @@ class Years:
         ground = self.scene.target + np.stack([east / np.cos(np.radians(43.3)), north, up], axis=1)
         shots = np.array(self.scene.shots, dtype=object)[slice(None) if seen is None else seen]
         xy = np.stack([shot.exact.project(ground) for shot in shots], axis=1)
-        n, views = xy.shape[:2]
-        index = np.tile(np.arange(views), n), np.repeat(np.arange(n), views)
-        found = triangulate(sensors, *index, xy.reshape(-1, 2), alt=float(self.scene.target[2]))
-        return np.asarray(np.sqrt((found.residuals.reshape(n, views, 2) ** 2).sum(axis=2).mean(axis=0)))
+        found = triangulate(sensors, *rows_of(xy), alt=float(self.scene.target[2]))
+        return np.asarray(np.sqrt((found.residuals.reshape(xy.shape) ** 2).sum(axis=2).mean(axis=0)))
 
 
 class _Seasons:

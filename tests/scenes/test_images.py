@@ -13,9 +13,11 @@ from click.testing import CliRunner
 
 from barpc.base.errors import InputError, OutputError
 from barpc.rpcio import read_rpc
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
+from barpc.sensor.geometry import convergence_angle
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import triangulate
 from tests.scenes import ImageOptions, Scene, images, write_scene
 from tests.scenes.__main__ import command
 from tests.scenes.images import inverse

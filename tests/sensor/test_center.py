@@ -10,7 +10,7 @@ import pytest
 
 from barpc.base.errors import RpcError
 from barpc.cameras import open_camera
-from barpc.sensor.geometry import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
+from barpc.sensor.centers import NOMINAL_ALTITUDE, PLAUSIBLE_ALTITUDE, camera_center
 from barpc.simulate import Look, fly
 
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

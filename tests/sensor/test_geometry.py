@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.sensor.centers import camera_center
 from barpc.sensor.geometry import (
     base_to_height,
-    camera_center,
     convergence_angle,
-    epipolar_offset,
     footprint,
     ground_sample_distance,
     image_border,
     lines_of_sight,
-    triangulate,
     view_angles,
 )
 from barpc.sensor.rpc import RPC
+from barpc.sensor.triangulation import epipolar_offset, triangulate
 
 from .conftest import make_rpc
 

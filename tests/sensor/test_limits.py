@@ -14,18 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction, RigidMotion
 from barpc.sensor.curve import Curve, about_middle, rotation_matrix
 from barpc.sensor.document import XmlFields, parse_time, seconds
-from barpc.sensor.geometry import (
-    Several,
-    camera_center,
-    image_border,
-    image_grid,
-    lines_of_sight,
-    sight_enu,
-    view_angles,
-)
+from barpc.sensor.geometry import Several, image_border, lines_of_sight, sight_enu, view_angles
 from barpc.sensor.image_corrections import (
     CorrectionGrid,
     Displaced,
@@ -36,6 +29,7 @@ from barpc.sensor.image_corrections import (
 )
 from barpc.sensor.radar import aside, dot, on_circle
 from barpc.sensor.rpc import altitude_range
+from barpc.sensor.sampler import image_grid
 from barpc.sensor.sicd import ImagePlane, Monostatic, PolarFormat, RangeAzimuth, ZeroDoppler, open_sicd
 from tests.sensor.conftest import MODELS, make_rpc
 from tests.sensor.radar_documents import document

@@ -12,6 +12,7 @@ import pytest
 import rasterio
 
 from barpc.sensor.sentinel1 import burst_rows, read_annotation
+from tests.geotiffs import write_image
 from tests.sensor.s1_product import Product
 
 HEIGHT = 250.0
@@ -51,16 +52,7 @@ def safe(tmp_path: Path) -> Path:
         pixels[burst.first_line : burst.first_line + 20] = 0
         pixels[burst.first_line + SMALL.lines_per_burst - 20 : lines.stop] = 0
     name = folder / "measurement" / SMALL.name.replace(".xml", ".tiff")
-    profile = {
-        "driver": "GTiff",
-        "width": SMALL.samples,
-        "height": SMALL.lines,
-        "count": 1,
-        "dtype": "complex64",
-    }
-    with rasterio.Env(), pytest.warns(rasterio.errors.NotGeoreferencedWarning):
-        with rasterio.open(name, "w", **profile) as target:
-            target.write(pixels, 1)
+    write_image(name, pixels)
     return folder
 
 

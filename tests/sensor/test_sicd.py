@@ -15,9 +15,11 @@ from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
 from barpc.scene import Tracks, View
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_center, triangulate, view_angles
+from barpc.sensor.geometry import view_angles
 from barpc.sensor.sicd import find_sicd, is_sicd, open_sicd
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import Look, fly
 from tests.sensor.radar_documents import DURATION, KINDS, SIZE, document, nitf
 

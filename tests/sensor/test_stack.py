@@ -9,9 +9,11 @@ import pytest
 
 from barpc.base.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
+from barpc.sensor.centers import camera_center, camera_centers
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import GRID_NODES, Several, camera_center, camera_centers, ground_grids, image_grid
+from barpc.sensor.geometry import Several
 from barpc.sensor.rpc import RPC, RpcStack, localize_stack
+from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
 
@@ -108,9 +110,10 @@ def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
     np.testing.assert_array_equal(asked, ground + view[:, None])
     sizes = [(20_000, 19_000), (9_000, 8_000), (5_000, 20_000)]
     cameras = [(sensor, size, (0.0, 0.01 * size[0])) for sensor, size in zip(some, sizes, strict=True)]
-    for (sensor, size, alts), found in zip(cameras, ground_grids(cameras), strict=True):
+    for (sensor, size, alts), found in zip(cameras, Sample.grids(cameras), strict=True):
         at, level = image_grid(size, alts, GRID_NODES)
-        np.testing.assert_allclose(found, np.column_stack([sensor.localize(at, level), at]), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found.ground, sensor.localize(at, level), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found.image, at, rtol=0, atol=1e-5)
 
 
 def test_nothing_is_asked_of_no_camera():

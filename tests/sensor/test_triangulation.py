@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
-from barpc.sensor.geometry import intersect_pair, triangulate
 from barpc.sensor.rpc import RpcStack
+from barpc.sensor.triangulation import intersect_pair, triangulate
 from tests.sensor.test_geometry import tilted_rpc
 
 SENSORS = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]

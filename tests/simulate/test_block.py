@@ -7,8 +7,10 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
+from barpc.sensor.centers import camera_center
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import camera_center, convergence_angle, triangulate
+from barpc.sensor.geometry import convergence_angle
+from barpc.sensor.triangulation import triangulate
 from barpc.simulate import BlockOptions, fly, looks, recentred, simulate_block
 
 

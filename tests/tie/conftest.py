@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 from scipy import ndimage
 
 from barpc.rasters.raster import open_raster
@@ -17,23 +15,11 @@ from barpc.rpcio import read_rpc
 from barpc.scene import View
 from barpc.sensor.rpc import RPC, altitude_range
 from barpc.tie import TieResult, find_tracks
+from tests.geotiffs import write_image
 from tests.scenes import ImageOptions, Scene
 
 SIDES = [300, pytest.param(600, marks=pytest.mark.nightly)]
 """Rows and columns of a rendered scene: a quarter of the ground, all of it at night."""
-
-
-def write_image(path: Path, data: np.ndarray, **profile: object) -> Path:
-    """Write (H, W) or (bands, H, W) as a GeoTIFF without georeference."""
-    bands = data if data.ndim == 3 else data[None]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        with rasterio.open(
-            path, "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1], count=len(bands),
-            dtype=bands.dtype, **profile,
-        ) as out:  # fmt: skip
-            out.write(bands)
-    return path
 
 
 def view_of(path: Path, rpc: RPC) -> View:

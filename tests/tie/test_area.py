@@ -16,16 +16,17 @@ from barpc.base.errors import DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 from barpc.tie import Scope, TieOptions, find_tracks, read_area
 from barpc.tie.matchers import features
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Footprints, shared_tiles
 from barpc.tie.pixels import tiles
 from tests.constants import chosen
+from tests.geotiffs import write_image
 from tests.tie.stages import select_pairs
 
-from .conftest import Rendered, write_image
+from .conftest import Rendered
 from .test_pairs import METRE, camera
 from .test_pairs import views as views_of
 

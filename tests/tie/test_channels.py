@@ -14,8 +14,7 @@ from barpc.tie.patches.channels import (
 )
 from barpc.tie.patches.channels import picture as resampled
 from barpc.tie.patches.oriented import PatchTile
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 SIZE = 256
 SHIFT = np.array([3.3, -2.6])

@@ -16,8 +16,7 @@ from barpc.tie.patches.dense import (
     epipolar_frame,
     refined_disparity,
 )
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 
 @pytest.mark.parametrize("turn", np.radians([20.0, 100.0, 170.0, 200.0, 280.0, 350.0]))

@@ -18,8 +18,7 @@ from barpc.tie import Area, Scope, find_tracks
 from barpc.tie.detail import PARTS_PER_SIDE, Gap, gap, in_parts, seen_detail
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.tracks import TieResult
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 SIZE = (640, 1280)
 

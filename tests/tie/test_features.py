@@ -18,9 +18,8 @@ from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octa
 from barpc.tie.pixels import survey, tiles
 from barpc.workspace import Workspace
 from tests.constants import Sized, chosen
+from tests.geotiffs import write_image
 from tests.tie.stages import detect
-
-from .conftest import write_image
 
 
 @pytest.fixture(scope="module")

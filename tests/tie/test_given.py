@@ -17,10 +17,11 @@ from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, find_tracks
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.tracks import pair_counts
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import SIDES, Rendered, write_image
+from .conftest import SIDES, Rendered
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 

@@ -14,7 +14,7 @@ from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import Sized, chosen
-from tests.tie.conftest import write_image
+from tests.geotiffs import write_image
 
 ACROSS = 4.0
 LINEAR = np.array([[1.1, 0.2], [-0.1, 0.9]])

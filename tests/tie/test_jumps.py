@@ -19,7 +19,8 @@ from barpc.tie.matchers.matching import _PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
 from benchmarks.planted import Plant
-from tests.tie.conftest import Rendered, write_image
+from tests.geotiffs import write_image
+from tests.tie.conftest import Rendered
 from tests.tie.stages import common_tracks
 
 PLANTS = [

@@ -22,11 +22,12 @@ from barpc.tie.pairing.epipolar import (
 )
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.patches import dense
-from barpc.tie.patches.register import refine
+from barpc.tie.patches.links import refine
 from barpc.tie.pixels import survey, tiles
 from tests.constants import CONSTANTS, chosen
 from tests.costs import once
-from tests.tie.conftest import Rendered, write_image
+from tests.geotiffs import write_image
+from tests.tie.conftest import Rendered
 from tests.tie.stages import detect, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
 

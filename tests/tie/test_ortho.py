@@ -12,8 +12,8 @@ from rasterio import Affine
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
 from barpc.tie.patches.channels import Patch, Sheet, of_image, of_reference, picture, picture_share, ticks
+from tests.geotiffs import write_image
 
-from .conftest import write_image
 from .test_pairs import camera, views
 
 HERE = np.array([5.4, 43.3])

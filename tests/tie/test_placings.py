@@ -18,9 +18,9 @@ from barpc.tie import TieOptions, find_tracks
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import Sift
 from barpc.tie.matchers.placings import Placing, _mirrored, misplaced, stretched
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 
-from .conftest import write_image
 from .test_pairs import camera
 
 

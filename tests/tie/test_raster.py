@@ -8,8 +8,7 @@ import rasterio
 
 from barpc.base.errors import ImageError
 from barpc.tie.pixels import Stretch, grow, levelled, read_pixels, sample_stretch
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 RNG = np.random.default_rng(0)
 

@@ -26,10 +26,10 @@ from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches.oriented import PatchTile
 from tests.constants import Sized
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import write_image
 from .test_pairs import METRE, camera, views
 
 GEOID = 28.2

@@ -31,12 +31,11 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
-
-from .conftest import write_image
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 GSD = 2.0
@@ -149,10 +148,8 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
         pixels, profile, place = file.read(1), file.profile, file.transform
     paths, half = [], pixels.shape[1] // 2
     for name, part, left in (("west", pixels[:, :half], 0), ("east", pixels[:, half:], half)):
-        paths.append(str(tmp_path / f"{name}.tif"))
         profile.update(width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f))
-        with rasterio.open(paths[-1], "w", **profile) as file:
-            file.write(part, 1)
+        paths.append(str(write_image(tmp_path / f"{name}.tif", part, **profile)))
     whole, parts = register_views(views, [reference], dem), register_views(views, paths, dem)
     assert parts.views[0].points > 0.6 * whole.views[0].points
     assert np.subtract(parts.views[0].offset, whole.views[0].offset) == pytest.approx([0, 0], abs=0.2)
@@ -317,9 +314,7 @@ def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_be
 ):
     path, degrees = tmp_path / "ref.tif", metres / 111_000.0
     corner = rasterio.Affine(degrees, 0, -25 * degrees, 0, -degrees, 25 * degrees)
-    profile = {"width": 50, "height": 50, "count": 1, "dtype": "uint8", "crs": "EPSG:4326"}
-    with rasterio.open(path, "w", "GTiff", transform=corner, **profile) as file:
-        file.write(np.ones((50, 50), np.uint8), 1)
+    write_image(path, np.ones((50, 50), np.uint8), transform=corner, crs="EPSG:4326")
     monkeypatch.setattr(_ReferenceWork, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
     view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
     assert register_views([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)

@@ -13,8 +13,8 @@ from barpc.tie.patches import register
 from barpc.tie.patches.register import _Template, _with_derivatives, register_patches, register_places, upsampled
 from barpc.tie.pixels import PixelReader
 from tests.constants import Sized
+from tests.geotiffs import write_image
 from tests.lanes import diagonal
-from tests.tie.conftest import write_image
 
 SIZE = 400
 

@@ -9,23 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from barpc.scene import Tracks
 from barpc.tie.pairing.epipolar import (
     epipolar_segments,
 )
-from barpc.tie.patches.register import (
-    PatchRegistration,
-    _at,
-    _merge_groups,
-    _Registrations,
-    _shared_variance,
-    _sparse,
-    _task_parts,
-    references,
-    register_places,
-)
+from barpc.tie.patches.links import _Registrations, _shared_variance, references
+from barpc.tie.patches.register import PatchRegistration, _at, _merge_groups, _sparse, register_places, task_parts
 from tests.constants import Sized
-from tests.tie.conftest import write_image
+from tests.everywhere import tied
+from tests.geotiffs import write_image
 from tests.tie.test_pairs import camera, views
 from tests.tie.test_tracks import tracks_of
 
@@ -86,11 +77,10 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
     two = views(camera(0.0, lean=0.0), camera(0.0, lean=0.2))
     rng = np.random.default_rng(4)
     places = rng.integers(100, 900, (count, 2)).astype(float)
-    xy = np.stack([places, epipolar_segments(*two, places).place(np.zeros(count))], axis=1).reshape(-1, 2)
-    tracks = Tracks(np.tile([0, 1], count), np.repeat(np.arange(count), 2), xy, np.full(2 * count, 0.1))
+    tracks = tied(np.stack([places, epipolar_segments(*two, places).place(np.zeros(count))], axis=1), 0.1)
     links = _Registrations(two, tracks, np.arange(0, 2 * count, 2), np.arange(1, 2 * count, 2))
     across = rng.normal(0, noise, count)
-    found = PatchRegistration.none(xy[1::2])
+    found = PatchRegistration.none(tracks.xy[1::2])
     found.sigma[:] = 0.1
     sigma = links.scaled(found, np.ones(count, dtype=bool), across)
     np.testing.assert_allclose(sigma, scaled, rtol=0.3 if scaled > 0.1 else 1e-12)
@@ -99,8 +89,8 @@ def test_sigmas_are_those_of_the_epipolar_lines_where_these_say_more(count, nois
 def links_of(count: int, seen: int) -> _Registrations:
     """Tracks in a row of `seen` like views, referred to the first."""
     many = views(*(camera(0.0, lean=0.2 * v) for v in range(seen)))
-    xy = np.repeat(np.random.default_rng(5).integers(100, 900, (count, 2)).astype(float), seen, axis=0)
-    tracks = Tracks(np.tile(np.arange(seen), count), np.repeat(np.arange(count), seen), xy, np.full(seen * count, 0.1))
+    xy = np.random.default_rng(5).integers(100, 900, (count, 1, 2)).astype(float)
+    tracks = tied(np.repeat(xy, seen, axis=1), 0.1)
     rows = np.arange(seen * count)
     other = rows[rows % seen > 0]
     return _Registrations(many, tracks, other - other % seen, other)
@@ -167,7 +157,7 @@ def test_tiles_that_follow_each_other_share_a_task_as_far_as_it_holds_their_poin
 def test_few_points_are_registered_in_bands_of_rows_swept_by_columns(count: int) -> None:
     places = np.random.default_rng(0).uniform(0, 40_000, (count, 2))
     links = np.arange(count) + 7
-    parts = _task_parts(places, links, 1024)
+    parts = task_parts(places, links, 1024)
     assert max(len(part) for part in parts) <= 512
     assert len(parts) <= 1.1 * count / 512 + count / 400  # nearly full
     assert sorted(np.concatenate(parts)) == links.tolist()

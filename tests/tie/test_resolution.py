@@ -11,16 +11,17 @@ import pytest
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
-from barpc.sensor.geometry import epipolar_offset
 from barpc.sensor.rpc import altitude_range
+from barpc.sensor.triangulation import epipolar_offset
 from barpc.tie import Matches, Pair, Scope, find_tracks
 from barpc.tie.pairing.resolution import Coarser, Looks
 from barpc.tie.pixels import PixelReader, read_picture, read_pixels, survey
 from barpc.tie.tracks import _needed
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import Rendered, view_of, write_image
+from .conftest import Rendered, view_of
 from .test_pairs import METRE, camera
 
 RNG = np.random.default_rng(4)

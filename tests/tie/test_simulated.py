@@ -16,10 +16,11 @@ from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.tie import TieOptions, find_tracks
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import SIDES, write_image
+from .conftest import SIDES
 
 
 def rms(scene, tracks: Tracks, i: int, j: int) -> np.ndarray:

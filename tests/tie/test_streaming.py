@@ -22,14 +22,14 @@ from barpc.scene import View
 from barpc.tie import TieOptions, find_tracks
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, detect_tile, keep_tile, locate
-from barpc.tie.patches.register import _usual
+from barpc.tie.patches.links import _usual
 from barpc.tie.pixels import Survey, read_picture, survey, tiles
 from barpc.workspace import Workspace
 from tests.constants import Sized
+from tests.geotiffs import write_image
 from tests.lanes import diagonal, rest_slow
 from tests.tie.stages import detect
 
-from .conftest import write_image
 from .test_pairs import camera
 
 SIDE = 1000

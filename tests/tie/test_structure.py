@@ -35,9 +35,9 @@ from barpc.tie.matchers.structural import (
 from barpc.tie.pairing.epipolar import EpipolarSegments, epipolar_segments, robust_affine
 from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register_oriented, resolution
 from barpc.tie.pixels import read_pixels
+from tests.geotiffs import write_image
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
-from tests.tie.conftest import write_image
 from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import camera, views
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from barpc.tie.pixels import jpeg, thumbnail
-
-from .conftest import write_image
+from tests.geotiffs import write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

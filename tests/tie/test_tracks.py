@@ -13,6 +13,7 @@ from barpc.tie import Matches, TieOptions, thin
 from barpc.tie import link as link_pairs
 from barpc.tie.matchers.report import PairReport
 from barpc.tie.tracks import require_tracks
+from tests.everywhere import tied
 from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import METRE, camera, views
 
@@ -79,8 +80,7 @@ def test_no_matches_make_no_tracks() -> None:
 def many(count: int, views: int = 2, crowd: float = 1.0) -> Tracks:
     rng = np.random.default_rng(1)
     xy = 1000 * rng.uniform(0, 1, (count, 1, 2)) ** crowd + rng.uniform(0, 1, (1, views, 2))
-    point, view = np.repeat(np.arange(count), views), np.tile(np.arange(views), count)
-    return Tracks(view, point, xy.reshape(-1, 2), np.full(count * views, 0.1))
+    return tied(xy, 0.1)
 
 
 @pytest.mark.parametrize("crowd", [1.0, 3.0])
@@ -175,8 +175,7 @@ def test_every_place_has_its_four_before_one_has_five() -> None:
     """A hundred tracks at one place of an image and six each at three others."""
     place = np.array([[100.0, 100.0], [900.0, 100.0], [100.0, 900.0], [900.0, 900.0]])
     of = np.repeat([0, 1, 2, 3], [100, 6, 6, 6])
-    xy = np.repeat(place[of], 2, axis=0)
-    tracks = Tracks(np.tile([0, 1], 118), np.repeat(np.arange(118), 2), xy, np.full(236, 0.1))
+    tracks = tied(np.repeat(place[of][:, None], 2, axis=1), 0.1)
 
     def kept(most: int) -> list[int]:
         left = thin(tracks, [(1000, 1000)] * 2, most)

@@ -16,6 +16,7 @@ from barpc.base.errors import InputError, OutputError, Remark
 from barpc.rasters.dem import Dem
 from barpc.rpcio import write_rpc_copy
 from tests.cli.test_images import run
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.rasters.test_dem import write_geoid
 from tests.scenes.files import write_scene
@@ -40,11 +41,7 @@ def write_hills(path: Path, crs: str = "EPSG:4979", less: float = 0.0, start: fl
     x, y = np.meshgrid(origin[0] + step * (np.arange(size) + 0.5), origin[1] - step * (np.arange(size) + 0.5))
     lon, lat = UTM.transform(x, y) if "32631" in crs else (np.mod(x + 180, 360) - 180, y)
     place = rasterio.Affine(step, 0, origin[0], 0, -step, origin[1])
-    what = {"dtype": "float32", "crs": crs, "transform": place, **how}
-    heights = (hills(lon, lat) - less).astype(np.float32)
-    with rasterio.open(path, "w", "GTiff", size, size, 1, **what) as file:
-        file.write(heights, 1)
-    return path
+    return write_image(path, (hills(lon, lat) - less).astype(np.float32), crs=crs, transform=place, **how)
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +49,8 @@ def ramp(tmp_path_factory) -> Path:
     """An image whose pixels are their own columns and rows."""
     folder = tmp_path_factory.mktemp("ramp")
     pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
-    with rasterio.open(folder / "raw.tif", "w", "GTiff", SIDE, SIDE, 2, dtype="float32") as file:
-        file.write(pixels)
-    write_rpc_copy(barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300), folder / "raw.tif", folder / "ramp.tif")
+    raw = write_image(folder / "raw.tif", pixels)
+    write_rpc_copy(barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300), raw, folder / "ramp.tif")
     return folder / "ramp.tif"
 
 
@@ -97,9 +93,7 @@ def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
     east = middle - rpc.localize([SIDE / 2, SIDE / 2], 150.0)[0]
     rpc = replace(rpc, ground_offset=rpc.ground_offset + [east, 0.0, 0.0])
     pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
-    with rasterio.open(tmp_path / "raw.tif", "w", "GTiff", SIDE, SIDE, 2, dtype="float32") as file:
-        file.write(pixels)
-    write_rpc_copy(rpc, tmp_path / "raw.tif", image := tmp_path / "ramp.tif")
+    write_rpc_copy(rpc, write_image(tmp_path / "raw.tif", pixels), image := tmp_path / "ramp.tif")
     dem = write_hills(tmp_path / "dem.tif", start=start)
     (made,) = barpc.ortho(image, tmp_path / "maps", dem=dem)
     off = errors(made.path, image, Dem.open(dem))
@@ -153,10 +147,8 @@ def test_where_the_dem_has_a_void_there_are_no_pixels_and_beyond_it_no_map(ramp,
 def test_numbers_keep_their_type_and_what_meant_nothing_still_does(tmp_path):
     pixels = np.full((1, SIDE, SIDE), 7, np.uint16)
     pixels[:, :, : SIDE // 2] = 65535
-    with rasterio.open(tmp_path / "raw.tif", "w", "GTiff", SIDE, SIDE, 1, dtype="uint16", nodata=65535) as file:
-        file.write(pixels)
     rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
-    write_rpc_copy(rpc, tmp_path / "raw.tif", tmp_path / "a.tif")
+    write_rpc_copy(rpc, write_image(tmp_path / "raw.tif", pixels, nodata=65535), tmp_path / "a.tif")
     with rasterio.open(tmp_path / "a.tif") as image:
         (made,) = barpc.ortho(image, tmp_path / "maps", alt=150, crs="EPSG:2154", gsd=1)
     assert (made.crs, made.gsd) == ("EPSG:2154", 1.0)
@@ -181,8 +173,7 @@ def test_nothing_is_replaced_and_radar_s_complex_pixels_are_named(ramp, tmp_path
     assert (tmp_path / "maps/ramp.tif").read_bytes() == before
     assert run("ortho", ramp, "--alt", 150, "--overwrite", "-o", ramp.parent) == 1
     assert "is an input and is never written" in capsys.readouterr().err
-    with rasterio.open(tmp_path / "c.tif", "w", "GTiff", SIDE, SIDE, 1, dtype="complex64") as file:
-        file.write(np.ones((1, SIDE, SIDE), np.complex64))
+    write_image(tmp_path / "c.tif", np.ones((SIDE, SIDE), np.complex64))
     write_rpc_copy(barpc.read_rpc(ramp), tmp_path / "c.tif", tmp_path / "complex.tif")
     with pytest.raises(InputError, match=r"complex\.tif: complex pixels"):
         barpc.ortho(tmp_path / "complex.tif", tmp_path / "other", alt=150)

@@ -15,8 +15,8 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import IntArray, View
 from barpc.sensor import SensorModel
+from barpc.sensor.centers import camera_centers
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import camera_centers
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected, Splined
 from barpc.sensor.rpc import localize_stack
 

@@ -23,7 +23,7 @@ from barpc.base.geodesy import Array, ecef_from_ground, enu_basis
 from barpc.base.statistics import BEST, CONVERGED, CRITICAL, FEWEST, ITERATIONS, MANY, STEPS, SURE, SURELY
 from barpc.scene import BoolArray, GroundPoints, IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import triangulate
+from barpc.sensor.triangulation import triangulate
 
 _CHECK_SHARE = 0.1  # of all tracks
 _STEPS_PER_PIXEL = 4.0  # of coordinates rounded for the hash: changes of their last digits alter few draws

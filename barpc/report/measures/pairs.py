@@ -16,7 +16,8 @@ from barpc.report.summary.pairs import OffsetEntry, PairEntry
 from barpc.report.summary.words import medians
 from barpc.scene import IntArray
 from barpc.sensor import SensorModel
-from barpc.sensor.geometry import Several, base_to_height, convergence_angle, epipolar_offset, ground_sample_distance
+from barpc.sensor.geometry import Several, base_to_height, convergence_angle, ground_sample_distance
+from barpc.sensor.triangulation import epipolar_offset
 
 _FROM_FAR = 4  # steps to a pair's closest approach, from the altitude of the scene
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken

@@ -25,10 +25,11 @@ from barpc.report.summary.views import (
 )
 from barpc.scene import IntArray, View
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.geometry import Several, ground_grids, ground_sample_distance, view_angles
+from barpc.sensor.geometry import Several, ground_sample_distance, view_angles
 from barpc.sensor.image_corrections import ImageCorrected, RowSpline, Splined
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
+from barpc.sensor.sampler import Sample
 
 _SPLINE_ROWS = 400  # of an image, over which a spline is averaged
 
@@ -117,7 +118,7 @@ def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
     if behind is not None:
         seen = list(zip(*behind.project_ecef(ecef_from_ground(middle)), behind.sensor.project(middle), strict=True))
     ends = [(model, view.size, view.alt_range) for model, view in zip(run.cameras, run.views, strict=True)]
-    grids = ground_grids(ends, (3, 2)) if run.written else None
+    shown = [np.hstack([one.ground, one.image]) for one in (Sample.grids(ends, (3, 2)) if run.written else ())]
     return [
         {
             "systematic_px": found.smooth.rms[i],
@@ -126,7 +127,7 @@ def _adjustment_values(run: Run, middle: Array) -> list[dict[str, Any]]:
             "held_out_px": found.held_out_rms[i],
             "prior_scale": found.prior.scale[i],
             "correction": _correction(found, i, middle[i], seen[i] if seen else None),
-            "certified": tuple(map(tuple, grids[i].tolist())) if grids else None,
+            "certified": tuple(map(tuple, shown[i].tolist())) if shown else None,
         }
         for i in range(num)
     ]

@@ -22,6 +22,7 @@ from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, View
+from barpc.sensor.sampler import image_grid
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
@@ -101,9 +102,8 @@ class GroundAltitudes:
         """Return two views restricted to the altitudes of the terrain, or else to `known` ones, with a margin [m]."""
         low, high = common_range(*views)
         if self.terrain is not None:
-            axes = (np.linspace(0.0, length - 1.0, _PROBES) for length in views[0].size)
-            xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-            ground = views[0].sensor.localize(xy, np.full(len(xy), 0.5 * (low + high)))
+            middle = 0.5 * (low + high)
+            ground = views[0].sensor.localize(*image_grid(views[0].size, (middle, middle), (_PROBES, 1)))
             heights = self.terrain(ground[:, 0], ground[:, 1])
             other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
             with np.errstate(invalid="ignore"):
