@@ -191,12 +191,14 @@ def accepted(fit: RpcFit, options: FitOptions, strict: bool) -> RpcFit:
 def best_method(attempt: Callable[[str], RpcFit], options: FitOptions, strict: bool, exact: bool) -> RpcFit:
     """Return the fit by the method asked for; of several (``auto``) the best accepted, or else the best, or a FitError.
 
-    Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for.
+    Points of a model are `exact`: what a ridge leaves of them is misfit, and the least squares of that are looked for;
+    so they are where the ridge has a pole near the scene.
     """
     if options.method != "auto":
         return accepted(attempt(str(options.method)), options, strict)
     fits = [attempt("ridge")]
-    if exact and not float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR:
+    calm = fits[0].min_denominator >= MIN_DENOMINATOR_RATIO
+    if exact and not (calm and float(fits[0].max_ckp.max()) <= NEGLIGIBLE_FIT_ERROR):
         fits.append(attempt("gauss-newton"))
     wrong = [fit.verdict(options.tolerance) for fit in fits]
     rank = [

@@ -88,5 +88,5 @@ def test_images_of_one_direction_are_known_within_the_range_of_their_altitudes(a
     """Rays tell nothing there, and nobody else does: not that tracks lie in the middle of that range."""
     off, said, found = height(angle, 1)
     assert abs(off) < said
-    assert 500.0 < said <= 1000.0
+    assert 500.0 < said < 1100.0  # the range, 1000 m, and what the cameras add
     assert np.abs(found.residuals[found.inlier]).max() < 5 * NOISE

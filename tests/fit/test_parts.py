@@ -176,6 +176,7 @@ def test_offsets_and_scales_are_the_middle_and_the_half_of_the_points() -> None:
 
 POLES = [{"min_denominator": least, "max_ckp": np.full(2, 0.02)} for least in (-0.1, 0.0, float("nan"))]
 WORSE = {"max_ckp": np.full(2, 0.03)}
+EXACT = {"max_ckp": np.full(2, 1e-8)}
 
 
 @pytest.mark.parametrize(
@@ -186,6 +187,9 @@ WORSE = {"max_ckp": np.full(2, 0.03)}
         ({"max_ckp": np.array([1.1e-6, 1e-9])}, {"rmse_ckp": np.full(2, 1.0)}, {}, "ridge"),
         ({}, None, {"exact": False}, "ridge"),
         ({}, None, {"method": "ridge"}, "ridge"),
+        # and where it has a pole, however exact it is
+        *((pole | EXACT, {"min_denominator": 0.4}, {}, "gauss-newton") for pole in POLES),
+        ({"min_denominator": 0.09} | EXACT, {"min_denominator": 0.4}, {}, "gauss-newton"),
         # of accepted fits the one with the least error
         ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([4.5e-3, 1e-3])}, {}, "gauss-newton"),
         ({"rmse_ckp": np.array([3e-3, 4e-3])}, {"rmse_ckp": np.array([5.1e-3, 0.0])}, {}, "ridge"),

@@ -32,7 +32,7 @@ VERBS: dict[str, tuple[str, ...]] = {
 ALL = set(VERBS)
 PIXELS = {"verify", "check", "export", "ortho", "dsm", "add-to", "update", "calibrate"}
 SCENE = {"verify", "export", "points", "ortho", "dsm"}
-TIES = {*SCENE, "calibrate", "report"}
+TIES = {*SCENE, "report"}
 
 
 def grid(path: Path, metres: float) -> Path:

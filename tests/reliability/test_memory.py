@@ -152,8 +152,9 @@ def test_no_reader_of_a_file_that_was_written_is_blamed(tmp_path, monkeypatch) -
         raise MemoryError
 
     one = verify_outputs.Consumer("barpc", fail)  # type: ignore[arg-type]
+    monkeypatch.setattr(verify_outputs, "_consumers", lambda _: {"barpc": one})
     with pytest.raises(MemoryError):
-        verify_outputs._consumer_readings(tmp_path / "x_RPC.TXT", {"barpc": one}, lambda _, read: (0.0, 0.0))
+        verify_outputs._consumer_readings(tmp_path / "x_RPC.TXT", lambda _, read: (0.0, 0.0))
 
 
 def test_a_worker_says_what_its_own_memory_is(monkeypatch) -> None:

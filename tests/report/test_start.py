@@ -54,11 +54,11 @@ def run(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("words", "most"),
     [
-        (["verify", "{run}"], 59),
+        (["verify", "{run}"], 60),
         (["report", "{run}"], 58),
         (["report", "{run}", "{run}"], 60),
-        (["export", "{run}", "{out}", "--to", "s2p"], 73),
-        (["export", "{run}", "{out}", "--to", "points"], 73),
+        (["export", "{run}", "{out}", "--to", "s2p"], 76),
+        (["export", "{run}", "{out}", "--to", "points"], 76),
         (["info", "{run}/view_00.vrt", "{run}/view_01.vrt"], 65),
         (["info", "{run}/view_00_RPC.TXT"], 53),
         (["project", "{run}/view_00_RPC.TXT", "5.4", "43.3", "100"], 49),
