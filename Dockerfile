@@ -1,5 +1,5 @@
-# docker build -t barpc:0.4.0 .
-# docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" barpc:0.4.0 adjust left.tif right.tif -o adjusted
+# docker build -t barpc:0.5.0 .
+# docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" barpc:0.5.0 adjust left.tif right.tif -o adjusted
 FROM python:3.12-slim AS build
 WORKDIR /src
 COPY . .

@@ -12,7 +12,7 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # as of `typing`, whose import is most of what this one would cost
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 
 _PUBLIC_MODULES = {
     "barpc.verbs.runs": "adjust check dsm export match open_run plan report verify",
