@@ -81,7 +81,7 @@ def test_both_solvers_reach_the_same_minimum(request, size, model):
     block = request.getfixturevalue(size)
     first, second = (solve(block, **EVERY, model=model, solver=solver) for solver in ("auto", "sparse"))
     tight = solve(block, **EVERY, model=model, solver="sparse", tolerance=1e-14)
-    assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
+    assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-5)
     assert second.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     np.testing.assert_allclose(first.params, tight.params, atol=2e-3 * np.abs(tight.params).max())
 

@@ -193,8 +193,8 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
             marks=pytest.mark.nightly,
         ),
         ("jitter 0.1 at 5 Hz", "look", "px with a period of 27"),
-        ("clouds 60 %", "bad", "check for clouds, water and change"),
-        ("RPC 200 px wrong", "good", "was off by more than the"),
+        ("clouds 60 %", "look", "wrong matches, or camera errors beyond the model"),
+        ("RPC 200 px wrong", "good", "exceed the pointing error"),
     ],
 )
 def test_what_is_said_is_true(name, status, word):

@@ -104,8 +104,8 @@ def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_pa
     adjust(rendered.paths[1:], folder, overwritten())
     assert "Which ground do they reconstruct?" not in (folder / "report.html").read_text(encoding="utf-8")
     (folder / "tables" / SURFACE).write_bytes(old)
-    assert run("report", folder) == 0
-    assert "Which ground do they reconstruct?" not in (folder / "report.html").read_text(encoding="utf-8")
+    assert run("report", folder) == 1
+    assert "was changed since the run wrote it" in capsys.readouterr().err
 
 
 def overwritten():

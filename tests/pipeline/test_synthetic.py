@@ -86,7 +86,7 @@ def test_the_samples_run_within_a_gigabyte_and_half_a_minute_of_one_core(tmp_pat
     assert seconds < 60  # 5-8 s on the machine of the benchmarks; the bound is 30 and CI may be slow
     assert memory < 1e9
     assert "before" in done.stdout
-    assert "(before: " in done.stdout
+    assert "; before: " in done.stdout
 
 
 def test_a_result_can_make_its_report_again(adjusted):

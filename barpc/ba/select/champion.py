@@ -16,7 +16,7 @@ from barpc.ba.robust.heldout import measure, problem_of_block
 from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solution import Solution
 from barpc.base.geodesy import Array
-from barpc.base.statistics import BANDS, LEVEL, MAD, OUTLIER, SURELY
+from barpc.base.statistics import BANDS, MAD, OUTLIER, SURELY
 from barpc.scene import IntArray
 
 _MIN_OFFSETS = 12  # offsets of a band: fewer give no reliable median
@@ -152,8 +152,7 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
 
 
 def largest_offset(found: Solution, ties: Block) -> float:
-    """Return the 95 % quantile of the absolute epipolar offsets [px] of a block; 0 without a pair."""
+    """Return the largest absolute median epipolar offset of a band [px]; 0 without one. Wrong matches hardly count."""
     bands = Bands.of(ties)
-    offsets = np.abs(bands.offsets(found)) if len(bands.first) else np.zeros(0)
-    offsets = offsets[np.isfinite(offsets)]
-    return float(np.quantile(offsets, 1.0 - LEVEL)) if len(offsets) else 0.0
+    middle = bands.medians(bands.offsets(found))[0] if len(bands.first) else np.zeros(0)
+    return float(np.nan_to_num(middle).max(initial=0.0))
