@@ -50,10 +50,11 @@ def main() -> None:
         run = block_run(num_views, options.tracks * num_views)
         summary_seconds, summary = seconds(lambda run=run: summarize(run), 1)
         with tempfile.TemporaryDirectory() as folder:
+            Path(folder, "tables").mkdir()
 
             def write(run: Run = run, summary: Summary = summary, folder: str = folder) -> None:
                 for name, content in TABLES.items():
-                    Path(folder, name).write_bytes(b"".join(content(run, summary)))
+                    Path(folder, "tables", name).write_bytes(b"".join(content(run, summary)))
 
             tables_seconds, _ = seconds(write, options.repeats)
             page_seconds, html = seconds(lambda s=summary, f=folder: report_html(s, f), options.repeats)

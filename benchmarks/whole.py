@@ -70,7 +70,7 @@ def turn(environment: dict[str, str], arguments: list[str]) -> dict[str, float]:
 def cpu(command: list[str], environment: dict[str, str], folder: str) -> float:
     """CPU seconds of a process."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, check=True, env=environment, cwd=folder)
+    subprocess.run(command, check=True, env=environment, cwd=folder, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
