@@ -9,11 +9,15 @@ what a family puts in: an offset, a tilt, voids, another place, nothing at all.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.worlds_cameras import Array, Relief, compass, ecef
 
