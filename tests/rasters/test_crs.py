@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -253,7 +253,7 @@ def test_what_is_no_reference_system_is_said(text: str) -> None:
 @pytest.mark.parametrize("version", ["WKT1_ESRI", "WKT1_GDAL", "WKT2_2019"])
 def test_what_proj_writes_of_its_own_systems_is_plain(version: str, count: int) -> None:
     rng = np.random.default_rng(count)
-    with sqlite3.connect(Path(pyproj.datadir.get_data_dir()) / "proj.db") as known:
+    with closing(sqlite3.connect(Path(pyproj.datadir.get_data_dir()) / "proj.db")) as known:
         rows = known.execute("select auth_name, code from crs_view where deprecated = 0 order by 1, 2").fetchall()
     seen = 0
     for authority, code in rng.permutation(rows)[:count]:

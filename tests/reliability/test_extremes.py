@@ -6,7 +6,7 @@ import io
 import sqlite3
 import time
 import zipfile
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +145,7 @@ def test_hdf5_that_claims_more_than_it_holds_or_nests_without_end_is_refused(tmp
 
 
 def _colmap(path: Path) -> None:
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         database.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT)")
         database.execute("CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")
         database.execute("CREATE TABLE matches (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)")

@@ -82,7 +82,7 @@ def test_the_standard_s_tables_name_every_layer_and_none_that_is_empty(block_run
 
 def test_qgis_finds_a_style_of_every_layer_that_draws_each_status_as_the_report_does(block_run):
     """As its OGR provider asks: by the names of table and geometry, with empty ones of catalogue and schema."""
-    with sqlite3.connect(block_run.folder / "map.gpkg") as data:
+    with closing(sqlite3.connect(block_run.folder / "map.gpkg")) as data, data:
         asked = "SELECT styleQML, useAsDefault FROM layer_styles WHERE f_table_schema = '' AND f_table_name = ? AND "
         found = {
             name: data.execute(f"{asked} f_geometry_column = ?", (name, column)).fetchall()
