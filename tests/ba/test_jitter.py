@@ -19,7 +19,7 @@ from barpc.simulate import simulate_block
 from benchmarks.referee import cases, judge, make, solve
 from tests.ba.test_referee import hills
 from tests.costs import once
-from tests.lanes import known, rest_slow
+from tests.lanes import known
 
 TABLE = cases()
 SEEDS = (0, 1, 2)
@@ -140,10 +140,10 @@ def test_what_robust_rounds_would_let_go_is_followed():
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("seed", rest_slow([3, 18], mark=pytest.mark.nightly))
+@pytest.mark.parametrize("seed", [3, pytest.param(18, marks=known("1.47 m are learnt of a drift of 2.1 m, 1.5 asked"))])
 def test_the_drift_is_not_taken_wider_than_it_is_seen_where_jitter_is_followed(seed):
     found, after = solved("all", seed)  # flown: 2.1 m, of degree 2 1.0 m
-    assert 1.4 < found.prior.drift_sigma[0] < 4.0
+    assert 1.5 < found.prior.drift_sigma[0] < 4.0
     assert 0.4 < found.prior.drift_sigma[1] < 2.0
     assert 0.5 < after.shape < 4.0  # seed 18: 6.1 with a drift that may be 5.5 m
 

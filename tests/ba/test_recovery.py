@@ -19,7 +19,7 @@ from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, solve
 from tests.constants import chosen
-from tests.lanes import rest_slow
+from tests.lanes import known, rest_slow
 
 EVERY = {"hold_out": False}
 
@@ -65,6 +65,7 @@ def small():
     return simulate_block(4, 300, seed=11)
 
 
+ENDS = known("scipy's solver ends 3.3e-6 of the cost below the sparse one's tight minimum")
 MODELS = ("rotation", "translation", "rotation+translation")
 
 
@@ -74,14 +75,15 @@ MODELS = ("rotation", "translation", "rotation+translation")
     ("size", "model"),
     [
         *rest_slow(pytest.param("small", model) for model in MODELS[::-1]),
-        *(pytest.param("block", m, marks=pytest.mark.nightly) for m in MODELS),
+        *(pytest.param("block", m, marks=pytest.mark.nightly) for m in MODELS if m != "translation"),
+        pytest.param("block", "translation", marks=[pytest.mark.nightly, ENDS]),
     ],
 )
 def test_both_solvers_reach_the_same_minimum(request, size, model):
     block = request.getfixturevalue(size)
     first, second = (solve(block, **EVERY, model=model, solver=solver) for solver in ("auto", "sparse"))
     tight = solve(block, **EVERY, model=model, solver="sparse", tolerance=1e-14)
-    assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-5)
+    assert first.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     assert second.cost_history[-1] == pytest.approx(tight.cost_history[-1], rel=1e-6)
     np.testing.assert_allclose(first.params, tight.params, atol=2e-3 * np.abs(tight.params).max())
 

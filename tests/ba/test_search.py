@@ -37,7 +37,7 @@ from tests.ba.residuals import (
 )
 from tests.ba.test_moving import drifting
 from tests.costs import once
-from tests.lanes import rest_slow
+from tests.lanes import known, rest_slow
 
 FLOOR = 0.05  # px
 STEP, SWING = step(2.0, 1, 0.4, 0.6), sinusoid(0.6, 1, 20.0)
@@ -97,7 +97,9 @@ def test_a_new_term_is_one_class_and_one_row_of_the_table(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("view", "axis", "start", "stop"), [(0, 1, 0.8, 1.1), (1, 1, 0.4, 0.6), (2, 0, 0.25, 0.4)], ids=str
 )
-def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start, stop, seed) -> None:
+def test_a_step_is_found_with_its_ends_between_the_tie_points(request, view, axis, start, stop, seed) -> None:
+    if (view, seed) == (2, 1):
+        request.applymarker(known("the runner-up is a step of another image"))
     seen = residuals_of(step(1.0, view, start, stop, axis), seed=seed)
     found = searched(seen)
     (one,) = found.findings
@@ -112,8 +114,7 @@ def test_a_step_is_found_with_its_ends_between_the_tie_points(view, axis, start,
     assert one.gain > 100.0
     assert 0.0 < one.gap < (0.2 if axis else 0.9) * one.gain
     # an endless decay is a step to the end of its image, and no other; then rows, or detectors, of another image
-    rivals = {"decay"} if stop > 1.0 else {"step"} if axis else {"step", "detector_line"}
-    assert one.runner_up in rivals
+    assert one.runner_up == ("decay" if stop > 1.0 else "step" if axis else "detector_line")
     assert (found.right > 0.5).mean() > 0.98  # those that were displaced, too
     assert found.step.shape == (3, seen.linear.residual.size and found.step.shape[1])
 

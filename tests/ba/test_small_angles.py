@@ -19,6 +19,7 @@ from barpc.sensor.corrected import Corrected, Correction
 from barpc.simulate import Look, fly
 from tests.costs import once
 from tests.everywhere import tied
+from tests.lanes import known
 
 ATTITUDE, POSITION, NOISE, SIZE = 5e-6, 2.0, 0.3, (10_000, 10_000)
 TARGET = np.array([5.5, 44.5, 900.0])
@@ -83,10 +84,10 @@ def test_what_is_said_of_the_height_goes_on_smoothly_through_the_least_angle() -
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("angle", [0.02, 0.2])
+@pytest.mark.parametrize("angle", [pytest.param(0.02, marks=known("1076 m are said of a range of 1000 m")), 0.2])
 def test_images_of_one_direction_are_known_within_the_range_of_their_altitudes(angle: float) -> None:
     """Rays tell nothing there, and nobody else does: not that tracks lie in the middle of that range."""
     off, said, found = height(angle, 1)
     assert abs(off) < said
-    assert 500.0 < said < 1100.0  # the range, 1000 m, and what the cameras add
+    assert 500.0 < said <= 1000.0
     assert np.abs(found.residuals[found.inlier]).max() < 5 * NOISE
