@@ -15,7 +15,7 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.robust.heldout import keep_out
 from barpc.ba.select import image_terms
 from barpc.ba.select.beam import Selection
-from barpc.ba.select.image_terms import spline_counts, with_splines, with_terms
+from barpc.ba.select.image_terms import spline_counts, with_splines, with_terms, with_terms_beside_splines
 from barpc.ba.select.parts import Parts
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import Solution, solve_block
@@ -261,6 +261,23 @@ def test_splines_are_as_dense_as_what_shakes_the_images_asks_for(case: tuple[int
     assert found.after.error < 0.5 * one.found.after.error
     off = solved(shaken(0.5, waves), tracks=tracks, jitter="off")
     assert off.with_splines() is off.found
+
+
+def test_a_step_that_jitter_hid_is_found_beside_splines() -> None:
+    """Alone 0.4 px are hidden by jitter of 0.5 px in all images; check tracks have both."""
+    one = solved(shaken(0.5, 3), step(0.4, 1, 0.25, 0.6, 0))
+    smooth = one.with_splines()
+    beside = search_terms(smooth.outcome, one.parts.inner, one.options.noise_floor)
+    found = with_terms_beside_splines(smooth, beside, one.parts, one.options)
+    before, waves = waves_of(smooth), waves_of(found)
+    assert ("step", 1) in [(term.kind, term.view) for term in found.findings]
+    assert before is not None
+    assert waves is not None
+    assert waves.count == before.count > 0
+    assert found.after.error < 0.8 * smooth.after.error
+    params = found.final.params[1, found.problem.cameras.unknowns.in_waves][waves.kinds[2]]
+    np.testing.assert_allclose(np.abs(params), 0.4 * DIRECTION[:, 0], rtol=0.25)
+    assert with_terms_beside_splines(smooth, Selection(), one.parts, one.options) is smooth
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ The prior variances of all of them are estimated (`barpc.ba.robust.variances`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -65,6 +65,22 @@ class AdditionalParameters:
         both = self.of_views.items(), others.of_views.values()
         rows = {name: np.concatenate([x, y]) for (name, x), y in zip(*both, strict=True)}
         return AdditionalParameters(self.count, **rows)
+
+    def beside(self, params: Array, added: AdditionalParameters, of_added: Array) -> tuple[AdditionalParameters, Array]:
+        """Return the layout with the displaced parts and sinusoids of `added` after its own, and the unknowns of both.
+
+        `params` (N, size) and `of_added` (N, added.size) are the unknowns of each [px].
+        """
+        kinds = []
+        for own, other, rows in zip(
+            self.kinds, added.kinds, (2, 2, 2, 4), strict=True
+        ):  # rows: col, row; of waves twice
+            both = params[:, own], of_added[:, other]
+            kinds.append(np.concatenate([one.reshape(len(one), rows, -1) for one in both], axis=2))
+        steps = np.concatenate([self.steps, added.steps], axis=1)
+        periods = np.concatenate([self.periods, added.periods], axis=1)
+        unknowns = np.hstack([one.reshape(len(params), -1) for one in kinds])
+        return replace(self, steps=steps, periods=periods), unknowns
 
     def is_whole(self, views: int, size: int) -> bool:
         """Return whether the arrays are valid for `views` views of `size` unknowns each."""

@@ -74,6 +74,21 @@ def with_terms(found: Solution, selected: Selection, parts: Parts, options: Adju
     return without if in_all or in_most else found
 
 
+def with_terms_beside_splines(smooth: Solution, selected: Selection, parts: Parts, options: AdjustOptions) -> Solution:
+    """Solve the block with its splines and the terms that a search beside them selected, unless check residuals grow.
+
+    Jitter may hide smaller displacements, as those of detectors.
+    """
+    terms = [one for one in selected.findings if TERMS[one.kind].FOLLOWED]
+    if not terms or options.is_plain:
+        return smooth
+    at, layout = _at_selection(smooth, selected, parts.inner), _layout_of(terms, len(parts.inner.views))
+    tried = _solve_with(at, parts, options, layout)
+    if not is_admitted(tried.after, smooth.after, parts.outer, sum(one.gain for one in terms)):
+        return smooth
+    return replace(tried, findings=(*smooth.findings, *terms))
+
+
 def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> Solution:
     """Solve the block with steps of rows constrained to whole numbers of lines, where they are nearly whole.
 
@@ -231,8 +246,10 @@ def _solve_with(
     """
     block, additional, start = parts.inner, layout.additional, layout.start
     outcome, ended, unknowns = found.outcome, found.outcome.state, found.problem.cameras.unknowns
-    if unknowns.waves is not None:  # selected terms stay
+    if unknowns.waves is not None and start is None:  # selected terms stay
         additional = replace(additional, steps=unknowns.waves.steps, periods=unknowns.waves.periods)
+    elif unknowns.waves is not None and start is not None:
+        additional, start = unknowns.waves.beside(ended.params[:, unknowns.in_waves], additional, start)
     drift = unknowns.drift if layout.drift is None else layout.drift
     problem = make_problem(block, options, unknowns.center, None, drift, additional)
     problem = problem if held is None else replace(problem, joint_prior=held)

@@ -17,7 +17,7 @@ from barpc.ba.select.anomalies import significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
 from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
-from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms
+from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms, with_terms_beside_splines
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
 from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
@@ -144,6 +144,9 @@ def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve:
         found, parts, selected = _without_moving_ground(first, parts, options, solve)
         found = with_lines_lost(with_terms(found, selected, parts, options), parts, options)
     smooth = with_splines(found, parts, options) if geometric else found
+    if smooth is not found:
+        beside = search_terms(smooth.outcome, parts.inner, options.noise_floor)
+        smooth = with_terms_beside_splines(smooth, beside, parts, options)
     if searched is None and (given or found.outcome is first.outcome):
         return SelectedModel(smooth, parts)
     affine, less = (_with_image_affine(found, parts, options, solve), parts) if searched is None else searched[1:]
