@@ -218,6 +218,15 @@ def test_lines_lost_in_two_of_four_views_are_given_back_to_both(seed: int) -> No
     assert max(*judged.p99, judged.hit) < 0.06
 
 
+@pytest.mark.slow
+def test_a_jump_whose_rows_a_pair_hardly_observes_is_no_number_of_lines() -> None:
+    """A jump of 2.8 px across epipolar lines is as well one of 156 +- 4 rows: of these one is near a whole number."""
+    world = make("local", 0)
+    found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED)
+    assert [one.kind for one in found.findings] == ["step"]
+    assert judge(world, found.sensors).left < 0.02
+
+
 @pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0]))
 def test_nothing_is_found_in_sound_residuals_though_intervals_are_asked_about(outliers) -> None:
     found = searched(residuals_of(outliers=outliers), interval(4000.0, 8000.0, 1), interval(0.0, 1000.0, by_share=True))

@@ -93,8 +93,8 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
     """Solve the block with steps of rows constrained to whole numbers of lines, where they are nearly whole.
 
     No platform turns by pixels between two lines. If all rows from one on are displaced, lines were lost, and the step
-    is a whole number of rows, without any columns (within `_LINE_TOLERANCE`). A pair observes only its component across
-    epipolar lines; the constraint determines the other one.
+    is a whole number of rows, without any columns (within `_LINE_TOLERANCE`), the only one that is not rejected. A pair
+    observes only its component across epipolar lines; the constraint determines the other one.
     """
     findings = list(found.findings)
     steps = [at for at, one in enumerate(findings) if _ends_with_its_image(one, parts.inner)]
@@ -112,9 +112,11 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
         known = np.linalg.inv(covariance.view(one.view)[np.ix_(own, own)])
         pull = known @ found.final.params[one.view, own]  # right-hand side: the prior, of mean zero, adds nothing
         known -= np.diag(found.outcome.problem.camera_prior.sigma[one.view, own] ** -2.0)
-        lines = float(pull[1] / known[1, 1])
+        lines, sigma = float(pull[1] / known[1, 1]), float(known[1, 1] ** -0.5)
         misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
-        if round(lines) and abs(lines - round(lines)) < _LINE_TOLERANCE and misfit < CRITICAL**2:
+        off = abs(lines - round(lines))
+        is_only_one = CRITICAL * sigma < 1.0 - off  # a pair may not observe the rows: any number would be nearly whole
+        if round(lines) and off < _LINE_TOLERANCE and is_only_one and misfit < CRITICAL**2:
             findings[at] = replace(one, kind=LinesLost.NAME, size=np.array([0.0, round(lines)]))
             index += [one.view * found.final.params.shape[1] + int(k) for k in own]
             mean += [0.0, float(round(lines))]
