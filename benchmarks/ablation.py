@@ -55,20 +55,21 @@ MOVED = (
     "fault:2", "glacier:22", "lost:0", "lost:2", "lost:3", "lost:5", "slide:1", "cloud:1", "dem:0", "plane:0",
 )  # fmt: skip
 """Worlds of every family, for whole mechanisms."""
-_NEVER: dict[str, Any] = {
+MECHANISMS: dict[str, Any] = {
     "restart from a consensus": ("solution._is_suspect", lambda *_: False),
     "drift of a higher degree": ("solution._with_more_drift", lambda first, *_: first),
     "control that distorts": ("solution._without_distorting_control", lambda found, *_: found),
     "foreign camera": ("select.models.find_foreign_camera", lambda *_: (None, None)),
     "search of terms": ("select.models.search_terms", lambda *_: importlib.import_module(_BEAM).Selection()),
-    "veto of check tracks": ("select.models.is_admitted select.image_terms.is_admitted", lambda *_: True),
+    "veto of check tracks": ("select.image_terms.is_admitted", lambda *_: True),
     "terms in the images": ("select.models.with_terms", lambda found, *_: found),
     "splines and detectors": ("select.models.with_splines select.image_terms.with_splines", lambda found, *_: found),
+    "terms beside splines": ("select.models.with_terms_beside_splines", lambda smooth, *_: smooth),
     "line of detectors": ("terms.detector_line.change_points", lambda *_: []),
     "affine in the image": ("select.models._with_image_affine", lambda *_: None),
     "correlated noise": ("select.beam.correlated_log_ratio select.anomalies.correlated_log_ratio", lambda *_: 0.0),
     "rivals side by side": ("select.beam._rivals", lambda _: []),
-    "parts that hold a moving group": ("select.beam.TermSearch._members", lambda *_: []),
+    "parts that hold a moving group": ("select.beam.TermSearch._parts_at_motion", lambda *_: []),
     "simpler terms": ("terms.decay.Decay.simpler", lambda *_: None),
     "alternatives of a low frequency": ("terms.low_frequency.LowFrequency.alternatives", lambda *_: []),
     "steps": ("terms.step.Step.propose", lambda *_: []),
@@ -84,20 +85,24 @@ _BEAM = "barpc.ba.select.beam"
 
 @dataclass(frozen=True)
 class Mechanism:
-    """One of `_NEVER`."""
+    """One of `MECHANISMS`."""
 
     name: str
 
     def set(self, _factor: float) -> None:
         """Switch it off, in this process."""
-        places, instead = _NEVER[self.name]
-        for place in places.split():
+        for target, name in self.places():
+            setattr(target, name, MECHANISMS[self.name][1])
+
+    def places(self) -> Iterator[tuple[Any, str]]:
+        """Yield modules or classes, and the name of its function there."""
+        for place in MECHANISMS[self.name][0].split():
             *modules, last = f"barpc.ba.{place}".split(".")
             owner = modules[-1] if modules[-1][0].isupper() else None
             target = importlib.import_module(".".join(modules[:-1] if owner else modules))
             target = getattr(target, owner) if owner else target
             assert hasattr(target, last), place
-            setattr(target, last, instead)
+            yield target, last
 
 
 @dataclass(frozen=True)
@@ -257,7 +262,7 @@ def main() -> None:
     args = parser.parse_args()
     worlds = tuple(args.worlds or (MOVED if args.mechanisms else WORLDS))
     if args.mechanisms:
-        ablate_mechanisms([name for name in _NEVER if not args.only or name in args.only], worlds, args.j)
+        ablate_mechanisms([name for name in MECHANISMS if not args.only or name in args.only], worlds, args.j)
         return
     wanted = [c for c in constants(args.package) if not args.only or c.name in args.only]
     tasks = [(c, f, worlds) for c in wanted for f in args.factors]
