@@ -436,3 +436,13 @@ def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
     world = make("biased", seed)
     found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     assert found.findings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.costs(10)
+def test_ground_that_moved_beyond_a_row_of_all_images_is_no_jitter() -> None:
+    """A fault of 1.2 m across the scan of four images: splines fit a half of it, and motion all that they had cut."""
+    world = make("fault", 4)
+    found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED)
+    assert [one.kind for one in found.findings] == ["moving_objects"]
+    assert judge(world, found.sensors).left < 0.05

@@ -112,14 +112,16 @@ def _band(place: Array, pair: IntArray) -> IntArray:
     return np.asarray(np.minimum(part.astype(np.int64), BANDS - 1))
 
 
-def is_closer(tried: Solution, plain: Solution, ties: Block) -> bool:
+def is_closer(tried: Solution, plain: Solution, ties: Block, still: Block | None = None) -> bool:
     """Return whether a model has significantly smaller residuals than the plain one, over all tie points of a block.
 
     Losses are robust (Geman-McClure), with the smaller noise of the two solutions as scale. They include matches that
-    either model rejected or excluded, so a model gains nothing by fitting another subset of the matches as well.
+    either model rejected or excluded, so a model gains nothing by fitting another subset of the matches as well. A
+    model with a moving group is measured on `still`, the tie points with the motion of the group removed.
     """
     noise = min(tried.outcome.noise, plain.outcome.noise)
-    far = [(measure(one.problem, one.final.params, ties).residual ** 2).sum(axis=0) for one in (tried, plain)]
+    sides = (tried, ties if still is None else still), (plain, ties)
+    far = [(measure(one.problem, one.final.params, of).residual ** 2).sum(axis=0) for one, of in sides]
     less = np.subtract(*(geman_mcclure(one / (noise * ties.sigma) ** 2)[0] for one in far[::-1]))
     index, point = np.unique(ties.point, return_inverse=True)
     by_track = np.bincount(point, less)

@@ -10,7 +10,7 @@ import numpy as np
 from barpc.ba.constraints.block import MIN_OBSERVATIONS, Block
 from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.solution import Solution
-from barpc.ba.terms.moving_ground import Motion, MovingGroup, members
+from barpc.ba.terms.moving_ground import Motion, MovingGroup, members, motion_of
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL, SURE
@@ -68,6 +68,13 @@ class Parts:
         for rows in (still & self.kept_out, still & of_gcps):
             group[rows] = number * members(found.problem, found.final.params, one, block.without(~rows))
         return replace(self, group=group)
+
+    def without_motion(self, found: Solution, one: MovingGroup) -> Block:
+        """Return all tie points, those of the last group, `one`, with their motion removed; cameras are of `found`."""
+        ties = self.ties()
+        member = self.group[np.isin(self.block.order, ties.order)] == self.group.max(initial=0)
+        moved = motion_of(found.problem, found.final.params, one, ties)
+        return replace(ties, xy=ties.xy - np.nan_to_num(moved) * member)
 
     def motion_pixels(self, one: MovingGroup) -> float:
         """Return the largest motion of a group between two images, in pixels of the coarser one."""

@@ -228,6 +228,13 @@ def group_of(linear: Linear, ground: GroundMotion, group: Group, found: MixtureF
     return MovingGroup(float(apart[0].max()), apart[1], member, shares, ground, found)
 
 
+def motion_of(problem: Problem, params: Array, one: MovingGroup, block: Block) -> Array:
+    """Return the displacements (2, K) [px] of the observations of a block if their tracks moved with a group."""
+    part, points = problem_of_block(problem, params, block)
+    ground = GroundMotion.of(part, State(params, points), one.ground)
+    return np.einsum("cmk,m->ck", ground.by_moves(block.view, len(block.views)), one.fit.move)
+
+
 def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> BoolArray:
     """Return the mask (K,) of observations of a block that belong to a group, with camera unknowns (N, q)."""
     if not len(block.view):
