@@ -478,12 +478,12 @@ def test_the_noise_is_the_sum_of_squares_over_what_is_left_of_freedom(observatio
     ties = block.point < 10  # control points are tested one by one, by what the tie points say
     freedom = 2 * ties.sum() - 3 * 10 - 18
     assert freedom < 20
-    assert counts.noise(residual, use, problem) == 1.0  # too few to tell
+    assert counts.noise(residual, use, problem, 0) == 1.0  # too few to tell
     free = replace(problem, free=np.zeros(18, dtype=bool))
     freedom = 2 * ties.sum() - 3 * 10
     expected = np.sqrt(((residual / block.sigma)[:, ties] ** 2).sum() / freedom)
     assert freedom >= 20
-    assert counts.noise(residual, use, free) == pytest.approx(expected, rel=1e-12)
+    assert counts.noise(residual, use, free, 0) == pytest.approx(expected, rel=1e-12)
 
 
 def test_tie_points_of_a_view_count_together_at_most_as_the_floor_says(observations):

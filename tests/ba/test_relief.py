@@ -220,7 +220,7 @@ def test_hills_that_are_seen_on_one_side_only_are_hills(side: float) -> None:
 def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     ground = points(200)
     tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
-    made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3))
+    made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3), 0.0)
     assert made.delivered[1] == pytest.approx(-40.0 * 0.816, rel=0.05)  # at the RMS distance of a square's points
     assert np.abs(made.delivered[[0, 2]]).max() < 2.5
     assert np.isnan(made.beyond(2.0)).all()  # nothing is known of the cameras yet

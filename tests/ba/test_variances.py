@@ -366,7 +366,7 @@ def test_variances_of_a_large_block_are_exact_where_they_are_stated_and_probed_w
     assert (by_unknown > 0.05).all()  # they are probed, indeed
     assert (by_unknown < 0.3).all()
     assert (abs(off.mean(axis=0)) < 0.05).all()
-    prior = prior_sigmas(block.views, found.options, 1, None)
+    prior = prior_sigmas(block.views, found.options, 1, None, 0)
     known = 1 - true[:, :6] / prior[:, :6] ** 2
     turn, blocks = found.cameras.unknowns.sight / prior, covariance.of_views()
     along = 1 - ((turn[:, None] @ blocks)[:, 0] * turn).sum(axis=1)

@@ -183,7 +183,7 @@ class Relief:
         return sigma
 
     @classmethod
-    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
+    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float) -> Relief:
         """Compare a DEM with triangulated ground points (P, 3).
 
         Rays determine the heights of the points in the mask `strong` (P,), with standard deviations `sharp` (P,) [m].

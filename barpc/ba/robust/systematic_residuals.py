@@ -199,7 +199,7 @@ class Smooth:
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
     def test_neighbours(
-        self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
+        self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float
     ) -> SmoothTest:
         """Return the test with `shared` and `redundancy` added.
 

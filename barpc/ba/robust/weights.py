@@ -126,7 +126,7 @@ class Observations:
         """Return the sums (N,) of the squared weights of the tie points of each view."""
         return np.asarray(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0])
 
-    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
+    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int) -> float:
         """Estimate the observed over stated standard deviation of tie points in use; 1 if they are too few.
 
         `fitted` is the number of other parameters that were fitted to the residuals.
