@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
 from barpc.ba.solving.covariance import Covariance, SharedErrors
 from barpc.ba.solving.normal import Reduced, solve_transposed, whiten
 from barpc.ba.solving.problem import Problem
@@ -30,7 +31,6 @@ from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bspline
 
 LINE_SPLINES = 28  # over 25 intervals: lenses and focal planes bend over a twentieth of the line or more
 _COEFFICIENT_SIGMA = 3.0  # px: prior sigma of a spline coefficient, far above the distortion of any optics
-STEP_SIGMA = 1.0  # px: prior sigma of a step between detectors, which are aligned and measured before launch
 CURVE_COLUMNS = 400  # number of columns at which a curve is evaluated
 # px: interior orientation is calibrated in flight to 0.05-0.1 px RMS (SPOT 5 HRS and HRG: Gachet 2004, "SPOT5 in-flight
 # commissioning: inner orientation of HRG and HRS instruments", Int. Arch. Photogramm. XXXV-B1; before calibration the
@@ -79,7 +79,7 @@ class LineCurve:
         """Return the prior information (n, n) of the unknowns; `bend` is the sigma of third differences [px]."""
         rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
         smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
-        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / STEP_SIGMA**2)])
+        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / FIRST_SIGMA**2)])
 
     @cached_property
     def columns(self) -> Array:

@@ -362,7 +362,7 @@ def _inflation(place: Array, gradients: Array, independent: Array, surface: TieS
         if count < FEWEST:
             return factors
         sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in gradients.T], axis=1)
-        ratio = (sums**2).sum(axis=0) / np.maximum(independent, 1e-300) * count / (count - 7.0)  # seven are fitted
+        ratio = (sums**2).sum(axis=0) / np.maximum(independent, 1e-300) * count / (count - len(factors))
         up, flat = [2, 3, 4], [0, 1, 5, 6]
         for part in (up, flat):
             factors[part] = np.maximum(factors[part], np.sqrt(ratio[part].mean()))

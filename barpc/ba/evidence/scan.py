@@ -27,7 +27,6 @@ from barpc.scene import BoolArray, IntArray
 BINS = 40  # number of bins of equal size along the rows or columns of an image
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # first bin of each interval, and the bin after its last
 _FEWEST_INSIDE = 8  # least number of check observations of a tested region
-_PERMUTATIONS = 2000  # twice as many as a p-value of `CHANCE` needs
 _FINEST = 32  # smallest cells along each side of an image; one check observation is taken in each
 # residuals of two views have one direction: a component is ignored if its spread is below this share of the largest
 MIN_EXTENT_RATIO = 0.05
@@ -324,6 +323,7 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
     principal axes. `of_near` (P, k) is 1 for the inliers of a region, else 0.
     """
     rng, here, count = np.random.default_rng(0), of_near.sum(axis=1), along.shape[1]
+    permutations = round(2.0 / CHANCE)  # twice as many as a p-value of `CHANCE` needs
     along = along - along.mean(axis=1, keepdims=True)
     scale = (1.0 / here - 1.0 / count)[:, None] * (along**2).mean(axis=1)
 
@@ -331,8 +331,8 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
         return np.asarray(((of_near @ values.T / here[:, None]) ** 2 / scale).sum(axis=1))
 
     found = squared_means_over_variances(along)
-    drawn = [squared_means_over_variances(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
-    return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
+    drawn = [squared_means_over_variances(along[:, rng.permutation(count)]).max() for _ in range(permutations)]
+    return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (permutations + 1.0))
 
 
 def hypergeometric_tail(found: int, count: int, marked: int, whole: int) -> float:

@@ -11,12 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barpc.ba.control.agreement import ODDS
 from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_better, measure
 from barpc.ba.select.anomalies import significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
-from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
+from barpc.ba.select.foreign_camera import (
+    AMBIGUOUS_VIEWS,
+    ForeignCamera,
+    Solver,
+    contradicted_view,
+    find_foreign_camera,
+)
 from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
@@ -25,11 +32,10 @@ from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.options import AUTO, AdjustOptions
-from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
+from barpc.base.statistics import MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
 MAX_CAMERA_CHANGE = 0.06  # px: a view with mostly rejected tie points that changes the others by more is left out
-_AMBIGUOUS_VIEWS = 3  # in a block of so few views, any might be the wrong one
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +81,7 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
     view = int(lost.argmax())
     others = parts.without_view(view)
     groups = others.inner.groups(others.inner.use)
-    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _AMBIGUOUS_VIEWS:
+    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= AMBIGUOUS_VIEWS:
         return selected
     try:
         alone = _select_terms(solve(others.inner, others.outer, options), others, options, solve)
@@ -221,7 +227,7 @@ def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts
 def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
     """Exchange the last moving group and the ground, if the priors of the cameras favour that.
 
-    The smaller group was taken as moving, but in one block of twenty (`LEVEL`) clouds may cover most of the ground.
+    The smaller group was taken as moving, but in one block of twenty (`ODDS`) clouds may cover most of the ground.
     Cameras that fit the clouds deviate more from their priors. With control nothing is exchanged.
     """
     exchanged = parts.exchanged()
@@ -232,7 +238,7 @@ def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solv
     except (AdjustError, np.linalg.LinAlgError):
         return found, parts
     cost, of_other = (float((one.problem.camera_prior.residual(one.final.params) ** 2).sum()) for one in (found, other))
-    return (other, exchanged) if 0.5 * (cost - of_other) > -np.log(LEVEL) else (found, parts)
+    return (other, exchanged) if 0.5 * (cost - of_other) > ODDS else (found, parts)
 
 
 def _without_moving_ground(
