@@ -32,7 +32,6 @@ from barpc.scene import BoolArray
 _FAR_OFF = 150.0  # m: larger offsets from a reference exceed the accuracy of delivered cameras
 _TREND = MUCH_NOISE * NOISE_FLOOR  # px: with larger systematic residuals, other models are tried
 _SKEW = 1e-3  # largest usual drift, relative to half the image length: 3 microradian per second
-MUCH_BETTER = 0.7  # largest ratio of check residuals to accept another model that may change heights
 CLEARLY = 0.8  # largest ratio of noise to accept another start; also least fraction of inliers of a view
 
 

@@ -275,7 +275,7 @@ def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Arr
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
     reach = CRITICAL * before[:2]
-    step = np.maximum(1.5 * wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
+    step = np.maximum(wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
     sides = [np.arange(-(r // s), r // s + 1) * s for r, s in zip(reach, step, strict=True)]
     half = 2.0 * float(np.hypot(wide, 0.5 * steep * np.hypot(*np.minimum(step, reach))))
     best, found = -1.0, np.zeros(7)

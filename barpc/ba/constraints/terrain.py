@@ -77,8 +77,7 @@ class Bands:
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _MIN_SIDE_TO_WIDTH <= max(extent, _MIN_SIDE_TO_WIDTH * step):
             total, weight = (
-                gaussian_filter(a, width / step, mode="nearest", truncate=3.0)
-                for a in (filled, known.astype(np.float64))
+                gaussian_filter(a, width / step, mode="nearest") for a in (filled, known.astype(np.float64))
             )
             smoothed.append(middle + total / np.maximum(weight, 1e-6))
             width *= 2.0

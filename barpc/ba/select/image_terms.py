@@ -14,7 +14,7 @@ from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
 from barpc.ba.select.anomalies import correlated_noise_gain, significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
-from barpc.ba.solution import MUCH_BETTER, Solution, finished
+from barpc.ba.solution import Solution, finished
 from barpc.ba.terms import TERMS, LinesLost, Sinusoid
 from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
@@ -159,7 +159,7 @@ def _explains(tried: Solution, found: Solution, block: Block) -> bool:
     Check tie points share matching errors with their neighbours, so a smaller fall may be a fit to noise.
     """
     left, before = (correlated_noise_gain(one.outcome, block) for one in (tried, found))
-    return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
+    return left <= max(0.5 * before, SURE) or MUCH_NOISE * tried.after.error < found.after.error
 
 
 def _at_selection(found: Solution, selected: Selection, block: Block) -> Solution:

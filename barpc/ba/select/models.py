@@ -27,7 +27,7 @@ from barpc.ba.select.foreign_camera import (
 from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
-from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
+from barpc.ba.solution import CLEARLY, Solution
 from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
@@ -153,7 +153,7 @@ def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve:
     if searched is None and (given or found.outcome is first.outcome):
         return SelectedModel(smooth, parts)
     affine, less = (_with_image_affine(found, parts, options, solve), parts) if searched is None else searched[1:]
-    if affine is None or not _is_much_better(affine, found) or smooth.after.error < MUCH_BETTER * affine.after.error:
+    if affine is None or not _is_much_better(affine, found) or MUCH_NOISE * smooth.after.error < affine.after.error:
         return SelectedModel(smooth, parts)
     return SelectedModel(affine, less, found.after.whole_rms)
 
@@ -190,7 +190,7 @@ def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, so
 
 def _is_much_better(affine: Solution, found: Solution) -> bool:
     """Return whether an affine in every image has much smaller check residuals than the geometric model."""
-    better = affine.after.error < (CLEARLY if found.is_skew else MUCH_BETTER) * found.after.error
+    better = affine.after.error < (CLEARLY if found.is_skew else 1.0 / MUCH_NOISE) * found.after.error
     # affines leave the tilts of the scene undetermined, so they must also gain more than the noise floor
     return better and affine.after.whole_rms < found.after.whole_rms - NOISE_FLOOR
 
