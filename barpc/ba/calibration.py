@@ -36,13 +36,12 @@ from barpc.sensor.image_corrections import ColumnSpline
 _ROUGHNESS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: candidate sigmas of the third differences of splines
 _CANDIDATES = 128  # intervals of the line, between which steps are tried first
 _FINER = 12  # factor by which each pass reduces the spacing of the candidates, around the steps found
-_POSITIONS = 65  # tried positions of a view on the line: over +-3 standard deviations, then over a 16th of that
+_POSITIONS = (
+    65  # tried positions of a view on the line: over +-`CRITICAL` standard deviations, then over a 16th of that
+)
 _NUISANCE_SIGMA = 100.0  # px: a wide prior, as a block may not determine all nuisances
 _MOST_STEPS = 40  # limit of the number of steps; focal planes have up to about thirty detectors
 _BEST_NOISE = 2e-3  # px: least noise of tie points, even if they agree better
-# Residuals up to this many standard deviations have full weight. A smoother loss would give less weight to observations
-# that contradict the current curve: each pass would keep a third of its error.
-_FULL_WEIGHT = 3.0
 _LEAST_SHARE = 0.75  # of a curve in a block of its sensor: halfway between 1 and 0.5, where correcting does not help
 
 
@@ -262,7 +261,9 @@ def _weights(ties: SensorTies, curve: ColumnSpline | None) -> Array:
     for _ in range(BACKFITTING):
         length = np.linalg.norm(adjusted, axis=1) / np.sqrt(2.0 * redundancy)
         spread = max(robust_spread(length), 1e-6)
-        weight = np.minimum(1.0, _FULL_WEIGHT * spread / np.maximum(length, 1e-9)) ** 2
+        # full weight up to there: a smoother loss would give less weight to observations that contradict the current
+        # curve, and each pass would keep a third of its error
+        weight = np.minimum(1.0, CRITICAL * spread / np.maximum(length, 1e-9)) ** 2
         adjusted = _Eliminated(ties, residual, weight).residuals()
     noise = np.sqrt((weight**2 * (adjusted**2).sum(axis=1)).sum() / (weight**2 * 2.0 * redundancy).sum())
     return np.asarray(weight / max(noise, _BEST_NOISE))
@@ -361,7 +362,7 @@ def _fit_curve(
 def _fit_positions(ties: SensorTies, shift: Array, weight: Array, spline: ColumnSpline) -> tuple[Array, Array]:
     """Return the shifts (V,) [px] with which the loose views of a block fit a curve best, and their sigmas (V,) [px].
 
-    Each view is tried at positions within three standard deviations, then at finer ones around the best. The views take
+    Each view is tried at positions within `CRITICAL` sigmas, then at finer ones around the best. The views take
     turns, as they have points in common. `shift` are the start values.
     """
     shift, sigma = shift.copy(), np.zeros(len(shift))
@@ -370,7 +371,7 @@ def _fit_positions(ties: SensorTies, shift: Array, weight: Array, spline: Column
     block = _Eliminated(ties, ties.residual, weight)
     for _ in range(STEPS):
         for v in np.flatnonzero(ties.loose).tolist():
-            middle, reach, sigma[v] = 0.0, 3.0 * ties.loose[v], 0.0
+            middle, reach, sigma[v] = 0.0, CRITICAL * ties.loose[v], 0.0
             for _ in range(STEPS):  # in the end a 4000th of the first reach
                 tried = middle + np.linspace(-reach, reach, _POSITIONS)
                 at = np.tile(shift, (_POSITIONS, 1))

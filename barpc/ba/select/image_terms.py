@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.constraints.block import Block, make_problem
-from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters
+from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters, most_splines
 from barpc.ba.parameters.priors import JointPrior
 from barpc.ba.robust.heldout import is_admitted, is_better
 from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
@@ -20,7 +20,7 @@ from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
+from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SURE
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _SPLINE_FACTOR = 1.5  # ratio of successive numbers of splines: 7, 10, 15, 22, 33
@@ -205,7 +205,7 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
-    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
+    most = most_splines(block.view[block.use])
     if options.spacing:
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), MIN_SPLINES)]
     most = min(most, LARGEST // (2 * len(block.views)))
