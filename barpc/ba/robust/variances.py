@@ -35,9 +35,6 @@ logger = logging.getLogger(__name__)
 _LIKELIER = -np.log(LEVEL)
 # drift caused by a rotation, over the rotation: the projection centre moves by some km while an image is taken
 _CENTRE_MOTION_SHARE = 0.01
-# a cautious standard deviation is the upper confidence limit with this probability of error; too narrow a prior bends
-# all heights
-_LOW = 0.1
 SAME_PRIOR = 0.2  # log change of a standard deviation below which a block is not solved again
 _MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is estimated
 
@@ -351,12 +348,12 @@ class Variances:
 
         `total` is the sum of squares over the given variance. The given variance has the weight of `STATED_FREEDOM`
         observations. With `careful`, the estimate is at least the upper confidence limit with a probability of error of
-        `_LOW`.
+        `LEVEL`: too narrow a prior bends all heights.
         """
         likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
         if not careful or freedom <= _MIN_FREEDOM:
             return float(likely)
-        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
+        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, LEVEL))))
 
     def _odd(
         self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
