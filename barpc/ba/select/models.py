@@ -27,7 +27,7 @@ from barpc.ba.select.foreign_camera import (
 from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
-from barpc.ba.solution import CLEARLY, Solution
+from barpc.ba.solution import CLEARLY, SURE_TREND, Solution
 from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
@@ -35,7 +35,6 @@ from barpc.base.options import AUTO, AdjustOptions
 from barpc.base.statistics import MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
-MAX_CAMERA_CHANGE = 0.06  # px: a view with mostly rejected tie points that changes the others by more is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,7 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
 def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Leave out the view with the largest share of rejected tie points, if over half, and if it changes other cameras.
 
-    The other views are adjusted alone. Their model is returned if it differs by more than `MAX_CAMERA_CHANGE`.
+    The other views are adjusted alone. Their model is returned if it differs by more than `SURE_TREND`.
     """
     found, parts = selected.found, selected.parts
     lost = lost_shares(found, parts.inner)
@@ -87,7 +86,7 @@ def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve
         alone = _select_terms(solve(others.inner, others.outer, options), others, options, solve)
     except (AdjustError, np.linalg.LinAlgError):
         return selected
-    if compared(alone.found, found, alone.parts.ties()).changed <= MAX_CAMERA_CHANGE:
+    if compared(alone.found, found, alone.parts.ties()).changed <= SURE_TREND:
         return selected
     return replace(alone, foreign=contradicted_view(view))
 
