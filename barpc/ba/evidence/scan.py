@@ -55,9 +55,18 @@ def price(views: int) -> float:
 
 
 def scan(
-    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, weight: Array, floor: float = 0.0
+    view: IntArray,
+    place: Array,
+    size: Array,
+    wrong: Array,
+    off: Array,
+    weight: Array,
+    floor: float = 0.0,
+    least: float = SURE,
 ) -> list[Interval]:
-    """Find the most significant interval of rows and of columns of each view by each statistic; largest gain first.
+    """Find the best interval of rows and of columns of each view by each statistic, if its gain exceeds `least` [nats].
+
+    The one of largest gain is first.
 
     Parameters
     ----------
@@ -69,7 +78,7 @@ def scan(
     floor : float, size of displacements that are tolerated [standard deviations]
     """
     views, found = size.shape[1], []
-    off, least = np.clip(off, -OUTLIER, OUTLIER), price(views)
+    off, cost = np.clip(off, -OUTLIER, OUTLIER), price(views)
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
         rows = np.array([np.ones(len(view)), wrong])
@@ -80,7 +89,7 @@ def scan(
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # the whole image is no interval
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
-                surplus, common = float(gain[at, v]) - least, float(displaced[at, v])
+                surplus, common = float(gain[at, v]) - cost, float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (0, i) if j == BINS else (j, BINS)  # the shorter part is the displaced one
@@ -89,7 +98,7 @@ def scan(
                 ends = float(i * step), float(j * step)
                 statistics = surplus, count_wrong / max(inside, 1.0), common, by_share
                 found.append(Interval(v, axis, *ends, *statistics, part=(j - i) / BINS))
-    return sorted(found, key=lambda one: -one.gain)
+    return sorted((one for one in found if one.gain > least), key=lambda one: -one.gain)
 
 
 def _interval_sums(bins: Array) -> Array:
