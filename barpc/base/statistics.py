@@ -116,6 +116,11 @@ SMALL = 400
 """Most unknowns of a block that is solved again for every hypothesis."""
 
 
+def evenly(count: int, most: int | None = None) -> slice:
+    """Return the slice of every n-th of `count` elements that leaves at most `most`; by default `SAMPLE`."""
+    return slice(None, None, max(-(-count // (most or SAMPLE)), 1))
+
+
 def kd_tree(places: Array) -> Any:
     """Return scipy's k-d tree of places (n, d)."""
     from scipy.spatial import cKDTree  # a tenth of a second, which runs with matches given do not need

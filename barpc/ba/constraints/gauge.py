@@ -23,7 +23,7 @@ from barpc.ba.solving.normal import Reduced, by_cameras, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import SAMPLE
+from barpc.base.statistics import evenly
 from barpc.scene import BoolArray, IntArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
@@ -78,7 +78,7 @@ def gauge_report(
     shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
-    use[index[:: len(index) // SAMPLE + 1]] = True
+    use[index[evenly(len(index))]] = True
     middle = points[use].mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T

@@ -22,10 +22,10 @@ from barpc.base.statistics import (
     FEWEST,
     ITERATIONS,
     RIDGE,
-    SAMPLE,
     STATED_FREEDOM,
     SURELY,
     TIMES,
+    evenly,
     kd_tree,
     robust_spread,
 )
@@ -119,8 +119,8 @@ class GivenHeights:
     sigma: Array  # (n,) standard deviation of the height [m]
     sigma_flat: Array  # (n,) standard deviation of the horizontal position along each axis [m]
 
-    def select(self, keep: BoolArray) -> GivenHeights:
-        """Return the heights of a mask (n,)."""
+    def select(self, keep: BoolArray | slice) -> GivenHeights:
+        """Return the heights of a mask (n,), or of a slice."""
         return GivenHeights(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
 
 
@@ -270,7 +270,7 @@ def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Arr
 
     Its tilts, turn and scale are 0. All is 0 if no height is at a valid patch.
     """
-    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
+    few = given.select(evenly(len(given.sigma)))
     first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
