@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.constraints.gauge import MOTIONS, SIMILAR, GaugeReport, motions_of_moves, weakest_modes
-from barpc.ba.constraints.terrain import quadratic_basis, variance_inflation
+from barpc.ba.constraints.terrain import quadratic_basis, variance_inflation, without_outliers
 from barpc.ba.evidence.scan import BINS, price
 from barpc.ba.parameters.additional_parameters import DRIFTS
 from barpc.ba.terms.term import SIZE_PRICE
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_unit, wrap_longitude
-from barpc.base.statistics import CRITICAL, MANY, OUTLIER, SURE, robust_spread
+from barpc.base.statistics import CRITICAL, MANY, SURE
 
 CHANCES = np.array([0.14, 0.05])
 """Probabilities that columns, and that rows, of an image are displaced.
@@ -114,8 +114,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
         return None, limits
     error, at = ground[:, 2] - known, np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1]])
     at = (at - at[fits].mean(axis=0)) * metres_per_unit(ground[0])[:2]
-    error -= np.median(error[fits])
-    fits &= np.abs(error) <= OUTLIER * robust_spread(error[fits])
+    fits[fits] = without_outliers(error[fits])
     smooth, columns = quadratic_basis(at / np.abs(at[fits]).max()), rises.reshape(len(rises), -1)
     error, columns = _residuals(smooth[fits], error[fits, None])[:, 0], _residuals(smooth[fits], columns[fits])
     square = np.maximum((columns**2).sum(axis=0), 1e-9)

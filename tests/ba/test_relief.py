@@ -16,10 +16,10 @@ from barpc.ba.constraints.terrain import (
     Bands,
     RegularisedDem,
     Relief,
-    _without_outliers,
     believe,
     quadratic_basis,
     variance_inflation,
+    without_outliers,
 )
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
@@ -397,7 +397,7 @@ def test_points_that_pull_alike_where_they_lie_together_count_as_one() -> None:
 def test_values_within_five_standard_deviations_of_the_median_are_the_middle_ones() -> None:
     """Of values whose median lies at 2 and whose median distance from it is 1: 1.4826 is a standard deviation."""
     values = 2.0 + np.array([-1.0, -1.0, 0.0, 1.0, 1.0, -7.4, 7.5, 1.0, -1.0])
-    assert _without_outliers(values).tolist() == [True] * 6 + [False] + [True] * 2
+    assert without_outliers(values).tolist() == [True] * 6 + [False] + [True] * 2
 
 
 @pytest.mark.parametrize("part", [(0.0, 1.0), (0.0, 0.4), (0.6, 1.0)])

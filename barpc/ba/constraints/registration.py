@@ -22,11 +22,11 @@ from barpc.base.statistics import (
     FEWEST,
     ITERATIONS,
     RIDGE,
-    STATED_FREEDOM,
     SURELY,
     TIMES,
     evenly,
     kd_tree,
+    pooled_variance,
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
@@ -66,7 +66,7 @@ class TieSurface:
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
         usual = max(float(np.sqrt(np.median(squares) / freedom)), _MIN_RELIEF)
-        variance = (squares + STATED_FREEDOM * usual**2) / (freedom + STATED_FREEDOM)
+        variance = pooled_variance(squares, freedom, usual**2)
         patch[:, 0] += points[:, 2]
         return cls(
             points,

@@ -14,7 +14,7 @@ from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
-from barpc.base.statistics import OUTLIER
+from barpc.base.statistics import OUTLIER, evenly
 from barpc.scene import BoolArray, IntArray
 
 
@@ -185,9 +185,9 @@ class Linear:
             left[:, a:b] += (by_row[2 * a : 2 * b] @ step[v]).reshape(-1, 2).T
         return left
 
-    def thinned(self, most: int) -> Linear:
-        """Return every k-th track; k is the least for which about `most` observations remain."""
-        every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
+    def thinned(self, most: int | None = None) -> Linear:
+        """Return every k-th track; k is the least for which about `most` observations remain (see `evenly`)."""
+        every = evenly(sum(tracks.rows.size for tracks in self.tracks), most).step
         if every <= 1:
             return self
         groups = []
