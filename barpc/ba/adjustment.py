@@ -37,7 +37,7 @@ from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import OFF, AdjustOptions
 from barpc.base.process import one_blas_thread
-from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, evenly
+from barpc.base.statistics import ITERATIONS, MANY, evenly
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.centers import camera_center
 from barpc.sensor.radar import Radar
@@ -185,7 +185,7 @@ def _with_foreign_view(
         new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
         new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
     if placed is not None:
-        new["inlier"][parts[0].order[placed.rows]] = placed.agree(CRITICAL)
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree
         measured = measure(found.problem, params, parts[1])
         new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
     scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()

@@ -195,7 +195,7 @@ def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> A
             yield v, SimpleNamespace(views=(None,) * num), "solved"
 
     def placed(found: Any, others: Any, block: Any, view: int) -> Any:
-        told = {"contradicted": lambda _: contradicted[view], "is_coherent": lambda _: True}
+        told = {"contradicted": contradicted[view], "is_coherent": True}
         return SimpleNamespace(meets=False, squared=np.zeros(200), **told)
 
     monkeypatch.setattr(foreign_camera, "_leave_one_view_out", agreeing)

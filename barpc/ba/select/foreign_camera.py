@@ -27,7 +27,7 @@ from barpc.ba.solution import Solution
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import GEOMETRIC, AdjustOptions
-from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, OUTLIER, SMALL, SURE, TRIED
+from barpc.base.statistics import LARGEST, MUCH_NOISE, OUTLIER, SMALL, SURE, TRIED
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ def find_foreign_camera(
         if placed is None:
             too_few.append((v, found))
             continue
-        left.append(LeaveOneOut(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
+        left.append(LeaveOneOut(v, others, found, placed, placed.contradicted, placed.is_coherent))
         if num > AMBIGUOUS_VIEWS:  # the others fit without it: no second view needs to be tried
             break
     if beyond_prior is not None and first is not None:
