@@ -63,8 +63,8 @@ def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
 
 
 SIZES = {
-    "altimetry_points": ("barpc.ba.altimetry.SAMPLE",),
-    "scene_points": ("barpc.ba.constraints.gauge.SAMPLE",),
+    "altimetry_points": ("barpc.base.statistics.SAMPLE",),
+    "scene_points": ("barpc.base.statistics.SAMPLE",),
     "tests_kept": ("barpc.ba.control.snooping.KEPT",),
     "heights_measured": ("barpc.ba.result.MANY",),
     "slight_cut": ("barpc.ba.robust.rounds.SLIGHT",),

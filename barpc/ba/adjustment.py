@@ -37,7 +37,7 @@ from barpc.base.errors import AdjustError, BarpcWarning
 from barpc.base.geodesy import Array, ground_from_ecef
 from barpc.base.options import OFF, AdjustOptions
 from barpc.base.process import one_blas_thread
-from barpc.base.statistics import CRITICAL, ITERATIONS, MANY, SAMPLE
+from barpc.base.statistics import ITERATIONS, MANY, evenly
 from barpc.scene import Altimetry, BoolArray, GroundPoints, Reference, Tracks, View
 from barpc.sensor.centers import camera_center
 from barpc.sensor.radar import Radar
@@ -185,7 +185,7 @@ def _with_foreign_view(
         new["residuals_before"][rows] = others.views[v].sensor.project(ground) - part.xy[:, ties].T
         new["residuals"][rows] = sensors[v].project(ground) - part.xy[:, ties].T
     if placed is not None:
-        new["inlier"][parts[0].order[placed.rows]] = placed.agree(CRITICAL)
+        new["inlier"][parts[0].order[placed.rows]] = placed.agree
         measured = measure(found.problem, params, parts[1])
         new["held_out_noise"][v], new["held_out_rms"][v] = measured.noise[v], measured.rms[v]
     scale, odd = whole.prior.scale.copy(), whole.prior.odd.copy()
@@ -309,7 +309,7 @@ def _control_w(found: Solution, block: Block, covariance: Covariance) -> Array:
     has_prior = outcome.inlier & (False if prior is None else np.isin(block.point, prior.index))
     of_gcps = np.flatnonzero(has_prior & (block.point >= block.num_tracks) & (block.point < block.num_known))
     others = np.flatnonzero(has_prior & (block.point >= block.num_known))
-    rows = np.union1d(of_gcps, others[:: -(-len(others) // SAMPLE)] if len(others) else others)
+    rows = np.union1d(of_gcps, others[evenly(len(others))])
     if len(rows):
         at_end = (found.final, outcome.residual, outcome.weight)
         w[rows] = image_test(covariance, outcome.problem, *at_end, rows)
@@ -331,7 +331,7 @@ def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment
     other = any(isinstance(sensor, Radar) for sensor in cameras.sensors) or found.problem.joint_prior is not None
     if len(cameras.sensors) != 2 or other or whole.findings or len(index) < MANY:
         return whole
-    points, terrain = whole.points[index[:: len(index) // SAMPLE + 1]], found.heights.dem
+    points, terrain = whole.points[index[evenly(len(index))]], found.heights.dem
     ground, known = ground_from_ecef(points), np.full(len(points), np.nan)
     if terrain is not None and whole.terrain is not None and whole.terrain.shows and whole.terrain.agrees:
         known = np.asarray(terrain(ground[:, 0], ground[:, 1]), dtype=np.float64)

@@ -28,7 +28,7 @@ from barpc.ba.robust.rounds import Rounds
 from barpc.ba.solution import Solution, finished
 from barpc.ba.solving.covariance import Covariance
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.base.statistics import CRITICAL, FEWEST, GROSS, LEVEL, SAMPLE, robust_spread
+from barpc.base.statistics import CRITICAL, FEWEST, GROSS, LEVEL, evenly, robust_spread
 from barpc.scene import Altimetry, IntArray
 
 
@@ -62,7 +62,7 @@ def hold_by_altimetry(found: Solution, block: Block, outer: Block, given: Altime
         margin = CRITICAL * np.sqrt(np.diag(before)[:2])
         low, high = local[:, :2].min(axis=0) - margin, local[:, :2].max(axis=0) + margin
         near = np.flatnonzero(((place[:, :2] >= low) & (place[:, :2] <= high)).all(axis=1))
-        near = near[:: -(-len(near) // SAMPLE) or 1]
+        near = near[evenly(len(near))]
     if len(near) < FEWEST:
         return found, _unused(num_given, len(near), f"at least {FEWEST} heights on the tie points' surface are needed")
     surface = TieSurface.of(local)
@@ -73,7 +73,7 @@ def hold_by_altimetry(found: Solution, block: Block, outer: Block, given: Altime
     if why_not:
         return found, replace(test, why_not=why_not)
     least = 1 if found.heights.dem is None else 2  # half of the tie points keep the prior of the DEM
-    sampled = np.arange(0, len(ties), max(-(-len(ties) // SAMPLE), least))
+    sampled = np.arange(0, len(ties), max(evenly(len(ties)).step, least))
     placed = _registered_ties(
         points, ties[sampled], local[sampled, :2] / radius, enu, registered, np.sqrt(np.diag(before))
     )

@@ -23,7 +23,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from barpc.ba.interior import LINE_SPLINES, STEP_SIGMA, LineCurve
+from barpc.ba.interior import LINE_SPLINES, LineCurve
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
 from barpc.base.errors import InputError
 from barpc.base.geodesy import Array, ecef_from_ground_jacobian
 from barpc.base.statistics import BACKFITTING, CRITICAL, ROUNDING, STEPS, SURE, robust_spread
@@ -35,14 +36,12 @@ from barpc.sensor.image_corrections import ColumnSpline
 _ROUGHNESS = 10.0 ** np.arange(-4.0, 0.5, 0.5)  # px: candidate sigmas of the third differences of splines
 _CANDIDATES = 128  # intervals of the line, between which steps are tried first
 _FINER = 12  # factor by which each pass reduces the spacing of the candidates, around the steps found
-_POSITIONS = 65  # tried positions of a view on the line: over +-3 standard deviations, then over a 16th of that
-_MOST_STEPS = 40  # limit of the number of steps; focal planes have up to about thirty detectors
-_NUISANCES = 5  # number of nuisances of each coordinate of a view
+_POSITIONS = (
+    65  # tried positions of a view on the line: over +-`CRITICAL` standard deviations, then over a 16th of that
+)
 _NUISANCE_SIGMA = 100.0  # px: a wide prior, as a block may not determine all nuisances
+_MOST_STEPS = 40  # limit of the number of steps; focal planes have up to about thirty detectors
 _BEST_NOISE = 2e-3  # px: least noise of tie points, even if they agree better
-# Residuals up to this many standard deviations have full weight. A smoother loss would give less weight to observations
-# that contradict the current curve: each pass would keep a third of its error.
-_FULL_WEIGHT = 3.0
 _LEAST_SHARE = 0.75  # of a curve in a block of its sensor: halfway between 1 and 0.5, where correcting does not help
 
 
@@ -139,9 +138,8 @@ class _Eliminated:
         col, row = ties.place.T
         terms = np.stack([np.ones(count), col, row, col * row, row**2], axis=1)
         self.weight = weight
-        self._nuisances = self.derivatives(
-            terms, 2 * _NUISANCES * ties.view[:, None] + np.arange(_NUISANCES), _NUISANCES, self.num_views
-        )
+        each = terms.shape[1]
+        self._nuisances = self.derivatives(terms, 2 * each * ties.view[:, None] + np.arange(each), each, self.num_views)
         self._residual = (residual * weight[:, None]).ravel()
         loose = sp.eye_array(self._nuisances.shape[1]) / _NUISANCE_SIGMA**2
         normal = (self.product(self._nuisances) + loose).tocsc()
@@ -191,7 +189,7 @@ class _Eliminated:
             self.product(unknowns).toarray() - cross.T @ solved[:, :-1],
             self.gradient(unknowns) - cross.T @ solved[:, -1],
             float(off @ off - self._half @ solved[:, -1]),
-            float(self._residual.size - 3 * self.num_points - 2 * _NUISANCES * self.num_views),
+            float(self._residual.size - 3 * self.num_points - self._nuisances.shape[1]),
         )
 
 
@@ -263,7 +261,9 @@ def _weights(ties: SensorTies, curve: ColumnSpline | None) -> Array:
     for _ in range(BACKFITTING):
         length = np.linalg.norm(adjusted, axis=1) / np.sqrt(2.0 * redundancy)
         spread = max(robust_spread(length), 1e-6)
-        weight = np.minimum(1.0, _FULL_WEIGHT * spread / np.maximum(length, 1e-9)) ** 2
+        # full weight up to there: a smoother loss would give less weight to observations that contradict the current
+        # curve, and each pass would keep a third of its error
+        weight = np.minimum(1.0, CRITICAL * spread / np.maximum(length, 1e-9)) ** 2
         adjusted = _Eliminated(ties, residual, weight).residuals()
     noise = np.sqrt((weight**2 * (adjusted**2).sum(axis=1)).sum() / (weight**2 * 2.0 * redundancy).sum())
     return np.asarray(weight / max(noise, _BEST_NOISE))
@@ -362,7 +362,7 @@ def _fit_curve(
 def _fit_positions(ties: SensorTies, shift: Array, weight: Array, spline: ColumnSpline) -> tuple[Array, Array]:
     """Return the shifts (V,) [px] with which the loose views of a block fit a curve best, and their sigmas (V,) [px].
 
-    Each view is tried at positions within three standard deviations, then at finer ones around the best. The views take
+    Each view is tried at positions within `CRITICAL` sigmas, then at finer ones around the best. The views take
     turns, as they have points in common. `shift` are the start values.
     """
     shift, sigma = shift.copy(), np.zeros(len(shift))
@@ -371,7 +371,7 @@ def _fit_positions(ties: SensorTies, shift: Array, weight: Array, spline: Column
     block = _Eliminated(ties, ties.residual, weight)
     for _ in range(STEPS):
         for v in np.flatnonzero(ties.loose).tolist():
-            middle, reach, sigma[v] = 0.0, 3.0 * ties.loose[v], 0.0
+            middle, reach, sigma[v] = 0.0, CRITICAL * ties.loose[v], 0.0
             for _ in range(STEPS):  # in the end a 4000th of the first reach
                 tried = middle + np.linspace(-reach, reach, _POSITIONS)
                 at = np.tile(shift, (_POSITIONS, 1))
@@ -404,10 +404,10 @@ def _forward_selection(total: Told, curve: LineCurve, bend: float) -> tuple[list
     gradient, chosen, pairs = total.gradient[steps] + cross.T @ found, list[int](), np.arange(count)
     while count and len(chosen) < _MOST_STEPS:
         of_steps = np.stack([pairs, pairs + count], axis=1)
-        blocks = matrix[of_steps[:, :, None], of_steps[:, None, :]] + np.eye(2) / STEP_SIGMA**2
+        blocks = matrix[of_steps[:, :, None], of_steps[:, None, :]] + np.eye(2) / FIRST_SIGMA**2
         pull = gradient[of_steps]
         gains = 0.5 * np.einsum("ni,ni->n", pull, np.linalg.solve(blocks, pull[..., None])[..., 0])
-        gains -= 0.5 * np.linalg.slogdet(blocks * STEP_SIGMA**2)[1] + np.log(count)
+        gains -= 0.5 * np.linalg.slogdet(blocks * FIRST_SIGMA**2)[1] + np.log(count)
         best = int(np.argmax(gains))
         if not gains[best] > SURE:
             break

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from barpc.ba.parameters.additional_parameters import FIRST_SIGMA
 from barpc.ba.solving.covariance import Covariance, SharedErrors
 from barpc.ba.solving.normal import Reduced, solve_transposed, whiten
 from barpc.ba.solving.problem import Problem
@@ -30,8 +31,6 @@ from barpc.sensor.image_corrections import ColumnSpline, bspline_pieces, bspline
 
 LINE_SPLINES = 28  # over 25 intervals: lenses and focal planes bend over a twentieth of the line or more
 _COEFFICIENT_SIGMA = 3.0  # px: prior sigma of a spline coefficient, far above the distortion of any optics
-STEP_SIGMA = 1.0  # px: prior sigma of a step between detectors, which are aligned and measured before launch
-CURVE_COLUMNS = 400  # number of columns at which a curve is evaluated
 # px: interior orientation is calibrated in flight to 0.05-0.1 px RMS (SPOT 5 HRS and HRG: Gachet 2004, "SPOT5 in-flight
 # commissioning: inner orientation of HRG and HRS instruments", Int. Arch. Photogramm. XXXV-B1; before calibration the
 # curves reach 0.4 px) or to "better than 0.3 px" (ZY-1 02C: Yang and Wang 2013, J. Remote Sens. 17(5)). The prior has
@@ -79,19 +78,19 @@ class LineCurve:
         """Return the prior information (n, n) of the unknowns; `bend` is the sigma of third differences [px]."""
         rough = np.diff(np.eye(LINE_SPLINES), n=3, axis=0) / bend
         smooth = rough.T @ rough + np.eye(LINE_SPLINES) / _COEFFICIENT_SIGMA**2
-        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / STEP_SIGMA**2)])
+        return la.block_diag(*2 * [la.block_diag(smooth, np.eye(len(self.edges)) / FIRST_SIGMA**2)])
 
     @cached_property
     def columns(self) -> Array:
-        """Evenly spaced columns (`CURVE_COLUMNS`,) at which the curve is evaluated."""
-        return (np.arange(CURVE_COLUMNS) + 0.5) * self.width / CURVE_COLUMNS - 0.5
+        """All columns (width,)."""
+        return np.arange(self.width, dtype=np.float64)
 
     @cached_property
     def bent(self) -> Array:
         """Projection (n, n) of the unknowns that removes a constant and a slope; splines represent both exactly."""
         slope = (np.arange(LINE_SPLINES) - 1.0) * 2.0 / (LINE_SPLINES - 3) - 1.0
         lines = np.stack([np.ones(LINE_SPLINES), slope], axis=1)
-        straight = np.stack([np.ones(CURVE_COLUMNS), self.along(self.columns)], axis=1)
+        straight = np.stack([np.ones(self.width), self.along(self.columns)], axis=1)
         one = np.eye(self.size)
         one[:LINE_SPLINES] -= lines @ np.linalg.pinv(straight) @ self.basis(self.columns)
         return np.asarray(la.block_diag(one, one))
@@ -103,7 +102,7 @@ class LineCurve:
         if unknowns.ndim == 1:
             return np.array([np.sqrt(np.mean((basis @ unknowns[part]) ** 2)) for part in parts])
         blocks = (unknowns[part, part] for part in parts)
-        return np.sqrt([np.einsum("ni,ij,nj->n", basis, block, basis).mean() for block in blocks])
+        return np.sqrt([np.einsum("ni,ni->n", basis @ block, basis).mean() for block in blocks])
 
     def spline(self, unknowns: Array) -> ColumnSpline:
         """Return the image correction with unknowns (n,)."""

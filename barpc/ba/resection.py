@@ -14,7 +14,7 @@ from barpc.ba.robust.weights import geman_mcclure
 from barpc.ba.solution import Solution
 from barpc.ba.solving.normal import cholesky3, point_products, whiten
 from barpc.base.geodesy import GEOID, Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES, kd_tree
+from barpc.base.statistics import CRITICAL, FEW, GROSS, MUCH_NOISE, SHRINK, SURELY, TIMES, kd_tree
 from barpc.scene import BoolArray
 from barpc.sensor.image_corrections import bsplines
 
@@ -36,16 +36,19 @@ class Placed:
         """Whether the camera fits the points to the noise."""
         return self.noise < MUCH_NOISE
 
-    def agree(self, limit: float) -> BoolArray:
-        """Return the mask (n,) of observations with residuals within `limit` standard deviations."""
-        return np.asarray(self.squared <= 2.0 * limit * limit)
+    @property
+    def agree(self) -> BoolArray:
+        """Mask (n,) of observations with residuals within `CRITICAL` standard deviations."""
+        return np.asarray(self.squared <= 2.0 * CRITICAL**2)
 
-    def contradicted(self, limit: float) -> float:
-        """Return the fraction of observations with residuals beyond `limit` standard deviations, with splines."""
-        return float(self._exceeds(limit).mean())
+    @property
+    def contradicted(self) -> float:
+        """Fraction of observations with residuals beyond `CRITICAL` standard deviations, with splines."""
+        return float(self._is_outlier.mean())
 
-    def is_coherent(self, limit: float) -> bool:
-        """Return whether outliers have residuals like those of their neighbours: then the camera is wrong.
+    @property
+    def is_coherent(self) -> bool:
+        """Whether outliers have residuals like those of their neighbours: then the camera is wrong.
 
         Otherwise the matches are wrong. The difference of two independent residuals is 1.4 times their size, that of
         coherent residuals less than their size.
@@ -53,7 +56,7 @@ class Placed:
         seen = np.asarray(np.isfinite(self.left).all(axis=0))
         if seen.mean() < 0.5:  # most points are outside the domain of the camera
             return True
-        is_outlier = self._exceeds(limit) & seen
+        is_outlier = self._is_outlier & seen
         if is_outlier.sum() < FEW:
             return False
         outliers = self.left[:, is_outlier].T
@@ -61,8 +64,9 @@ class Placed:
         difference, size = (np.linalg.norm(x, axis=1) for x in (outliers - outliers[nearest], outliers))
         return bool(np.median(difference) < np.median(size))
 
-    def _exceeds(self, limit: float) -> BoolArray:
-        return ~np.asarray((self.left**2).sum(axis=0) <= 2.0 * limit * limit)
+    @property
+    def _is_outlier(self) -> BoolArray:
+        return ~np.asarray((self.left**2).sum(axis=0) <= 2.0 * CRITICAL**2)
 
 
 @dataclass(frozen=True, eq=False)

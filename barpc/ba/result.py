@@ -27,7 +27,7 @@ from barpc.ba.terms.term import Finding
 from barpc.ba.unseen import UnseenSteps
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
-from barpc.base.statistics import MANY
+from barpc.base.statistics import MANY, evenly
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction
@@ -269,7 +269,7 @@ def pair_heights(adjustment: Adjustment, first: int, second: int) -> PairHeights
     seen = seen[np.isfinite(adjustment.points[seen, 0])]
     if not len(seen):
         return PairHeights((first, second), np.nan, np.nan, 0)
-    points = adjustment.points[seen[:: len(seen) // MANY + 1]]
+    points = adjustment.points[seen[evenly(len(seen), MANY)]]
     n, pair = len(points), (min(first, second), max(first, second))
     cameras, params = adjustment.cameras, adjustment.params
     by_camera, pull, image = height_derivatives(cameras, params, pair, points)

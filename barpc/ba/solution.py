@@ -31,8 +31,8 @@ from barpc.scene import BoolArray
 
 _FAR_OFF = 150.0  # m: larger offsets from a reference exceed the accuracy of delivered cameras
 _TREND = MUCH_NOISE * NOISE_FLOOR  # px: with larger systematic residuals, other models are tried
+SURE_TREND = SURELY * NOISE_FLOOR  # px: smaller displacements of an image may be of its tie points
 _SKEW = 1e-3  # largest usual drift, relative to half the image length: 3 microradian per second
-MUCH_BETTER = 0.7  # largest ratio of check residuals to accept another model that may change heights
 CLEARLY = 0.8  # largest ratio of noise to accept another start; also least fraction of inliers of a view
 
 
@@ -147,7 +147,7 @@ def solve_block(
     drift = problem.cameras.unknowns.drift
     asked = dict[str, SmoothTest]()
     may_grow = options.drift is None and options.terms == AUTO and prior is None and drift
-    if may_grow and outcome.smooth.found(SURELY * NOISE_FLOOR).any():
+    if may_grow and outcome.smooth.found(SURE_TREND).any():
         less = outcome
         problem, outcome = _with_more_drift((problem, less), block, options, heights)
         asked = {} if outcome is less else {"drift": less.smooth}

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.constraints.gauge import MOTIONS, SIMILAR, GaugeReport, motions_of_moves, weakest_modes
-from barpc.ba.constraints.terrain import quadratic_basis, variance_inflation
-from barpc.ba.evidence.scan import price
+from barpc.ba.constraints.terrain import quadratic_basis, variance_inflation, without_outliers
+from barpc.ba.evidence.scan import BINS, price
 from barpc.ba.parameters.additional_parameters import DRIFTS
 from barpc.ba.terms.term import SIZE_PRICE
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, metres_per_unit, wrap_longitude
-from barpc.base.statistics import CRITICAL, MANY, OUTLIER, SURE, robust_spread
+from barpc.base.statistics import CRITICAL, MANY, SURE
 
 CHANCES = np.array([0.14, 0.05])
 """Probabilities that columns, and that rows, of an image are displaced.
@@ -33,7 +33,6 @@ LARGEST_STEPS = np.array([1.0, 5.0])
 Detectors are calibrated in flight to a fraction of a pixel. Larger displacements of rows tear the image visibly.
 """
 _LEAST_SHOWN = 1.0  # px: one row; heights of woods and houses look like smaller displacements
-_EDGES = 16  # number of equally probable positions of the edge along an axis
 
 
 @dataclass(frozen=True)
@@ -63,13 +62,13 @@ class UnseenSteps:
         heights by their coordinates [m/px].
         """
         # mean square of unseen displacements, for a uniform distribution from 0 to the largest displacement
-        sigma = np.sqrt(CHANCES / _EDGES * self.pixels**3 / (3.0 * LARGEST_STEPS))
+        sigma = np.sqrt(CHANCES / BINS * self.pixels**3 / (3.0 * LARGEST_STEPS))
         return np.asarray((sigma[..., None] * _steps(image, self.sizes) * pull[..., None]).reshape(len(pull), -1))
 
 
 def _steps(image: Array, sizes: Array) -> Array:
-    """Return 1 for image points (n, 2, 2) after an edge, else 0, for each edge (n, 2, 2, `_EDGES`)."""
-    edges = (np.arange(_EDGES) + 0.5) / _EDGES
+    """Return 1 for image points (n, 2, 2) after an edge, else 0, for equally probable edges (n, 2, 2, `BINS`)."""
+    edges = (np.arange(BINS) + 0.5) / BINS
     return np.asarray((image / sizes)[..., None] > edges, dtype=np.float64)
 
 
@@ -115,8 +114,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
         return None, limits
     error, at = ground[:, 2] - known, np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1]])
     at = (at - at[fits].mean(axis=0)) * metres_per_unit(ground[0])[:2]
-    error -= np.median(error[fits])
-    fits &= np.abs(error) <= OUTLIER * robust_spread(error[fits])
+    fits[fits] = without_outliers(error[fits])
     smooth, columns = quadratic_basis(at / np.abs(at[fits]).max()), rises.reshape(len(rises), -1)
     error, columns = _residuals(smooth[fits], error[fits, None])[:, 0], _residuals(smooth[fits], columns[fits])
     square = np.maximum((columns**2).sum(axis=0), 1e-9)
@@ -127,7 +125,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
     inflation = variance_inflation(at[fits], np.column_stack([residual, residual]))
     sigma = np.sqrt(residual @ residual / len(residual) * inflation / square)
     v, axis, edge = np.unravel_index(best, limits.shape)
-    shown = Shown(int(v), int(axis), (int(edge) + 0.5) / _EDGES, abs(float(pixels[best])), np.nan)
+    shown = Shown(int(v), int(axis), (int(edge) + 0.5) / BINS, abs(float(pixels[best])), np.nan)
     is_shown = shown.pixels > max(CRITICAL * float(sigma[best]), _LEAST_SHOWN)
     return shown if is_shown else None, np.maximum(CRITICAL * sigma, np.abs(pixels)).reshape(limits.shape)
 

@@ -116,6 +116,16 @@ SMALL = 400
 """Most unknowns of a block that is solved again for every hypothesis."""
 
 
+def evenly(count: int, most: int | None = None) -> slice:
+    """Return the slice of every n-th of `count` elements that leaves at most `most`; by default `SAMPLE`."""
+    return slice(None, None, max(-(-count // (most or SAMPLE)), 1))
+
+
+def pooled_variance(squares: Any, freedom: Any, stated: Any) -> Any:
+    """Return the variance by a sum of squares of so many degrees of freedom, with the stated one as a prior."""
+    return (STATED_FREEDOM * stated + squares) / (STATED_FREEDOM + freedom)
+
+
 def kd_tree(places: Array) -> Any:
     """Return scipy's k-d tree of places (n, d)."""
     from scipy.spatial import cKDTree  # a tenth of a second, which runs with matches given do not need

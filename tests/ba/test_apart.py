@@ -79,7 +79,7 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, chan
     if look == "height":  # a prior tells of one view where the others agree, which a pair always does
         assert adjust_tracks(block.views, block.tracks).apart is None
     if look != "axes":
-        monkeypatch.setattr(foreign_camera, "_EACH_LEFT_OUT", 2)
+        monkeypatch.setattr(foreign_camera, "AMBIGUOUS_VIEWS", 2)
     found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
     assert found.apart is not None
     assert found.apart.views == (2,)
@@ -195,7 +195,7 @@ def scripted(monkeypatch, evidence: list[float], contradicted: list[float]) -> A
             yield v, SimpleNamespace(views=(None,) * num), "solved"
 
     def placed(found: Any, others: Any, block: Any, view: int) -> Any:
-        told = {"contradicted": lambda _: contradicted[view], "is_coherent": lambda _: True}
+        told = {"contradicted": contradicted[view], "is_coherent": True}
         return SimpleNamespace(meets=False, squared=np.zeros(200), **told)
 
     monkeypatch.setattr(foreign_camera, "_leave_one_view_out", agreeing)

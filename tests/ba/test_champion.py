@@ -201,7 +201,7 @@ def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(m
     found = adjust_tracks(made.views, mixed)
     assert found.apart is None  # its wrong matches lie anywhere and are cut: the others stay as without it
     three = adjust_tracks(made.views[:3], tracks.select(tracks.view < 3))
-    monkeypatch.setattr(models, "MAX_CAMERA_CHANGE", 1e-9)
+    monkeypatch.setattr(models, "SURE_TREND", 1e-9)
     alone = adjust_tracks(made.views, mixed)
     assert alone.apart is not None
     assert (alone.apart.views, alone.apart.clear) == ((3,), True)

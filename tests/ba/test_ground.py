@@ -243,14 +243,14 @@ def flown(*accuracy: float) -> Any:
 
 def test_a_camera_is_as_accurate_as_it_states_for_attitude_and_position() -> None:
     views: Any = (flown(0.01, 0.02), flown())
-    stated = prior_sigmas(views, AdjustOptions(), 0)
+    stated = prior_sigmas(views, AdjustOptions(), 0, None, 0)
     np.testing.assert_array_equal(stated, [[USABLE_ACCURACY] * 6, [DEFAULT_ACCURACY] * 6])
     views = (flown(3.0, 0.5), flown(0.3, 9.0))
-    sigma = prior_sigmas(views, AdjustOptions(), 2)
+    sigma = prior_sigmas(views, AdjustOptions(), 2, None, 0)
     np.testing.assert_array_equal(sigma[0], np.repeat([3.0, 0.5, 0.2, 0.2], 3))
     np.testing.assert_array_equal(sigma[1], np.repeat([0.3, 9.0, 0.2, 0.2], 3))
     # one that is known to be off by more than that is not held to it, in either
-    off = prior_sigmas(views, AdjustOptions(), 0, np.array([1.0, np.nan]))
+    off = prior_sigmas(views, AdjustOptions(), 0, np.array([1.0, np.nan]), 0)
     np.testing.assert_array_equal(off, [np.repeat([3.0, 1.0], 3), np.repeat([0.3, 9.0], 3)])
     given = prior_sigmas(views, AdjustOptions(sigma_position=2.0), 1, None, 4)
     np.testing.assert_array_equal(given[:, 3:], [[2.0] * 3 + [0.2] * 3 + [1.0] * 4] * 2)
@@ -296,7 +296,7 @@ def test_heights_without_a_terrain_may_be_wrong_together_by_the_range_of_their_a
     held = held_by(heights(dem=None), points)
     np.testing.assert_allclose(held.common[:, 0, 0], 2.0)  # each by half of it
     views: Any = (flown(),)
-    np.testing.assert_array_equal(prior_sigmas(views, AdjustOptions(model="affine"), 0), np.full((1, 6), 20.0))
+    np.testing.assert_array_equal(prior_sigmas(views, AdjustOptions(model="affine"), 0, None, 0), np.full((1, 6), 20.0))
 
 
 def test_each_axis_of_a_reference_shares_its_own_error_over_its_own_sigma() -> None:

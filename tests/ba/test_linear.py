@@ -39,16 +39,16 @@ def test_a_dense_matrix_is_damped_and_solved(damping):
 
 
 def test_nothing_is_solved_without_unknowns():
-    assert linear.factorize(np.zeros((0, 0))).solve(np.zeros((0, 2))).shape == (0, 2)
+    assert linear.factorize(np.zeros((0, 0)), 0.0).solve(np.zeros((0, 2))).shape == (0, 2)
 
 
 def test_a_matrix_that_is_not_finite_is_an_adjust_error():
     with pytest.raises(AdjustError, match="not finite"):
-        linear.factorize(np.full((3, 3), np.nan))
+        linear.factorize(np.full((3, 3), np.nan), 0.0)
     pairs = np.zeros((0, 2), dtype=np.int64)
     blocks = Blocks(np.full((2, 3, 3), np.nan), np.zeros((0, 3, 3)), pairs)
     with pytest.raises(AdjustError, match="not finite"):
-        linear.factorize_blocks(blocks, dissect(pairs, np.zeros((2, 2)), np.ones(2, dtype=bool)))
+        linear.factorize_blocks(blocks, dissect(pairs, np.zeros((2, 2)), np.ones(2, dtype=bool)), 0.0)
 
 
 def test_a_large_block_is_solved_in_sparse_form_as_in_dense_form(block, adjusted, sized):

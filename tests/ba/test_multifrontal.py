@@ -102,7 +102,7 @@ def test_a_matrix_that_is_not_positive_definite_is_said() -> None:
     matrix = _matrix(pairs, len(place), 2)
     matrix.diagonal[50] *= -1.0
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
-        factorize_blocks(matrix, dissect(pairs, place, np.ones(len(place), dtype=bool)))
+        factorize_blocks(matrix, dissect(pairs, place, np.ones(len(place), dtype=bool)), 0.0)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])

@@ -307,11 +307,11 @@ def test_every_option_has_a_default():
 
 def test_prior_sigmas_stand_at_their_unknowns(dirty):
     with chosen(AdjustOptions, drift=2, sigma_attitude=2.0, sigma_position=3.0, sigma_drift=5.0) as options:
-        found = prior_sigmas(dirty.views, options, 2)
+        found = prior_sigmas(dirty.views, options, 2, None, 0)
     np.testing.assert_array_equal(found, [np.repeat([2, 3, 5, 5], 3)] * 4)
     for model, size in (("shift", 2), ("shift-drift", 4), ("affine", 6)):
         with chosen(AdjustOptions, model=model, sigma_shift=7.0) as given:
-            sigma = prior_sigmas(dirty.views, given, 0)
+            sigma = prior_sigmas(dirty.views, given, 0, None, 0)
         np.testing.assert_array_equal(sigma, np.full((4, size), 7.0))
 
 
@@ -320,7 +320,7 @@ def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
     view = dirty.views[0]
     told = replace(view, sensor=replace(view.sensor, err_bias=stated))
     assert stated_accuracy(told) == taken
-    np.testing.assert_array_equal(prior_sigmas((told,), AdjustOptions(), 0), np.full((1, 6), taken))
+    np.testing.assert_array_equal(prior_sigmas((told,), AdjustOptions(), 0, None, 0), np.full((1, 6), taken))
 
 
 def test_views_turn_about_the_centre_that_is_asked_for(dirty):

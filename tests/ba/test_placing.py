@@ -29,16 +29,16 @@ def test_the_median_of_squares_of_two_coordinates_is_one_where_they_are_as_state
     assert _median_length(length[:, 2:]) == np.inf
 
 
-@pytest.mark.parametrize(("size", "far"), [(2.99, False), (3.01, True)])
+@pytest.mark.parametrize(("size", "far"), [(3.99, False), (4.01, True)])
 def test_what_is_far_is_farther_than_so_many_deviations_of_both_coordinates(size: float, far: bool) -> None:
     left = np.zeros((2, 40))
     left[:, :10] = size  # sqrt(2) times that
     one = placed(left)
-    assert one.contradicted(3.0) == (0.25 if far else 0.0)
-    np.testing.assert_array_equal(one.agree(3.0), (np.arange(40) >= 10) | (not far))
+    assert one.contradicted == (0.25 if far else 0.0)
+    np.testing.assert_array_equal(one.agree, (np.arange(40) >= 10) | (not far))
     left[0, 39] = np.nan
-    assert placed(left).contradicted(3.0) == pytest.approx(0.025 + 0.25 * far)
-    assert placed(left, squared=np.zeros(40)).agree(3.0).all()  # of what is left with splines nothing
+    assert placed(left).contradicted == pytest.approx(0.025 + 0.25 * far)
+    assert placed(left, squared=np.zeros(40)).agree.all()  # of what is left with splines nothing
     assert placed(left, resection.MUCH_NOISE * 0.99).meets
     assert not placed(left, resection.MUCH_NOISE).meets
 
@@ -47,18 +47,18 @@ def test_a_camera_is_wrong_where_neighbours_lie_off_alike() -> None:
     rng = np.random.default_rng(1)
     smooth = 30.0 * np.stack([np.sin(XY[0] / 300.0), np.cos(XY[1] / 300.0)]) + 20.0
     anywhere = rng.normal(0.0, 30.0, (2, 80))
-    assert placed(smooth).is_coherent(3.0)
-    assert not placed(anywhere).is_coherent(3.0)
+    assert placed(smooth).is_coherent
+    assert not placed(anywhere).is_coherent
     few = smooth.copy()
     few[:, 29:] = 0.0
-    assert not placed(few).is_coherent(3.0)  # 29 say nothing
+    assert not placed(few).is_coherent  # 29 say nothing
     few[:, 29] = smooth[:, 29]
-    assert placed(few).is_coherent(3.0)
+    assert placed(few).is_coherent
     blind = anywhere.copy()
     blind[0, :40] = np.nan
-    assert not placed(blind).is_coherent(3.0)
+    assert not placed(blind).is_coherent
     blind[0, 40] = np.inf
-    assert placed(blind).is_coherent(3.0)  # more than half is not seen at all
+    assert placed(blind).is_coherent  # more than half is not seen at all
 
 
 def test_points_that_two_kept_observations_tell_are_known() -> None:

@@ -119,9 +119,9 @@ def test_common_errors_are_the_terrain_s_the_orthoimage_s_and_what_stands_on_it(
 
 
 def test_a_camera_that_is_known_to_be_off_is_not_held_to_what_it_states(block):
-    stated = prior_sigmas(block.views, AdjustOptions(), 0)
+    stated = prior_sigmas(block.views, AdjustOptions(), 0, None, 0)
     off = np.array([60.0, 1.0, np.nan])
-    found = prior_sigmas(block.views, AdjustOptions(), 0, off)
+    found = prior_sigmas(block.views, AdjustOptions(), 0, off, 0)
     assert found[0] == pytest.approx(60.0)
     assert found[1:] == pytest.approx(stated[1:])
-    assert prior_sigmas(block.views, AdjustOptions(sigma_attitude=2.0), 0, off)[0, :3] == pytest.approx(2.0)
+    assert prior_sigmas(block.views, AdjustOptions(sigma_attitude=2.0), 0, off, 0)[0, :3] == pytest.approx(2.0)

@@ -16,10 +16,10 @@ from barpc.ba.constraints.terrain import (
     Bands,
     RegularisedDem,
     Relief,
-    _without_outliers,
     believe,
     quadratic_basis,
     variance_inflation,
+    without_outliers,
 )
 from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
@@ -220,7 +220,7 @@ def test_hills_that_are_seen_on_one_side_only_are_hills(side: float) -> None:
 def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
     ground = points(200)
     tilted = lambda lon, lat: sum_of(HILLS)(lon, lat) + 40.0 * (lon - LON) * UNIT[0] / (SIDE / 2)  # noqa: E731
-    made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3))
+    made = Relief.of(tilted, ground, np.ones(200, dtype=bool), np.full(200, 0.3), 0.0)
     assert made.delivered[1] == pytest.approx(-40.0 * 0.816, rel=0.05)  # at the RMS distance of a square's points
     assert np.abs(made.delivered[[0, 2]]).max() < 2.5
     assert np.isnan(made.beyond(2.0)).all()  # nothing is known of the cameras yet
@@ -397,7 +397,7 @@ def test_points_that_pull_alike_where_they_lie_together_count_as_one() -> None:
 def test_values_within_five_standard_deviations_of_the_median_are_the_middle_ones() -> None:
     """Of values whose median lies at 2 and whose median distance from it is 1: 1.4826 is a standard deviation."""
     values = 2.0 + np.array([-1.0, -1.0, 0.0, 1.0, 1.0, -7.4, 7.5, 1.0, -1.0])
-    assert _without_outliers(values).tolist() == [True] * 6 + [False] + [True] * 2
+    assert without_outliers(values).tolist() == [True] * 6 + [False] + [True] * 2
 
 
 @pytest.mark.parametrize("part", [(0.0, 1.0), (0.0, 0.4), (0.6, 1.0)])

@@ -69,7 +69,7 @@ def smooth_of(view, reference, ties: np.ndarray | None = None) -> Smooth:
 def told(smooth: Smooth, residual: np.ndarray) -> tuple[bool, float, float]:
     """Whether a smooth part is found, its RMS, and what neighbours share [px]."""
     use = np.ones(residual.shape[1], dtype=bool)
-    found = smooth.test_neighbours(smooth.test(residual, use), residual, use)
+    found = smooth.test_neighbours(smooth.test(residual, use), residual, use, 1.0)
     return bool(found.found(0.06)[0]), float(found.rms[0]), float(found.shared[0])
 
 

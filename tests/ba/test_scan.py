@@ -21,7 +21,7 @@ def ties(seed: int, wrong: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def scan(view, place, size, wrong, off, floor=0.0):
-    return scanning.scan(view, place, size, wrong, off, 1.0 - wrong, floor)
+    return scanning.scan(view, place, size, wrong, off, 1.0 - wrong, floor, -np.inf)
 
 
 def test_the_price_is_that_of_one_of_all_runs_of_bins_of_both_axes_of_all_views() -> None:
@@ -84,6 +84,7 @@ def test_what_lies_below_the_floor_is_let_be() -> None:
     off = off + (place[1] < 0.3 * SIZE[1, view]) * 0.4
     assert scan(view, place, SIZE, wrong, off)[0].gain > SURE
     assert scan(view, place, SIZE, wrong, off, floor=0.4)[0].gain < SURE
+    assert scanning.scan(view, place, SIZE, wrong, off, 1.0 - wrong, 0.4) == []  # only what is sure is given
 
 
 @pytest.mark.parametrize("at", [0.3, 0.5, 0.62])

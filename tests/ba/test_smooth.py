@@ -201,14 +201,14 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
     residual[1, mine] += 0.15 * step[mine]
     use = np.ones(8000, dtype=bool)
     tested = smooth.test(residual, use)
-    found = smooth.test_neighbours(tested, residual, use)
+    found = smooth.test_neighbours(tested, residual, use, 1.0)
     np.testing.assert_array_equal(found.rms, tested.rms)
     assert found.shared[0] == pytest.approx(0.15, rel=0.15)
     assert found.shared[1] == 0.0
     for size, found in ((0.9, True), (3.0, False)):  # a mean product of 8 of its standard deviations, of 2
         faint = 0.15 * step * mine + noise(smooth, 0.3 * size)
         given = np.stack([0 * step, faint[1]])
-        shared = smooth.test_neighbours(smooth.test(given, use), given, use).shared
+        shared = smooth.test_neighbours(smooth.test(given, use), given, use, 1.0).shared
         assert (shared[0] > 0.0) == found  # else it may be chance
 
 

@@ -89,7 +89,7 @@ def test_the_floor_is_that_of_every_stretch_of_a_spline() -> None:
         information = TRACKS / 0.1**2
         assert (weight**2).sum() == pytest.approx(min(information, stretches / 0.3**2))
     misfit = observations().weight(use, 1.0, np.array([2.0, 9.0])).reshape(2, 7)[:, :TRACKS]
-    np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 3.0**2])
+    np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 9.0**2])
 
 
 @pytest.mark.parametrize(
@@ -115,9 +115,9 @@ def test_the_noise_is_that_of_the_tie_points_alone() -> None:
     problem: Any = SimpleNamespace(free=np.array([True] * 5 + [False] * 7))
     use = np.ones(2 * num, dtype=bool)
     freedom = 100 - 75 - 5
-    assert made.noise(residual, use, problem) == pytest.approx(np.sqrt(4 * 100 / freedom))
+    assert made.noise(residual, use, problem, 0) == pytest.approx(np.sqrt(4 * 100 / freedom))
     assert made.noise(residual, use, problem, fitted=1) == 1.0  # of 19 nothing is said
-    assert made.noise(0 * residual, use, problem) == 1e-6  # it is divided by
+    assert made.noise(0 * residual, use, problem, 0) == 1e-6  # it is divided by
 
 
 # --- robust rounds ------------------------------------------------------------------------------------------------

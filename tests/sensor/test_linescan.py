@@ -106,10 +106,10 @@ def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
     view = View("a", "", found.size, found.model, (0.0, 500.0))
     far = np.linalg.norm(found.model.position(10000) - ecef_from_ground(found.model.localize(IMAGE[2], np.array(0.0))))
     wanted = [2 * np.sqrt(12e-12 / 3) * far] * 3 + [np.sqrt(0.02)] * 3
-    np.testing.assert_allclose(prior_sigmas((view,), AdjustOptions(), 0), [wanted], rtol=1e-3)
-    assert prior_sigmas((view,), AdjustOptions(sigma_attitude=3.0), 0)[0, 0] == 3.0
+    np.testing.assert_allclose(prior_sigmas((view,), AdjustOptions(), 0, None, 0), [wanted], rtol=1e-3)
+    assert prior_sigmas((view,), AdjustOptions(sigma_attitude=3.0), 0, None, 0)[0, 0] == 3.0
     silent = replace(view, sensor=read(tmp_path, isd(FLIGHT, covariance=False)[0]).model)
-    np.testing.assert_array_equal(prior_sigmas((silent,), AdjustOptions(), 0), np.full((1, 6), 7.5))
+    np.testing.assert_array_equal(prior_sigmas((silent,), AdjustOptions(), 0, None, 0), np.full((1, 6), 7.5))
 
 
 # What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. Both were put

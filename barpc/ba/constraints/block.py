@@ -254,7 +254,7 @@ def _first_drift(options: AdjustOptions, prior: BlockPrior | None) -> int:
 def _known_centers(block: Block, options: AdjustOptions, centers: Array | None, prior: BlockPrior) -> Array:
     """Return the camera centres (N, 3) [m], ECEF; views of the earlier block keep the centres in its prior."""
     if centers is None:
-        centers = make_unknowns(block.views, options.first_model).center
+        centers = make_unknowns(block.views, options.first_model, prior.drift).center
     known = dict(zip(prior.names, prior.center, strict=True))
     return np.array([known.get(name, center) for name, center in zip(block.names, centers, strict=True)])
 

@@ -22,8 +22,8 @@ from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.normal import Reduced, by_cameras, solve_lower
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
-from barpc.base.geodesy import Array, enu_basis, ground_from_ecef, parts
-from barpc.base.statistics import MANY, SAMPLE
+from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
+from barpc.base.statistics import evenly
 from barpc.scene import BoolArray, IntArray
 
 MOTIONS = ("east", "north", "up", "tilt east", "tilt north", "turn", "scale", "twist", "bend east", "bend north")
@@ -78,7 +78,7 @@ def gauge_report(
     shift, count = (points[use] - before[use]).mean(axis=0), use.sum()
     index = np.flatnonzero(use)
     use = np.zeros_like(use)
-    use[index[:: len(index) // SAMPLE + 1]] = True
+    use[index[evenly(len(index))]] = True
     middle = points[use].mean(axis=0)
     enu = enu_basis(ground_from_ecef(middle))
     local = (points[use] - middle) @ enu.T
@@ -125,8 +125,7 @@ def _motion_by_shared(covariance: Covariance, pick: Array, index: IntArray) -> A
     """Return the derivatives (10, k) of the motions by errors common to several images, with the cameras fixed."""
     if covariance.shared is None:
         return 0.0
-    chunks = ((pick[:, part], covariance.shared.of_points(index[part])) for part in parts(len(index), MANY))
-    return np.asarray(sum(np.einsum("mni,nik->mk", *chunk) for chunk in chunks))
+    return np.asarray(np.einsum("mni,nik->mk", pick, covariance.shared.of_points(index)))
 
 
 def _motion_by_unknowns(covariance: Covariance, pick: Array, use: BoolArray, share: float) -> tuple[Array, Array]:

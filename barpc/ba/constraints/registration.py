@@ -22,11 +22,11 @@ from barpc.base.statistics import (
     FEWEST,
     ITERATIONS,
     RIDGE,
-    SAMPLE,
-    STATED_FREEDOM,
     SURELY,
     TIMES,
+    evenly,
     kd_tree,
+    pooled_variance,
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
@@ -66,7 +66,7 @@ class TieSurface:
         patch = np.einsum("pij,pkj,pk->pi", inverse, design, delta[..., 2])
         squares = ((delta[..., 2] - np.einsum("pkj,pj->pk", design, patch)) ** 2).sum(axis=1)
         usual = max(float(np.sqrt(np.median(squares) / freedom)), _MIN_RELIEF)
-        variance = (squares + STATED_FREEDOM * usual**2) / (freedom + STATED_FREEDOM)
+        variance = pooled_variance(squares, freedom, usual**2)
         patch[:, 0] += points[:, 2]
         return cls(
             points,
@@ -119,8 +119,8 @@ class GivenHeights:
     sigma: Array  # (n,) standard deviation of the height [m]
     sigma_flat: Array  # (n,) standard deviation of the horizontal position along each axis [m]
 
-    def select(self, keep: BoolArray) -> GivenHeights:
-        """Return the heights of a mask (n,)."""
+    def select(self, keep: BoolArray | slice) -> GivenHeights:
+        """Return the heights of a mask (n,), or of a slice."""
         return GivenHeights(self.place[keep], self.sigma[keep], self.sigma_flat[keep])
 
 
@@ -270,12 +270,12 @@ def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Arr
 
     Its tilts, turn and scale are 0. All is 0 if no height is at a valid patch.
     """
-    few = given.select(np.arange(len(given.sigma)) % -(-len(given.sigma) // SAMPLE) == 0)
+    few = given.select(evenly(len(given.sigma)))
     first = _SurfaceMisfit.of(surface, few, np.zeros(7), 1.0)
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
     reach = CRITICAL * before[:2]
-    step = np.maximum(1.5 * wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
+    step = np.maximum(wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
     sides = [np.arange(-(r // s), r // s + 1) * s for r, s in zip(reach, step, strict=True)]
     half = 2.0 * float(np.hypot(wide, 0.5 * steep * np.hypot(*np.minimum(step, reach))))
     best, found = -1.0, np.zeros(7)
@@ -362,7 +362,7 @@ def _inflation(place: Array, gradients: Array, independent: Array, surface: TieS
         if count < FEWEST:
             return factors
         sums = np.stack([np.bincount(group.ravel(), column, minlength=count) for column in gradients.T], axis=1)
-        ratio = (sums**2).sum(axis=0) / np.maximum(independent, 1e-300) * count / (count - 7.0)  # seven are fitted
+        ratio = (sums**2).sum(axis=0) / np.maximum(independent, 1e-300) * count / (count - len(factors))
         up, flat = [2, 3, 4], [0, 1, 5, 6]
         for part in (up, flat):
             factors[part] = np.maximum(factors[part], np.sqrt(ratio[part].mean()))

@@ -21,8 +21,8 @@ from barpc.base.statistics import (
     MANY,
     MUCH_NOISE,
     OUTLIER,
-    STATED_FREEDOM,
     SURELY,
+    pooled_variance,
     robust_spread,
 )
 from barpc.scene import BoolArray, IntArray
@@ -77,8 +77,7 @@ class Bands:
         filled, smoothed, width = np.where(known, heights - middle, 0.0), [], step
         while width * _MIN_SIDE_TO_WIDTH <= max(extent, _MIN_SIDE_TO_WIDTH * step):
             total, weight = (
-                gaussian_filter(a, width / step, mode="nearest", truncate=3.0)
-                for a in (filled, known.astype(np.float64))
+                gaussian_filter(a, width / step, mode="nearest") for a in (filled, known.astype(np.float64))
             )
             smoothed.append(middle + total / np.maximum(weight, 1e-6))
             width *= 2.0
@@ -183,7 +182,7 @@ class Relief:
         return sigma
 
     @classmethod
-    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float = 0.0) -> Relief:
+    def of(cls, terrain: Terrain, ground: Array, strong: BoolArray, sharp: Array, stated: float) -> Relief:
         """Compare a DEM with triangulated ground points (P, 3).
 
         Rays determine the heights of the points in the mask `strong` (P,), with standard deviations `sharp` (P,) [m].
@@ -202,7 +201,7 @@ class Relief:
         at = bands.local(ground[index])
         at -= at.mean(axis=0)
         plane = np.column_stack([np.ones(len(at)), at / np.sqrt((at**2).sum(axis=1).mean())])
-        near = _without_outliers(above)
+        near = without_outliers(above)
         for _ in range(BACKFITTING):
             delivered = _least_squares_fit(plane[near], above[near])
             residual = np.abs(above - plane @ delivered)
@@ -233,7 +232,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
     known = np.isfinite(heights[0])
     tell = relief.tell[index] & known
     if tell.any():
-        tell[tell] = _without_outliers((ground[:, 2] - heights.sum(axis=0))[tell])
+        tell[tell] = without_outliers((ground[:, 2] - heights.sum(axis=0))[tell])
     if tell.sum() < MANY:
         return None
     at = relief.bands.local(ground)
@@ -256,7 +255,7 @@ def believe(relief: Relief, index: IntArray, ground: Array, stated: float) -> Re
         weighted_slopes + np.einsum("nmx,mk->nx", by_place, trend),
         smooth,
         found.gains,
-        float(np.sqrt((STATED_FREEDOM * stated**2 + (residual[fits] ** 2).sum()) / (STATED_FREEDOM + freedom))),
+        float(np.sqrt(pooled_variance((residual[fits] ** 2).sum(), freedom, stated**2))),
         max(variance_inflation(at[fits], pull * residual[fits, None]), fits.sum() / relief.independent(index[fits])),
         ratio,
         shows,
@@ -306,7 +305,7 @@ def _regress_on_bands(
     return _BandRegression(gains, rising, part, residual, fits, motion_and_bend.shape[1] + len(gains))
 
 
-def _without_outliers(values: Array) -> BoolArray:
+def without_outliers(values: Array) -> BoolArray:
     """Return the mask (n,) of values (n,) that are not outliers relative to their median."""
     off = np.abs(values - np.median(values))
     return np.asarray(off <= OUTLIER * robust_spread(off))
@@ -338,7 +337,7 @@ def relief_ratio(ground: Array, dem: Array, stated: float) -> tuple[float, bool]
     """
     if len(dem) < MANY:
         return float("nan"), True
-    near = _without_outliers(ground[:, 2] - dem)
+    near = without_outliers(ground[:, 2] - dem)
     at = (ground - ground[near].mean(axis=0))[near, :2] * metres_per_unit(ground[near].mean(axis=0))[:2]
     plane = np.column_stack([np.ones(len(at)), at / max(float(np.abs(at).max()), 1.0)])
     relief = dem[near] - plane @ _least_squares_fit(plane, dem[near])

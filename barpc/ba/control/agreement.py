@@ -29,11 +29,8 @@ from barpc.scene import BoolArray, IntArray
 UNCONSTRAINED_SIGMA = 1e4
 _MAX_SET_POINTS = 50_000  # points in one batch, summed over its sets; about 25 MB
 _SIGMA_FACTORS = (1.0, 2.0, 3.0, 5.0)  # candidate factors by which standard deviations are understated
-# Sampling ends when the probability that all samples of three points had an outlier is this small, at the best inlier
-# share found. It is the probability after TRIALS / 2 samples if half of the points are outliers.
-_ENOUGH = (1.0 - 0.5**3) ** (TRIALS // 2)
 ODDS = float(-np.log(LEVEL))
-"""Log of the prior odds against a wrong point [nats].
+"""Log of the prior odds against an exception [nats]: a wrong point, or moving ground that covers most of a scene.
 
 The log prior of standard deviations understated by a factor f is -ODDS ln f. The log evidence of the best set must also
 exceed that of a smaller contradicting set by ODDS.
@@ -224,18 +221,14 @@ class _SubsetSearch:
         rng, count = np.random.default_rng(0), len(some.own)
         every = np.arange(count)
         found = [np.ones(count, dtype=bool)]
-        for scale in (1.0, 3.0):
-            most = 0.0
-            for trial in range(1, TRIALS // 2 + 1):
+        for scale in _SIGMA_FACTORS:
+            for _ in range(TRIALS // 2):
                 mask = np.zeros(count, dtype=bool)
                 mask[rng.choice(count, 3, replace=False)] = True
                 for _ in range(2):
                     if mask.any():  # an empty set would accept every point
                         mask = SetEvidence(some, mask[None], scale).deviations(every)[0][0] < CRITICAL**2
                 found += [mask] if mask.any() else []
-                most = max(most, float(mask.mean()))
-                if (1.0 - most**3) ** trial <= _ENOUGH:
-                    break
         sets = np.unique(np.array(found), axis=0)
         out = np.zeros((len(sets), self.count), dtype=bool)
         out[:, among] = sets

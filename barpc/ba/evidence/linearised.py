@@ -14,6 +14,7 @@ from barpc.ba.solving.normal import TRIANGLE, cholesky3, whiten
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array
+from barpc.base.statistics import OUTLIER, evenly
 from barpc.scene import BoolArray, IntArray
 
 
@@ -184,9 +185,9 @@ class Linear:
             left[:, a:b] += (by_row[2 * a : 2 * b] @ step[v]).reshape(-1, 2).T
         return left
 
-    def thinned(self, most: int) -> Linear:
-        """Return every k-th track; k is the least for which about `most` observations remain."""
-        every = -(-sum(tracks.rows.size for tracks in self.tracks) // most)
+    def thinned(self, most: int | None = None) -> Linear:
+        """Return every k-th track; k is the least for which about `most` observations remain (see `evenly`)."""
+        every = evenly(sum(tracks.rows.size for tracks in self.tracks), most).step
         if every <= 1:
             return self
         groups = []
@@ -224,7 +225,9 @@ def linearise(problem: Problem, state: State, use: BoolArray, sigma: Array, span
         tracks.append(TrackGroup(rows, view, subsets.astype(np.float64), basis, log_det - np.log(volume), by_camera))
         ends = ground.reshape(len(rows), n, 2, 3)[:, [0, -1]].reshape(len(rows), 4, 3)
         baselines.append(np.sqrt(np.maximum(np.linalg.det(np.swapaxes(ends, 1, 2) @ ends), 0.0)))
-    largest = max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), 5.0) if len(order) else 5.0
+    largest = (
+        max(float(np.quantile(np.linalg.norm(residual[:, order], axis=0), 0.99)), OUTLIER) if len(order) else OUTLIER
+    )
     parallax = float(np.median(np.concatenate(baselines))) * volume / image if len(order) else 0.0
     prior = problem.camera_prior
     return Linear(

@@ -27,7 +27,6 @@ from barpc.scene import BoolArray, IntArray
 BINS = 40  # number of bins of equal size along the rows or columns of an image
 _STARTS, _STOPS = np.triu_indices(BINS + 1, 1)  # first bin of each interval, and the bin after its last
 _FEWEST_INSIDE = 8  # least number of check observations of a tested region
-_PERMUTATIONS = 2000  # twice as many as a p-value of `CHANCE` needs
 _FINEST = 32  # smallest cells along each side of an image; one check observation is taken in each
 # residuals of two views have one direction: a component is ignored if its spread is below this share of the largest
 MIN_EXTENT_RATIO = 0.05
@@ -56,9 +55,18 @@ def price(views: int) -> float:
 
 
 def scan(
-    view: IntArray, place: Array, size: Array, wrong: Array, off: Array, weight: Array, floor: float = 0.0
+    view: IntArray,
+    place: Array,
+    size: Array,
+    wrong: Array,
+    off: Array,
+    weight: Array,
+    floor: float = 0.0,
+    least: float = SURE,
 ) -> list[Interval]:
-    """Find the most significant interval of rows and of columns of each view by each statistic; largest gain first.
+    """Find the best interval of rows and of columns of each view by each statistic, if its gain exceeds `least` [nats].
+
+    The one of largest gain is first.
 
     Parameters
     ----------
@@ -70,7 +78,7 @@ def scan(
     floor : float, size of displacements that are tolerated [standard deviations]
     """
     views, found = size.shape[1], []
-    off, least = np.clip(off, -OUTLIER, OUTLIER), price(views)
+    off, cost = np.clip(off, -OUTLIER, OUTLIER), price(views)
     for axis in (0, 1):
         bin_ = (place[axis] / size[axis][view] * BINS).astype(np.int64).clip(0, BINS - 1)
         rows = np.array([np.ones(len(view)), wrong])
@@ -81,7 +89,7 @@ def scan(
         for by_share, gain in zip((True, False), (shares, gains), strict=True):
             gain[BINS - 1] = 0.0  # the whole image is no interval
             for v, at in enumerate(gain.argmax(axis=0).tolist()):
-                surplus, common = float(gain[at, v]) - least, float(displaced[at, v])
+                surplus, common = float(gain[at, v]) - cost, float(displaced[at, v])
                 i, j = int(_STARTS[at]), int(_STOPS[at])
                 if not by_share and 2 * (j - i) > BINS and (i == 0 or j == BINS):
                     i, j = (0, i) if j == BINS else (j, BINS)  # the shorter part is the displaced one
@@ -90,7 +98,7 @@ def scan(
                 ends = float(i * step), float(j * step)
                 statistics = surplus, count_wrong / max(inside, 1.0), common, by_share
                 found.append(Interval(v, axis, *ends, *statistics, part=(j - i) / BINS))
-    return sorted(found, key=lambda one: -one.gain)
+    return sorted((one for one in found if one.gain > least), key=lambda one: -one.gain)
 
 
 def _interval_sums(bins: Array) -> Array:
@@ -324,6 +332,7 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
     principal axes. `of_near` (P, k) is 1 for the inliers of a region, else 0.
     """
     rng, here, count = np.random.default_rng(0), of_near.sum(axis=1), along.shape[1]
+    permutations = round(2.0 / CHANCE)  # twice as many as a p-value of `CHANCE` needs
     along = along - along.mean(axis=1, keepdims=True)
     scale = (1.0 / here - 1.0 / count)[:, None] * (along**2).mean(axis=1)
 
@@ -331,8 +340,8 @@ def _permutation_p_values(along: Array, of_near: Array) -> Array:
         return np.asarray(((of_near @ values.T / here[:, None]) ** 2 / scale).sum(axis=1))
 
     found = squared_means_over_variances(along)
-    drawn = [squared_means_over_variances(along[:, rng.permutation(count)]).max() for _ in range(_PERMUTATIONS)]
-    return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (_PERMUTATIONS + 1.0))
+    drawn = [squared_means_over_variances(along[:, rng.permutation(count)]).max() for _ in range(permutations)]
+    return np.asarray(1.0 - np.searchsorted(np.sort(drawn), found, side="left") / (permutations + 1.0))
 
 
 def hypergeometric_tail(found: int, count: int, marked: int, whole: int) -> float:

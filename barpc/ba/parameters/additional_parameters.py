@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg as la
 
 from barpc.base.geodesy import Array
-from barpc.base.statistics import SAMPLE
+from barpc.base.statistics import FEW, SAMPLE
 from barpc.scene import IntArray
 from barpc.sensor.image_corrections import RowSpline, bsplines, profile, sine_and_cosine
 
@@ -23,6 +23,11 @@ MIN_SPLINES = 7  # fewest splines of an image
 FIRST_SIGMA = 1.0  # px: prior standard deviation before variances are estimated
 OF_VIEWS = {"edges": (0,), "steps": (0, 5), "periods": (0,)}  # arrays with a row per view -> shape of an empty row
 DRIFTS = 3  # polynomials in the row (constant, linear, quadratic) to which splines are orthogonal
+
+
+def most_splines(view: IntArray) -> int:
+    """Return how many splines of an image observations of views (K,) allow: `FEW` for each, by the median view."""
+    return int(np.median(np.bincount(view))) // FEW
 
 
 @dataclass(frozen=True, eq=False)

@@ -200,9 +200,7 @@ def _stated_accuracy(view: View) -> tuple[float, float]:
     return (stated_accuracy(view),) * 2
 
 
-def prior_sigmas(
-    views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None = None, waves: int = 0
-) -> Array:
+def prior_sigmas(views: tuple[View, ...], options: AdjustOptions, drift: int, off: Array | None, waves: int) -> Array:
     """Return the prior standard deviations (N, q) of every view's unknowns, in the unknowns' units (m or px).
 
     `off` (N,) [m] are measured offsets of the views. Where larger than the stated accuracy, they replace it. `waves`

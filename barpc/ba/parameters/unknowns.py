@@ -187,7 +187,7 @@ class Unknowns:
 def make_unknowns(
     views: Sequence[View],
     model: str,
-    drift: int = 0,
+    drift: int,
     centers: Array | None = None,
     waves: AdditionalParameters | None = None,
 ) -> Unknowns:

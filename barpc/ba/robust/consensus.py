@@ -62,7 +62,7 @@ def two_normals(z: Array) -> tuple[float, float, float]:
     """
     z = z - z.mean()
     whole = float((z**2).mean())
-    (low, high), square, part = np.quantile(z, [0.1, 0.9]), 0.25 * whole, 0.5
+    (low, high), square, part = np.quantile(z, [LEVEL, 1.0 - LEVEL]), whole, 0.5
     for _ in range(ITERATIONS):
         # of equal width: the log ratio of their densities is linear in z
         second = expit((high - low) * (z - 0.5 * (low + high)) / square - np.log(part / (1.0 - part)))

@@ -18,7 +18,7 @@ from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS
 from barpc.ba.parameters.unknowns import Unknowns
 from barpc.ba.solving.structure import Structure
 from barpc.base.geodesy import Array, metres_per_unit, parts
-from barpc.base.statistics import KEPT, MANY, OUTLIER, RIDGE
+from barpc.base.statistics import KEPT, MANY, OUTLIER, RIDGE, evenly
 from barpc.scene import BoolArray, IntArray
 from barpc.sensor.image_corrections import bsplines
 
@@ -68,7 +68,7 @@ class NoiseCorrelation:
         for view in np.unique(block.view[rows]):
             own = np.flatnonzero(rows & (block.view == view))
             ties = ~rows & (block.view == view)
-            sampled = own[:: -(-len(own) // MANY)]  # points of a grid: some are representative of all
+            sampled = own[evenly(len(own), MANY)]  # points of a grid: some are representative of all
             alike = found.overlap(sampled[:, None], own[None]).sum(axis=1).mean()
             share[own] = 1.0 / (alike + len(own) / (NUM_TERMS * MAX_INDEPENDENT_ERRORS))
             usual = np.median(block.sigma[ties] if ties.any() else block.sigma[own])
@@ -199,7 +199,7 @@ class Smooth:
         return SmoothTest(rms, significance, by_row, np.zeros(n))
 
     def test_neighbours(
-        self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float = 1.0
+        self, tested: SmoothTest, residual: Array, use: BoolArray, redundancy: Array | float
     ) -> SmoothTest:
         """Return the test with `shared` and `redundancy` added.
 

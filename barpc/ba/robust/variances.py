@@ -26,7 +26,7 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum
 from barpc.base.geodesy import Array
 from barpc.base.options import AdjustOptions
-from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, LEVEL, STANDS, STATED_FREEDOM, SURE, TIMES
+from barpc.base.statistics import CHANCE, GROSS, ITERATIONS, LEVEL, STANDS, SURE, TIMES, pooled_variance
 from barpc.scene import BoolArray, IntArray, View
 
 logger = logging.getLogger(__name__)
@@ -35,9 +35,6 @@ logger = logging.getLogger(__name__)
 _LIKELIER = -np.log(LEVEL)
 # drift caused by a rotation, over the rotation: the projection centre moves by some km while an image is taken
 _CENTRE_MOTION_SHARE = 0.01
-# a cautious standard deviation is the upper confidence limit with this probability of error; too narrow a prior bends
-# all heights
-_LOW = 0.1
 SAME_PRIOR = 0.2  # log change of a standard deviation below which a block is not solved again
 _MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is estimated
 
@@ -252,7 +249,7 @@ class Variances:
             learnt = np.isfinite(sigma[:, rows[0]])  # infinite: the prior is in the matrix of an earlier block
             squares, freedom = (learnt * part.sum(axis=1) for part in (params[:, rows] ** 2, known[:, rows]))
             common = (NOISE_FLOOR**2 + squares.sum()) / (1.0 + freedom.sum())
-            size = np.sqrt((STATED_FREEDOM * common + squares) / (STATED_FREEDOM + freedom))
+            size = np.sqrt(pooled_variance(squares, freedom, common))
             out[:, rows] = np.where(learnt, size, np.inf)[:, None]
         return out
 
@@ -349,14 +346,14 @@ class Variances:
     def _likely(self, total: float, freedom: float, careful: bool) -> float:
         """Return the estimate of a variance over the given variance.
 
-        `total` is the sum of squares over the given variance. The given variance has the weight of `STATED_FREEDOM`
-        observations. With `careful`, the estimate is at least the upper confidence limit with a probability of error of
-        `_LOW`.
+        `total` is the sum of squares over the given variance, which has the weight of `STATED_FREEDOM` observations.
+        With `careful`, the estimate is at least the upper confidence limit with a probability of error of `LEVEL`: too
+        narrow a prior bends all heights.
         """
-        likely = (STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)
+        likely = pooled_variance(total, freedom, 1.0)
         if not careful or freedom <= _MIN_FREEDOM:
             return float(likely)
-        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
+        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, LEVEL))))
 
     def _odd(
         self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
@@ -398,7 +395,7 @@ class Variances:
         _, offset, blocks = known.alone(prior)
         seen = self._share(blocks, prior, known.around.problem.free)
         total, freedom = self._by_view(offset + self.given.mean, seen)[..., 0]
-        size = np.maximum(np.sqrt((STATED_FREEDOM + total) / (STATED_FREEDOM + freedom)), scale)
+        size = np.maximum(np.sqrt(pooled_variance(total, freedom, 1.0)), scale)
         return known.alone(self._prior(size, wide))[0], size
 
     def _beside(self, params: Array, known: Array, last: PriorTest | None) -> Array:

@@ -17,7 +17,6 @@ from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # median of a squared residual over its mean; 1 (two views) to 2 (many) degrees of freedom
-_LARGEST_MISFIT = 3.0  # px: upper limit; a larger misfit would take all weight from the view that causes it
 _LITTLE_NOISE = 0.04
 """Standard deviation of tie points [px] below which the noise floor is reduced in proportion to it.
 
@@ -111,7 +110,7 @@ class Observations:
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
         # at least a tenth of the noise floor, because copies of an image have no noise
         common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2
-        floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
+        floor = common / self.stretches + np.square(misfit) / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
         reduction = np.sqrt(np.minimum(MAX_INDEPENDENT_ERRORS / np.maximum(count, 1.0), 1.0))
@@ -126,7 +125,7 @@ class Observations:
         """Return the sums (N,) of the squared weights of the tie points of each view."""
         return np.asarray(self.structure.sum_views((weight * self.is_tie)[None] ** 2)[:, 0])
 
-    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int = 0) -> float:
+    def noise(self, residual: Array, use: BoolArray, problem: Problem, fitted: int) -> float:
         """Estimate the observed over stated standard deviation of tie points in use; 1 if they are too few.
 
         `fitted` is the number of other parameters that were fitted to the residuals.

@@ -18,7 +18,7 @@ from barpc.ba.evidence.scan import Interval, scan
 from barpc.ba.robust.rounds import Outcome, retriangulate_rejected
 from barpc.ba.robust.weights import Observations
 from barpc.base.geodesy import Array
-from barpc.base.statistics import FEW, OUTLIER, SURE
+from barpc.base.statistics import FEW, OUTLIER
 from barpc.scene import BoolArray, IntArray
 
 _SIDES = 2 ** np.arange(2, 6)  # grids to try: cells along each side of an image
@@ -40,7 +40,7 @@ def _find_significant(outcome: Outcome, block: Block, floor: float) -> list[Inte
     right = outcome.inlier[rows].astype(np.float64)  # means of inliers only: a few large outliers would shift them
     pixel = float(np.median(block.sigma[rows])) * outcome.noise if rows.any() else 1.0
     found = scan(block.view[rows], block.xy[:, rows], image_sizes(block), 1.0 - right, off, right, floor / pixel)
-    return [replace(one, off=one.off * pixel) for one in found if one.gain > SURE]
+    return [replace(one, off=one.off * pixel) for one in found]
 
 
 def unexplained_intervals(outcome: Outcome, block: Block, floor: float) -> list[Interval]:

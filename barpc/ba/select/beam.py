@@ -310,7 +310,7 @@ class TermSearch:
         all_residuals, known = residuals_from_inliers(linear, _residuals(found, linear, extra), found.right)
         off, weight = all_residuals[:, rows] / found.noise, (known[rows] | (wrong < 0.5)).astype(np.float64)
         floor = self.floor / self.sigma / found.noise
-        out = [one for one in scan(view, place, seen.size, wrong, off, weight, floor) if one.gain > SURE]
+        out = scan(view, place, seen.size, wrong, off, weight, floor)
         return _without_overlaps(out)[:RIVALS], find_periods(view, place[1], seen.size, weight, off)[:RIVALS]
 
     def _explains_all(self, made: list[_Candidate]) -> bool:
@@ -367,7 +367,7 @@ class TermSearch:
         """Yield displaced image parts where the moving tracks of a fit concentrate: they may be the true cause."""
         seen, none = self.seen, np.zeros((2, int(rows.sum())))
         places = scan(seen.linear.view[rows], seen.place[:, rows], seen.size, found.moving[rows], none, none[0])
-        best = {one.view: one for one in reversed(places) if one.by_share and one.gain > SURE}
+        best = {one.view: one for one in reversed(places) if one.by_share}
         intervals = sorted(best.values(), key=lambda one: -one.gain)[:RIVALS]
         return proposed(seen, intervals, [], (LowFrequency,))
 

@@ -20,8 +20,6 @@ from barpc.base.statistics import BANDS, MAD, OUTLIER, SURELY
 from barpc.scene import IntArray
 
 _MIN_OFFSETS = 12  # offsets of a band: fewer give no reliable median
-_MEDIAN_ERROR = 1.2533  # standard error of a median over that of a mean, for normal errors
-_PAIRS_PER_OBSERVATION = 2  # number of following observations of the track with which each is paired
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +40,11 @@ class Bands:
     @classmethod
     def of(cls, ties: Block) -> Bands:
         """Return the bands of the tie points of a block."""
-        first, second = _pairs(ties)
-        pair = np.unique(ties.view[first] * len(ties.views) + ties.view[second], return_inverse=True)[1]
+        structure = ties.own_points[1]
+        first, second = structure.first, structure.second
+        pair: IntArray = np.repeat(np.arange(len(structure.pair_view)), np.diff(structure.pair_bounds))
         bands = [_band(ties.xy[axis, rows], pair) for rows in (first, second) for axis in (0, 1)]
-        group = np.concatenate([(4 * BANDS + 1) * pair + BANDS * n + one for n, one in enumerate([*bands, 0])])
+        group = np.concatenate([(4 * BANDS + 1) * pair + BANDS * n + one for n, one in enumerate([*bands, 0 * pair])])
         return cls(ties, first, second, group, np.bincount(group))
 
     def offsets(self, found: Solution) -> Array:
@@ -83,18 +82,8 @@ class Bands:
     def errors(self, offsets: Array, middle: Array) -> Array:
         """Return the standard errors (B,) [px] of the medians `middle` (B,) [px] of offsets (5 M,) [px]."""
         spread = MAD * self.medians(np.abs(offsets - middle[self.group]))
-        return np.asarray(_MEDIAN_ERROR * spread / np.sqrt(np.maximum(self.count, 1)))
-
-
-def _pairs(ties: Block) -> tuple[IntArray, IntArray]:
-    """Return the first and second observations (M,) of pairs of the same point, in the order of their views."""
-    order = np.lexsort((ties.view, ties.point))
-    first, second = list[IntArray](), list[IntArray]()
-    for lag in range(1, _PAIRS_PER_OBSERVATION + 1):
-        same = np.flatnonzero(ties.point[order[lag:]] == ties.point[order[: len(order) - lag]])
-        first.append(order[same])
-        second.append(order[same + lag])
-    return np.concatenate(first), np.concatenate(second)
+        # of normal errors, a median has sqrt(pi / 2) times the standard error of a mean
+        return np.asarray(np.sqrt(np.pi / 2.0) * spread / np.sqrt(np.maximum(self.count, 1)))
 
 
 def _line_normals(by_point: Array, normal: Array) -> Array:

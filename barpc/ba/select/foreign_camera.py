@@ -27,12 +27,12 @@ from barpc.ba.solution import Solution
 from barpc.base.errors import AdjustError
 from barpc.base.geodesy import Array
 from barpc.base.options import GEOMETRIC, AdjustOptions
-from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, OUTLIER, SMALL, SURE, TRIED
+from barpc.base.statistics import LARGEST, MUCH_NOISE, OUTLIER, SMALL, SURE, TRIED
 
 logger = logging.getLogger(__name__)
 
 FOREIGN_CAMERA = "foreign_camera"  # kind of this anomaly in `summary.json`
-_EACH_LEFT_OUT = 3  # in a block of three views the remaining pair may fit by chance: each is left out
+AMBIGUOUS_VIEWS = 3  # in a block of so few views any may be the wrong one: a remaining pair may fit by chance
 
 Solver = Callable[[Block, Block, AdjustOptions], Solution]
 """(block to solve, block of check observations, options) -> solution."""
@@ -137,7 +137,7 @@ def find_foreign_camera(
     if first is not None:
         candidates = candidates[:TRIED]
         if agrees(first):
-            beyond_prior = _beyond_prior(first, block) if num > _EACH_LEFT_OUT else None
+            beyond_prior = _beyond_prior(first, block) if num > AMBIGUOUS_VIEWS else None
             candidates = candidates[rejected[candidates]] if beyond_prior is None else np.array([beyond_prior])
         if unknowns > SMALL:
             candidates = candidates[rejected[candidates]]
@@ -149,8 +149,8 @@ def find_foreign_camera(
         if placed is None:
             too_few.append((v, found))
             continue
-        left.append(LeaveOneOut(v, others, found, placed, placed.contradicted(CRITICAL), placed.is_coherent(CRITICAL)))
-        if num > _EACH_LEFT_OUT:  # the others fit without it: no second view needs to be tried
+        left.append(LeaveOneOut(v, others, found, placed, placed.contradicted, placed.is_coherent))
+        if num > AMBIGUOUS_VIEWS:  # the others fit without it: no second view needs to be tried
             break
     if beyond_prior is not None and first is not None:
         return _by_prior(left, float(first.outcome.prior.scale[beyond_prior]), block)

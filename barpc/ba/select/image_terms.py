@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from barpc.ba.constraints.block import Block, make_problem
-from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters
+from barpc.ba.parameters.additional_parameters import MIN_SPLINES, AdditionalParameters, most_splines
 from barpc.ba.parameters.priors import JointPrior
 from barpc.ba.robust.heldout import is_admitted, is_better
 from barpc.ba.robust.rounds import Rounds, retriangulate_rejected
 from barpc.ba.select.anomalies import correlated_noise_gain, significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.parts import Parts
-from barpc.ba.solution import MUCH_BETTER, Solution, finished
+from barpc.ba.solution import Solution, finished
 from barpc.ba.terms import TERMS, LinesLost, Sinusoid
 from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.statistics import CRITICAL, FEW, LARGEST, MUCH_NOISE, SURE
+from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SURE
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _SPLINE_FACTOR = 1.5  # ratio of successive numbers of splines: 7, 10, 15, 22, 33
@@ -176,7 +176,7 @@ def _explains(tried: Solution, found: Solution, block: Block) -> bool:
     Check tie points share matching errors with their neighbours, so a smaller fall may be a fit to noise.
     """
     left, before = (correlated_noise_gain(one.outcome, block) for one in (tried, found))
-    return left <= max(0.5 * before, SURE) or tried.after.error < MUCH_BETTER * found.after.error
+    return left <= max(0.5 * before, SURE) or MUCH_NOISE * tried.after.error < found.after.error
 
 
 def _at_selection(found: Solution, selected: Selection, block: Block) -> Solution:
@@ -222,7 +222,7 @@ def spline_counts(block: Block, options: AdjustOptions, has_waves: bool) -> list
     rows = max(view.size[1] for view in block.views)
     if options.jitter == OFF or options.is_plain:
         return [0] if options.detectors else []
-    most = int(np.median(np.bincount(block.view[block.use], minlength=len(block.views)))) // FEW
+    most = most_splines(block.view[block.use])
     if options.spacing:
         return [max(min(int(np.ceil(rows / options.spacing)) + 3, most), MIN_SPLINES)]
     most = min(most, LARGEST // (2 * len(block.views)))

@@ -11,25 +11,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from barpc.ba.control.agreement import ODDS
 from barpc.ba.parameters.priors import NOISE_FLOOR
 from barpc.ba.robust.heldout import is_better, measure
 from barpc.ba.select.anomalies import significant_intervals
 from barpc.ba.select.beam import Selection
 from barpc.ba.select.champion import compared, is_closer
-from barpc.ba.select.foreign_camera import ForeignCamera, Solver, contradicted_view, find_foreign_camera
+from barpc.ba.select.foreign_camera import (
+    AMBIGUOUS_VIEWS,
+    ForeignCamera,
+    Solver,
+    contradicted_view,
+    find_foreign_camera,
+)
 from barpc.ba.select.image_terms import with_lines_lost, with_splines, with_terms, with_terms_beside_splines
 from barpc.ba.select.parts import Parts, lost_shares
 from barpc.ba.select.search import search_terms
-from barpc.ba.solution import CLEARLY, MUCH_BETTER, Solution
+from barpc.ba.solution import CLEARLY, SURE_TREND, Solution
 from barpc.ba.terms.moving_ground import MovingGroup
 from barpc.ba.terms.term import Finding
 from barpc.base.errors import AdjustError
 from barpc.base.options import AUTO, AdjustOptions
-from barpc.base.statistics import LEVEL, MUCH_NOISE, RIVALS
+from barpc.base.statistics import MUCH_NOISE, RIVALS
 
 MIN_MOTION = 0.2  # px: least motion of ground between images of one pass
-MAX_CAMERA_CHANGE = 0.06  # px: a view with mostly rejected tie points that changes the others by more is left out
-_AMBIGUOUS_VIEWS = 3  # in a block of so few views, any might be the wrong one
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,20 +73,20 @@ def select_model(parts: Parts, options: AdjustOptions, solve: Solver) -> Selecte
 def _without_contradicted(selected: SelectedModel, options: AdjustOptions, solve: Solver) -> SelectedModel:
     """Leave out the view with the largest share of rejected tie points, if over half, and if it changes other cameras.
 
-    The other views are adjusted alone. Their model is returned if it differs by more than `MAX_CAMERA_CHANGE`.
+    The other views are adjusted alone. Their model is returned if it differs by more than `SURE_TREND`.
     """
     found, parts = selected.found, selected.parts
     lost = lost_shares(found, parts.inner)
     view = int(lost.argmax())
     others = parts.without_view(view)
     groups = others.inner.groups(others.inner.use)
-    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= _AMBIGUOUS_VIEWS:
+    if not lost[view] > 0.5 or max(map(len, groups), default=0) < len(lost) - 1 or len(lost) <= AMBIGUOUS_VIEWS:
         return selected
     try:
         alone = _select_terms(solve(others.inner, others.outer, options), others, options, solve)
     except (AdjustError, np.linalg.LinAlgError):
         return selected
-    if compared(alone.found, found, alone.parts.ties()).changed <= MAX_CAMERA_CHANGE:
+    if compared(alone.found, found, alone.parts.ties()).changed <= SURE_TREND:
         return selected
     return replace(alone, foreign=contradicted_view(view))
 
@@ -150,7 +155,7 @@ def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve:
     if searched is None and (given or found.outcome is first.outcome):
         return SelectedModel(smooth, parts)
     affine, less = (_with_image_affine(found, parts, options, solve), parts) if searched is None else searched[1:]
-    if affine is None or not _is_much_better(affine, found) or smooth.after.error < MUCH_BETTER * affine.after.error:
+    if affine is None or not _is_much_better(affine, found) or MUCH_NOISE * smooth.after.error < affine.after.error:
         return SelectedModel(smooth, parts)
     return SelectedModel(affine, less, found.after.whole_rms)
 
@@ -187,7 +192,7 @@ def _with_image_affine(found: Solution, parts: Parts, options: AdjustOptions, so
 
 def _is_much_better(affine: Solution, found: Solution) -> bool:
     """Return whether an affine in every image has much smaller check residuals than the geometric model."""
-    better = affine.after.error < (CLEARLY if found.is_skew else MUCH_BETTER) * found.after.error
+    better = affine.after.error < (CLEARLY if found.is_skew else 1.0 / MUCH_NOISE) * found.after.error
     # affines leave the tilts of the scene undetermined, so they must also gain more than the noise floor
     return better and affine.after.whole_rms < found.after.whole_rms - NOISE_FLOOR
 
@@ -224,7 +229,7 @@ def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts
 def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solve: Solver) -> tuple[Solution, Parts]:
     """Exchange the last moving group and the ground, if the priors of the cameras favour that.
 
-    The smaller group was taken as moving, but in one block of twenty (`LEVEL`) clouds may cover most of the ground.
+    The smaller group was taken as moving, but in one block of twenty (`ODDS`) clouds may cover most of the ground.
     Cameras that fit the clouds deviate more from their priors. With control nothing is exchanged.
     """
     exchanged = parts.exchanged()
@@ -235,7 +240,7 @@ def _likelier_ground(found: Solution, parts: Parts, options: AdjustOptions, solv
     except (AdjustError, np.linalg.LinAlgError):
         return found, parts
     cost, of_other = (float((one.problem.camera_prior.residual(one.final.params) ** 2).sum()) for one in (found, other))
-    return (other, exchanged) if 0.5 * (cost - of_other) > -np.log(LEVEL) else (found, parts)
+    return (other, exchanged) if 0.5 * (cost - of_other) > ODDS else (found, parts)
 
 
 def _without_moving_ground(

@@ -13,7 +13,7 @@ from barpc.ba.solution import Solution
 from barpc.ba.terms.moving_ground import Motion, MovingGroup, members, motion_of
 from barpc.base.geodesy import Array, ground_from_ecef, wrap_longitude
 from barpc.base.options import AdjustOptions
-from barpc.base.statistics import LEVEL, SURE
+from barpc.base.statistics import LEVEL
 from barpc.scene import BoolArray, IntArray
 
 _MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov distance of the rows of two groups: a tenth of each may be beyond one row
@@ -124,7 +124,7 @@ class Parts:
         size = np.array([view.size for view in block.views], dtype=np.float64).T
         none = np.zeros((2, int(rows.sum())))
         found = scan(block.view[rows], block.xy[:, rows], size, gone[rows].astype(np.float64), none, none[0])
-        sure = [one for one in found if one.by_share and one.axis == 1 and one.gain > SURE]
+        sure = [one for one in found if one.by_share and one.axis == 1]
         return [replace(one, moves=True) for one in sure if one.share > 0.5]
 
     def motion(self, number: int, one: MovingGroup, points: Array) -> Motion:

@@ -16,7 +16,7 @@ from barpc.ba.select.beam import Selection, TermSearch
 from barpc.ba.solving.solve import State
 from barpc.ba.terms.moving_ground import GroundMotion
 from barpc.ba.terms.term import Residuals
-from barpc.base.statistics import KEPT, LARGEST, SAMPLE, SLIGHT, SMALL
+from barpc.base.statistics import KEPT, LARGEST, SLIGHT, SMALL
 from barpc.scene import IntArray
 
 logger = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
     number, outs = np.full(len(block.views), -1), significant_intervals(outcome, block, floor)
     number[views] = np.arange(len(views))
     try:
-        base, few = _base_fit(linear, outcome, rows), linear.thinned(SAMPLE)
+        base, few = _base_fit(linear, outcome, rows), linear.thinned()
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
         return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()

@@ -297,7 +297,7 @@ class Factor:
     log_determinant: float = np.nan  # of the matrix
 
 
-def factorize(matrix: Array, damping: float = 0.0) -> Factor:
+def factorize(matrix: Array, damping: float) -> Factor:
     """Factorise S + damping diag(S).
 
     Raises
@@ -327,7 +327,7 @@ def factorize(matrix: Array, damping: float = 0.0) -> Factor:
     )
 
 
-def factorize_blocks(matrix: Blocks, order: Dissection, damping: float = 0.0, less: Array | None = None) -> Factor:
+def factorize_blocks(matrix: Blocks, order: Dissection, damping: float, less: Array | None = None) -> Factor:
     """Factorise S - B^T B for the views in `order`; B is `less` (m, n), of few rows."""
     _require_finite(matrix.diagonal)
     cholesky = Cholesky(matrix, order)

@@ -8,12 +8,17 @@ import numpy as np
 
 from barpc.ba.evidence.mixture import MixtureFit
 from barpc.ba.evidence.scan import BINS, Interval
-from barpc.ba.parameters.additional_parameters import DRIFTS, FIRST_SIGMA, MIN_SPLINES, AdditionalParameters
+from barpc.ba.parameters.additional_parameters import (
+    DRIFTS,
+    FIRST_SIGMA,
+    MIN_SPLINES,
+    AdditionalParameters,
+    most_splines,
+)
 from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.terms.decay import LENGTHS, Decay
 from barpc.ba.terms.step import ImagePart, Step, open_ended
 from barpc.ba.terms.term import SIZE_PRICE, Residuals, Term, in_both_coordinates
-from barpc.base.statistics import FEW
 from barpc.sensor.image_corrections import profile
 
 
@@ -30,8 +35,8 @@ class LowFrequency(Term):
         view, linear = interval.view, residuals.linear
         rows = np.flatnonzero(linear.view == view)
         u = 2.0 * residuals.place[1, rows] / residuals.size[1, view] - 1.0
-        each = int(np.median(np.bincount(linear.view[linear.in_tracks]))) // FEW
-        basis = AdditionalParameters(min(max(each, MIN_SPLINES), SPLINES)).splines(u)
+        most = most_splines(linear.view[linear.in_tracks])
+        basis = AdditionalParameters(min(max(most, MIN_SPLINES), SPLINES)).splines(u)
         sigma = np.full(2 * len(basis), FIRST_SIGMA)
         cost = float(np.log(linear.choices)) + SIZE_PRICE
         return [cls(view, in_both_coordinates(residuals, rows, basis), sigma, cost)]

@@ -21,7 +21,7 @@ from barpc.ba.robust.heldout import problem_of_block
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import State
 from barpc.base.geodesy import Array, enu_basis, ground_from_ecef
-from barpc.base.statistics import LEVEL, SAMPLE, SURE, TIMES
+from barpc.base.statistics import LEVEL, SURE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 GROUND_CELLS = 6  # cells along each side of the ground
@@ -110,7 +110,7 @@ def may_move(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Arra
     The largest score expected by chance among R regions is subtracted: half the chi-square quantile exceeded with
     probability 1 / R.
     """
-    few, group = linear.thinned(SAMPLE), _uniform_group(linear, ground)
+    few, group = linear.thinned(), _uniform_group(linear, ground)
     if not few.tracks:
         return False
     chance = float(gammainccinv(0.5 * len(group.sigma), 1.0 / len(_REGIONS)))
@@ -127,7 +127,7 @@ def _uniform_group(linear: Linear, ground: GroundMotion) -> Group:
 
 def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
     """Return the start of a fit of the most likely moving group, beside the fit `base`; None without tracks."""
-    few, group = linear.thinned(SAMPLE), _uniform_group(linear, ground)
+    few, group = linear.thinned(), _uniform_group(linear, ground)
     cell, rows = group.cell, few.in_tracks
     if not rows.any():
         return None
@@ -232,7 +232,7 @@ def motion_of(problem: Problem, params: Array, one: MovingGroup, block: Block) -
     """Return the displacements (2, K) [px] of the observations of a block if their tracks moved with a group."""
     part, points = problem_of_block(problem, params, block)
     ground = GroundMotion.of(part, State(params, points), one.ground)
-    return np.einsum("cmk,m->ck", ground.by_moves(block.view, len(block.views)), one.fit.move)
+    return np.asarray(np.einsum("cmk,m->ck", ground.by_moves(block.view, len(block.views)), one.fit.move))
 
 
 def members(problem: Problem, params: Array, one: MovingGroup, block: Block) -> BoolArray:
