@@ -35,6 +35,9 @@ logger = logging.getLogger(__name__)
 _LIKELIER = -np.log(LEVEL)
 # drift caused by a rotation, over the rotation: the projection centre moves by some km while an image is taken
 _CENTRE_MOTION_SHARE = 0.01
+# a cautious standard deviation is the upper confidence limit with this probability of error; too narrow a prior bends
+# all heights
+_LOW = 0.1
 SAME_PRIOR = 0.2  # log change of a standard deviation below which a block is not solved again
 _MIN_FREEDOM = 0.5  # degrees of freedom below which nothing is estimated
 
@@ -347,13 +350,12 @@ class Variances:
         """Return the estimate of a variance over the given variance.
 
         `total` is the sum of squares over the given variance, which has the weight of `STATED_FREEDOM` observations.
-        With `careful`, the estimate is at least the upper confidence limit with a probability of error of `LEVEL`: too
-        narrow a prior bends all heights.
+        With `careful`, the estimate is at least the upper confidence limit with a probability of error of `_LOW`.
         """
         likely = pooled_variance(total, freedom, 1.0)
         if not careful or freedom <= _MIN_FREEDOM:
             return float(likely)
-        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, LEVEL))))
+        return float(max(likely, total / (2.0 * gammaincinv(0.5 * freedom, _LOW))))
 
     def _odd(
         self, around: QuadraticProblem, wide: Array, usual: Array, rival: float | None = None
