@@ -32,7 +32,6 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "sigma_drift": ("barpc.ba.parameters.priors.DRIFT_SIGMA",),
         "sigma_shift": ("barpc.ba.parameters.priors.IMAGE_MODEL_SIGMA",),
         "num_passes": ("barpc.ba.robust.rounds.TRIED",),
-        "max_steps": ("barpc.ba.solving.solve.ITERATIONS",),
         "tolerance": ("barpc.ba.robust.rounds.TOLERANCE",),
         "min_observations": ("barpc.ba.constraints.block.MIN_OBSERVATIONS",),
     },

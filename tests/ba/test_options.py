@@ -101,7 +101,6 @@ ROWS = [
         dem=400.0,
     ),
     Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
-    Row("max_steps", 1, 30, steps, 1, rest={"tolerance": 1e-15, "solver": "sparse"}),
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"solver": "sparse"}),
 ]
 ELSEWHERE = {
@@ -111,7 +110,7 @@ ELSEWHERE = {
     "solver": "test_the_solver_that_is_asked_for_is_the_one_that_runs",
 }
 ELSEWHERE_TOO = (
-    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "tolerance", "max_steps",
+    "model", "drift", "jitter", "detectors", "fixed", "dem_sigma", "tolerance",
     "sigma_position", "num_passes", "sigma_drift", "sigma_shift",
 )  # fmt: skip
 """What tests of its own have among the fast ones, too."""
