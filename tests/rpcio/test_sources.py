@@ -128,6 +128,19 @@ def test_nothing_beside_a_vrt_hides_its_rpc_from_gdal(rpc, tagged):
     assert len(shadows(tagged)) == 3
 
 
+@pytest.mark.parametrize("found", [True, False])
+def test_a_vrt_without_an_rpc_is_an_image_like_others(found, rpc, tmp_path):
+    plain = write_image(tmp_path / "plain.tif")
+    vrt = tmp_path / "of_it.vrt"
+    rasterio.shutil.copy(plain, vrt, driver="VRT")
+    if found:
+        write_rpc(rpc, tmp_path / "of_it_RPC.TXT")
+        assert read_rpc(vrt) == rpc
+    else:
+        with pytest.raises(ImageError, match="of_it.vrt.*RPC"):
+            read_rpc(vrt)
+
+
 @pytest.mark.parametrize("kind", ["rpb", "txt", "xml", "dimap"])
 def test_a_sidecar_that_does_not_parse_is_an_error_not_a_fall_back_to_the_tag(kind, rpc, tagged):
     path = put(kind, tagged.parent, rpc)
