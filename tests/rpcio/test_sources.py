@@ -137,7 +137,7 @@ def test_a_vrt_without_an_rpc_is_an_image_like_others(found, rpc, tmp_path):
         write_rpc(rpc, tmp_path / "of_it_RPC.TXT")
         assert read_rpc(vrt) == rpc
     else:
-        with pytest.raises(ImageError, match="of_it.vrt.*RPC"):
+        with pytest.raises(ImageError, match=r"of_it\.vrt.*RPC"):
             read_rpc(vrt)
 
 
