@@ -377,7 +377,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
     return StereoBlock(views, groups, images, errors, scene.run)
 
 
-def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> StereoBlock:
+def block_of_images(images: Sequence[str], alts: tuple[float, float] | None, band: int) -> StereoBlock:
     """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:

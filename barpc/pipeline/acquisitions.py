@@ -27,7 +27,7 @@ _PEAK, _OFF = 8.0, 2  # standard deviations of the correlation at its peak, and 
 
 
 def one_each(
-    views: Sequence[View], sources: Sequence[Camera], band: int = 1, leads: frozenset[str] = frozenset()
+    views: Sequence[View], sources: Sequence[Camera], band: int, leads: frozenset[str] = frozenset()
 ) -> tuple[list[int], tuple[Carried, ...]]:
     """Return the views that are adjusted (their indices), one an acquisition, and those that get their correction.
 

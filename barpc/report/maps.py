@@ -76,12 +76,12 @@ def coordinate(value: float) -> str:
     return "0" if text == "-0" else text
 
 
-def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
+def round_ticks(low: float, high: float, most: int) -> list[float]:
     """Return at most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
 
     Examples
     --------
-    >>> round_ticks(-0.3, 1.1)
+    >>> round_ticks(-0.3, 1.1, 6)
     [0.0, 0.5, 1.0]
     """
     raw = (high - low) / most

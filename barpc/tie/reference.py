@@ -116,7 +116,7 @@ def register_views(
     views: Sequence[View],
     paths: Sequence[str],
     terrain: Terrain,
-    band: int = 1,
+    band: int,
     accuracy: Accuracy = DEFAULT_REFERENCE_ACCURACY,
     work: Work = HERE,
 ) -> ReferenceControl:

@@ -172,7 +172,7 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
     data[:, 250:] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0)
-    stored = survey(path)
+    stored = survey(path, 1)
     assert stored is not None
     with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
         boxes = tiles((320, 320), options.tile)
@@ -207,20 +207,20 @@ def test_a_stretch_takes_its_ends_to_0_and_255_and_holes_to_the_mean() -> None:
 def test_the_stretch_lies_between_the_percentiles_of_the_valid_pixels(tmp_path) -> None:
     values = np.arange(1, 60_001, dtype=np.uint16).reshape(200, 300)
     shuffled = np.random.default_rng(0).permutation(values.ravel()).reshape(200, 300)
-    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled))
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled), 1)
     assert stretch is not None
     assert stretch.low == pytest.approx(300, rel=0.15)
     assert stretch.high == pytest.approx(59_700, rel=0.003)
     flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
     for range_, varies in ((6.0, False), (10.0, True)):
         flat[20:30] = 2.0**23 + range_
-        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat)) is not None) == varies
+        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat), 1) is not None) == varies
 
 
 def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_path) -> None:
     data = np.full((60, 60), 7, np.uint16)
     data[:, :5], data[40:44, 40:44], data[20:25, 20:25], data[50, 50] = 0, 0, 0, 65535
-    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60))
+    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60), 1)
     expected = np.ones((60, 60), bool)
     expected[:, :5] = expected[20:25, 20:25] = expected[50, 50] = False
     np.testing.assert_array_equal(valid, expected)

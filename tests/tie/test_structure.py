@@ -46,7 +46,7 @@ from tests.tie.test_pairs import camera, views
 def winter(render, tmp_path_factory) -> tuple[View, View]:
     """Two views of a scene, the second under half a metre of snow for 40 %, a quarter of its classes turned over."""
     first, second = render(views=2).views
-    pixels, _ = read_pixels(second.path, (0, 0, *second.size))
+    pixels, _ = read_pixels(second.path, (0, 0, *second.size), 1)
     path = tmp_path_factory.mktemp("winter") / "winter.tif"
     write_image(path, disguised(pixels, 1, *SEASONS["winter"]))
     return first, replace(second, path=str(path))

@@ -173,15 +173,15 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _PairSearch] | None = None,
-    loosened: float = 0.0,
+    false_share: float = FALSE_SHARE,
 ) -> tuple[Matches, PairReport]:
     """Match a pair by all passes of one matcher; searches in `looked` are shared between attempts.
 
-    `loosened`: the share of false matches that a second attempt accepts.
+    `false_share`: the share of false matches that is accepted, larger in a second attempt.
     """
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     known: dict[str, Any] = {"angle": pair.angle, "overlap": pair.overlap, "reason": pair.reason}
-    report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=bool(loosened), **known)
+    report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=false_share > FALSE_SHARE, **known)
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -197,7 +197,7 @@ def _attempt(
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    found, control = search.trusted(search.local(tight), loosened or FALSE_SHARE)
+    found, control = search.trusted(search.local(tight), false_share)
     errors = search.errors(found)
     keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)

@@ -131,7 +131,7 @@ def dense_matches(
     images: Sequence[str],
     sizes: Sequence[tuple[int, int]],
     frame: EpipolarFrame,
-    band: int = 1,
+    band: int,
     coarse: tuple[Array, Array, float] | None = None,
 ) -> DenseMatches | None:
     """Match a part of two images; None where they do not show enough of it.
