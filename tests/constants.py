@@ -88,7 +88,7 @@ SIZES = {
     "rivals": ("barpc.ba.select.beam.RIVALS",),
     "pixels_together": ("barpc.tie.pixels.SPAN",),
     "keypoints_per_image": ("barpc.tie.matchers.features.PER_IMAGE",),
-    "candidates_together": ("barpc.tie.matchers.guided._PAIRS",),
+    "candidates_together": ("barpc.tie.matchers.guided.PIECE",),
     "places_together": ("barpc.tie.matchers.structural.PIECE",),
     "sides_crossed": ("barpc.tie.pairing.area._MOST_CROSSED",),
     "sides_together": ("barpc.tie.pairing.area._TOGETHER",),

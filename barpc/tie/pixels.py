@@ -31,7 +31,8 @@ CELL = 64
 SPAN = BLOCK_SIZE
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 PIECE = 1 << 22
-"""Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
+"""Pixels of pictures, places of templates in them, or numbers of descriptors that are worked on together; decides on no
+figure."""
 _STRETCH_BLOCKS = 5  # blocks a side whose pixels make the stretch
 _PERCENT = 0.5, 99.5  # of them that are black and white
 _WHITE = 255.0

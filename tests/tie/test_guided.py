@@ -9,10 +9,10 @@ import pytest
 
 from barpc.tie import TieOptions
 from barpc.tie.matchers.features import KeypointDensity, Keypoints, Sift, detect_tile, join_keypoints, quota, ranked
-from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _pairs_in_band
+from barpc.tie.matchers.guided import Guided, _Described, _pairs_in_band
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
-from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
+from barpc.tie.pixels import PIECE, Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import Sized, chosen
 from tests.geotiffs import write_image
 
@@ -272,7 +272,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     in_boxes = len(asked) * len(turned) / 2000**2 * (reach[1] - reach[0]) * 4.0 * tilt / 3.0
     assert len(pairs) < 1.2 * in_boxes  # at random: two of six sectors, two strips
     most = np.bincount(pairs[:, 0]).max()
-    assert max(len(part) for part in seen) <= _PAIRS + most
+    assert max(len(part) for part in seen) <= PIECE // 128 + most
     assert len({int(row) for part in seen for row in np.unique(part[:, 0])}) == sum(
         len(np.unique(part[:, 0])) for part in seen
     )
@@ -281,7 +281,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, sized: Sized) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    sized(candidates_together=7)
+    sized(candidates_together=7 * 128)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

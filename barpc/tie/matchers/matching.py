@@ -22,7 +22,7 @@ from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, View
-from barpc.sensor.sampler import image_grid
+from barpc.sensor.sampler import GRID_NODES, image_grid
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
@@ -72,7 +72,6 @@ FALSE_SHARE = 0.01
 _LOOSE_RATIO, _LOOSE_FALSE_SHARE, _LOOSE_NEEDED = 0.95, 0.05, 2 / 3
 """Ratio and false share of the second attempt; its part of the matches that a pair needs."""
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
-_PROBES = 12  # pixels along a side at which the terrain is asked
 _BOTH = Pair((0, 1), 1.0, 0.0)  # two views, of which nothing else is asked
 
 
@@ -103,7 +102,7 @@ class GroundAltitudes:
         low, high = common_range(*views)
         if self.terrain is not None:
             middle = 0.5 * (low + high)
-            ground = views[0].sensor.localize(*image_grid(views[0].size, (middle, middle), (_PROBES, 1)))
+            ground = views[0].sensor.localize(*image_grid(views[0].size, (middle, middle), (GRID_NODES[0], 1)))
             heights = self.terrain(ground[:, 0], ground[:, 1])
             other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
             with np.errstate(invalid="ignore"):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import NEWTON_STEPS, Array
 from barpc.base.statistics import BIWEIGHT, FEW, SURELY, kd_tree, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 
@@ -119,7 +119,7 @@ def _design(xy: Array, middle: Array, scale: Array) -> Array:
     return np.column_stack([np.ones(len(xy)), (xy - middle) / scale])
 
 
-def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
+def robust_affine(xy: Array, values: Array) -> Affine:
     """Fit values (N,) at positions (N, 2) [px] by an affine function, a constant for few points, despite outliers.
 
     Tukey's biweight on a scale that follows the residuals' MAD.
@@ -128,7 +128,7 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     design = _design(xy, middle, scale)
     columns = 3 if len(xy) >= FEW else 1
     coefficients = np.array([np.median(values), 0.0, 0.0])
-    for _ in range(steps):
+    for _ in range(NEWTON_STEPS):
         residual = values - design @ coefficients
         spread = max(robust_spread(residual), 1e-3)
         weight = np.maximum(0.0, 1.0 - (residual / (BIWEIGHT * spread)) ** 2)  # the biweight's root
