@@ -39,6 +39,7 @@ from barpc.tie.matchers.report import (
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
+    LEAST_SIGMA,
     EpipolarSegments,
     coherent,
     common_range,
@@ -209,7 +210,7 @@ def _attempt(
     if kind.detects:
         index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
         found = replace(found, index=index)
-    return replace(found.select(keep), sigma=max(spread, 0.05)), report
+    return replace(found.select(keep), sigma=max(spread, LEAST_SIGMA)), report
 
 
 def _overlap_keypoints(

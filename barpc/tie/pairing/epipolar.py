@@ -16,6 +16,10 @@ from barpc.scene import BoolArray, IntArray, View
 
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
+SIGMA = 0.1
+"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
+LEAST_SIGMA = 0.02
+"""Standard deviation of a place [px] at least: of a rendered one that is matched best."""
 _MIN_AGREEING_SHARE = 1 / 3
 """Part of the neighbours that agree: beside a straight edge half of them are of one side, less two standard deviations
 of `FEW` draws."""
@@ -152,12 +156,12 @@ def gradient(xy: Array, values: Array) -> Array:
     return fitted.coefficients[1:] / fitted.scale
 
 
-def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
+def coherent(xy: Array, values: Array) -> tuple[BoolArray, Array]:
     """Return the mask of values (N,) [px] at positions (N, 2) [px] that neighbours share, and values less medians.
 
     An image may jump at a row or a column, so that no function of position holds all of it: a value that agrees with
     enough of the `FEW` nearest is none that came by chance. It does within `SURELY` robust standard deviations, or
-    `floor` [px].
+    `SIGMA`.
     """
     if len(values) < 2:
         return np.ones(len(values), dtype=bool), np.zeros(len(values))
@@ -165,7 +169,7 @@ def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
     near = kd_tree(xy).query(xy, k=min(FEW + 1, len(xy)))[1]
     others = level[near]
     residual = level - np.median(others, axis=1)
-    agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), floor)
+    agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), SIGMA)
     return agree.sum(axis=1) - 1 >= _MIN_AGREEING_SHARE * (near.shape[1] - 1), residual
 
 

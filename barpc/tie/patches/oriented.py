@@ -22,8 +22,6 @@ ImageFiles = Sequence[tuple[str, tuple[int, int]]]
 
 TEMPLATE_REACH = 24
 """How far one reaches when matches are registered [px]."""
-SIGMA = 0.1
-"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
 """How far a template reaches to each side [px]."""
 MIN_PICTURE_SHARE = 0.9
