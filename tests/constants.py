@@ -95,9 +95,9 @@ SIZES = {
     "patches_together": ("barpc.tie.patches.register.CHUNK",),
     "newton_steps": ("barpc.tie.patches.register.NEWTON_STEPS",),
     "kept_after": ("barpc.workspace.KEEP_AFTER",),
-    "rows_together": ("barpc.report.tables.ROWS_TOGETHER",),
+    "rows_together": ("barpc.report.tables.CHUNK",),
     "tracks_in_tables": ("barpc.report.outcome.MAX_TRACKS",),
-    "observations_intersected": ("barpc.report.outcome._TOGETHER",),
+    "observations_intersected": ("barpc.report.outcome.CHUNK",),
     "matches_measured": ("barpc.report.measures.pairs.MAX_PER_PAIR",),
     "shown": (
         "barpc.report.maps.MAX_SHOWN",
