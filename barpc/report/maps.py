@@ -283,7 +283,7 @@ def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, 
     texts: list[Any] = []
     taken: OccupiedAreas = []
     for lon in round_ticks(plane.lon - reach[0], plane.lon + reach[0], 4):
-        x, words = float(plane(np.array([lon, plane.lat]))[0]), _degree_label(float(wrap_longitude(lon)), "EW")
+        x, words = float(plane(np.array([lon, plane.lat]))[0]), _degree_label((lon + 180.0) % 360.0 - 180.0, "EW")
         if 50 < x < right - 40:
             lines.append((x, 4, x, bottom))
             texts.append((x, bottom - 4, words, "middle"))
