@@ -148,7 +148,7 @@ class _GridSearch:
         sampling = self._sampling(self._step, at)
         linear = sampling.linear
         axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
-        half = max(asked.half_width, 0.75 * self._step)
+        half = max(asked.half_width, MAX_PATCH_SHIFT)
         wide = half if asked.probes else 2.0 * asked.half_width + INVALID_MARGIN + half
         wide = min(wide, float(np.abs(axes[1]) @ self._files[1][1]))  # B is no wider
         shift, longest = self._part_in_b(where, middle, rows, wide)
