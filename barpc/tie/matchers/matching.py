@@ -469,4 +469,4 @@ class _PairSearch:
             where = every(xy).moved(xy @ slope + np.median(level[near], axis=1))
             return replace(where, before=middle - half, after=middle + half)
 
-        return self._predicted(nearby, float(np.clip(SURELY * spread, 0.6, BAND_HALFWIDTH)))
+        return self._predicted(nearby, float(np.clip(4.0 * spread, 0.6, BAND_HALFWIDTH)))
