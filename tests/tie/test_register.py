@@ -305,8 +305,8 @@ def test_a_patch_whose_inner_part_goes_elsewhere_is_not_ok(texture, reference, m
     """By more than half a pixel, and more than five standard deviations: it lies across a step of the ground."""
     find = _Template.find
 
-    def found_apart(self, fine, reference, start, linear):
-        found = find(self, fine, reference, start, linear)
+    def found_apart(self, fine, reference, start, linear, *settled):
+        found = find(self, fine, reference, start, linear, *settled)
         if self._half == 10:
             return found
         return replace(found, xy=found.xy + apart * np.array([0.6, -0.8]), sigma=np.full(len(start), sigma))

@@ -208,7 +208,7 @@ def register_patches(
             found = template.find(fine, reference[rows].astype(np.int64), start[rows], linear[rows])
             best.put(rows, replace(found, ok=found.ok & _at(usable[1], found.xy)))
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
-        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows])
+        inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 / _SAMPLER_STEPS)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
         best.ok[rows] = apart <= 5.0 * np.maximum(SIGMA, inner.sigma)
     return best
@@ -278,7 +278,9 @@ class _Template:
         deviation = np.where(flat, np.float32(np.inf), deviation)
         return centred / deviation, deviation
 
-    def find(self, fine: FloatImage, reference: IntArray, start: Array, linear: Array) -> PatchRegistration:
+    def find(
+        self, fine: FloatImage, reference: IntArray, start: Array, linear: Array, settled: float = 1 / _SAMPLER_STEPS
+    ) -> PatchRegistration:
         """Register the patches about `reference` (N, 2), begun at `start` with the distortion `linear`."""
         offset = self._row * self._width + self._col
         place = reference[:, 1:] * self._width + reference[:, :1] + offset
@@ -293,15 +295,15 @@ class _Template:
         normal = (jacobian @ jacobian.transpose(0, 2, 1)).astype(np.float64)
         normal += _SINGLE_PRECISION_EPS * (1.0 + np.trace(normal, axis1=1, axis2=2))[:, None, None] * np.eye(8)
         inverse = np.asarray(np.linalg.inv(normal), np.float64)
-        xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy())
+        xy, step, correlation = self._iterate(fine, (jacobian, inverse), start.copy(), linear.copy(), settled)
         noise = np.maximum(1.0 - correlation**2, 0.0) / (self._effective - normal.shape[-1])
         sigma = np.sqrt(0.5 * (inverse[:, 0, 0] + inverse[:, 1, 1]) * noise).clip(_SINGLE_PRECISION_EPS)
         moved = np.hypot(*(xy - start).T)
-        ok = (step <= 10 / _SAMPLER_STEPS) & (moved <= oriented.MAX_PATCH_SHIFT) & np.isfinite(sigma)
+        ok = (step <= 10 * settled) & (moved <= oriented.MAX_PATCH_SHIFT) & np.isfinite(sigma)
         return PatchRegistration(xy, correlation, sigma, ok)
 
     def _iterate(
-        self, fine: FloatImage, solver: tuple[FloatImage, Array], centre: Array, linear: Array
+        self, fine: FloatImage, solver: tuple[FloatImage, Array], centre: Array, linear: Array, settled: float
     ) -> tuple[Array, Array, Array]:
         """Return the centres after the iterations, their last steps' lengths [px], and the correlations.
 
@@ -324,7 +326,7 @@ class _Template:
             moved = sampled - (linear[active] @ shift[:, :, None])[:, :, 0]
             length[active] = np.hypot(*(moved - centre[active]).T)
             centre[active] = moved
-            going = length[active] > 1 / _SAMPLER_STEPS
+            going = length[active] > settled
             if not going.any():
                 break
             if not going.all():
