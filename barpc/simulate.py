@@ -301,7 +301,7 @@ class Look:
     scan: float | None = None  # direction in which the rows advance over the ground [deg]; None: the heading
 
 
-def looks(count: int, turn: float = 0.0, altitude: float = Look.altitude) -> list[Look]:
+def looks(count: int, turn: float, altitude: float = Look.altitude) -> list[Look]:
     """Return looks at one place: pitch spread evenly, roll by the golden section, which starts at `turn` [turns]."""
     out = []
     for k in range(count):

@@ -137,7 +137,7 @@ def one_pass(count: int) -> Made:
     ground, offsets = view.sensor.ground_offset, np.random.default_rng(1).uniform(-0.2, 0.2, (count, 2))
     moved = [replace(view.sensor, ground_offset=ground + np.append(offset, 0.0)) for offset in offsets]
     views = [replace(view, name=f"v{n}", sensor=one) for n, one in enumerate(moved)]
-    return lambda: one_each(views, [None] * count)  # type: ignore[list-item]  # cameras are handed on alone
+    return lambda: one_each(views, [None] * count, 1)  # type: ignore[list-item]  # cameras are handed on alone
 
 
 GCPS = 309, 1084, 4337

@@ -160,7 +160,7 @@ def triplet(side: int, kind: str) -> tuple[float, float, float]:
     """Shares of wrong cells by the median of all pairs and of those that agree, and of the cells that are void."""
     with tempfile.TemporaryDirectory() as folder:
         made = Ground(side, kind, Path(folder), views=3)
-        block, found = block_of_images(made.paths, made.alt), []
+        block, found = block_of_images(made.paths, made.alt, 1), []
         for _, tile, (group,) in Grid(block, DsmOptions(alt=made.alt)).tiles:
             truth, pairs = made.truth(tile), [(block.views[i], block.views[j]) for i, j in group]
             low = minimum_filter(np.where(np.isfinite(truth), truth, np.inf), 3) - 5.0 * tile.step

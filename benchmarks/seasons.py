@@ -188,7 +188,7 @@ def sentinel2(data: Path) -> None:
 
 def ground(files: list[tuple[str, tuple[int, int]]], at: np.ndarray) -> np.ndarray:
     """Places about which both dates have data, and the first one, which has clouds, is not far brighter than usual."""
-    images = [read_pixels(path, (0, 0, *size)) for path, size in files]
+    images = [read_pixels(path, (0, 0, *size), 1) for path, size in files]
     data = images[0][1] & images[1][1]
     grey = images[0][0]
     white = data & (grey > 1.8 * np.percentile(grey[images[0][1]], 80))
@@ -206,7 +206,7 @@ def angles(seeds: int) -> None:
         with tempfile.TemporaryDirectory() as name:
             scene = Rendered(Path(name), ImageOptions(views=2, size=(700, 700), seed=seed))
             first, second = scene.views
-            pixels, _ = read_pixels(second.path, (0, 0, *second.size))
+            pixels, _ = read_pixels(second.path, (0, 0, *second.size), 1)
             for case, level in SEASONS.items():
                 path = write_image(Path(name) / "other.tif", disguised(pixels, seed, *level))
                 start = f"| {apart} | {case} | {seed} |"

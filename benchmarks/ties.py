@@ -101,8 +101,8 @@ def opencv(views: list[View]) -> float:
     start = time.process_time()
     found = []
     for view in views:
-        stretch = sample_stretch(view.path)
-        pixels, valid = read_pixels(view.path, (0, 0, *view.size))
+        stretch = sample_stretch(view.path, 1)
+        pixels, valid = read_pixels(view.path, (0, 0, *view.size), 1)
         found.append(cv2.SIFT.create().detectAndCompute(stretch.apply(pixels, valid), None))
     for i in range(len(views)):
         for j in range(i + 1, len(views)):

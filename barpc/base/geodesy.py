@@ -36,6 +36,8 @@ GEOID = 110.0
 """m: no geoid lies farther from the ellipsoid."""
 STATED, INFERRED, DEFAULT = "stated", "inferred", "default"
 """How it is known what heights count from: a person or a file says it; a format's definition does; nothing does."""
+TURNS = 540.0
+"""Longitudes are taken by whole turns up to this [deg]."""
 MAX_COORDINATE = 1e9
 """No place, size or other number of a file comes near, be it in px, deg or m."""
 NEWTON_STEPS = 12
@@ -284,6 +286,11 @@ def wrap_longitude(lon: npt.ArrayLike, center: npt.ArrayLike = 0.0) -> Array:
     return lon - 360.0 * turns
 
 
+def is_lonlat(places: Array) -> BoolArray:
+    """Return which places (..., 2 or more) begin with a longitude and a latitude [deg]; NaN does not."""
+    return np.asarray((np.abs(places[..., :2]) <= (TURNS, 90.0)).all(axis=-1))
+
+
 def utm(lon: float, lat: float) -> tuple[int, str]:
     """Return the UTM zone of a place [deg], by its longitude alone, and the reference system of the zone."""
     zone = int((lon + 180.0) // 6.0) % 60 + 1
@@ -321,19 +328,18 @@ def polygon(ring: Array) -> dict[str, Any] | None:
     if not np.isfinite(ring).all():
         return None
     step = np.diff(ring[:, 0], append=ring[:1, 0])
-    step -= 360.0 * np.rint(step / 360.0)
-    turn = 360.0 * np.rint(step.sum() / 360.0)
+    step = wrap_longitude(step)
+    turn = float(step.sum() - wrap_longitude(step.sum()))
     if turn:
         ring = _clip(_around_pole(ring, step, turn), -180.0)
     if _area(ring) < 0:
         ring = ring[::-1]
-    first = int(np.floor((ring[:, 0].min() + 180.0) / 360.0))
-    last = int(np.ceil((ring[:, 0].max() + 180.0) / 360.0))
+    low, high = ring[:, 0].min(), ring[:, 0].max()
     parts = []
-    for world in range(first, max(last, first + 1)):
-        part = _clip(ring, 360.0 * world - 180.0)
+    for world in np.arange(low - wrap_longitude(low), high + 180.0, 360.0):
+        part = _clip(ring, world - 180.0)
         if len(part) >= 3 and _area(part):
-            part = part - [360.0 * world, 0.0]
+            part = part - [world, 0.0]
             parts.append([[*part.tolist(), part[0].tolist()]])
     if len(parts) == 1:
         return {"type": "Polygon", "coordinates": parts[0]}
@@ -354,7 +360,7 @@ def _around_pole(ring: Array, step: Array, turn: float) -> Array:
     """Return the area between an outline around a pole and that pole, three turns of it: from it one is cut."""
     lon = ring[0, 0] % 360.0 - 1.5 * turn + np.concatenate([[0.0], np.cumsum(np.tile(step, 3))])
     lat = np.append(np.tile(ring[:, 1], 3), ring[0, 1])
-    pole = 90.0 if lat.mean() > 0 else -90.0
+    pole = np.copysign(90.0, lat.mean())
     return np.column_stack([np.concatenate([lon, lon[[-1, 0]]]), np.concatenate([lat, [pole, pole]])])
 
 

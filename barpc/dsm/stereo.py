@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 from pyproj import Transformer
+from scipy.interpolate import BSpline
 from scipy.ndimage import maximum_filter
 
 from barpc.ba import BlockPrior
@@ -44,12 +45,12 @@ from barpc.sensor.triangulation import intersect_pair
 from barpc.tie.pairing.overlaps import Link, overlapping_pairs
 from barpc.tie.patches.dense import (
     ACROSS,
-    ALLOWANCE,
     COLUMNS_PER_PIXEL,
     WINDOW,
     DenseMatches,
     dense_matches,
     epipolar_frame,
+    span_of_surface,
 )
 
 logger = logging.getLogger(__name__)
@@ -180,8 +181,8 @@ def _tile_points(pair: tuple[View, View], tile: Tile, band: int, halved: int = 0
             return [(_intersected(pair, tile, found), found.sigma * frame.metres, found.share, frame.metres)]
         if found.share < MATCHED or not len(found.sigma):
             return [(np.empty((0, 3)), np.empty(0), found.share, frame.metres)]
-        low, high = np.percentile(found.alt, [1.0, 99.0]) + np.array([-1.0, 1.0]) * ALLOWANCE * frame.metres
-        tile = replace(tile, alts=(max(tile.alts[0], float(low)), min(tile.alts[1], float(high))))
+        low, high = span_of_surface(found.alt, frame.metres)
+        tile = replace(tile, alts=(max(tile.alts[0], low), min(tile.alts[1], high)))
         coarse = (found.a + 0.5) * zoom - 0.5, (found.b + 0.5) * zoom - 0.5, zoom
         zoom //= 2
 
@@ -244,7 +245,8 @@ def noise_of_mean(side: Array) -> Array:
     """
     lag = np.arange(int(np.ceil(side.max(initial=1.0))))
     far, num = lag / WINDOW, lag + 1.0
-    alike = np.where(far < 1.0, 1.0 - 1.5 * far**2 + 0.75 * far**3, 0.25 * np.maximum(2.0 - far, 0.0) ** 3)
+    spline = BSpline.basis_element(np.arange(-2, 3), extrapolate=False)
+    alike = np.nan_to_num(spline(far)) / spline(0.0)
     alike[0] = 0.5  # a match is once beside itself, and twice beside another
     left = 2.0 * (num * np.cumsum(alike) - np.cumsum(lag * alike)) / num**2
     return np.asarray(np.interp(side, num, left))
@@ -377,7 +379,7 @@ def block_of_run(folder: Path, alts: tuple[float, float] | None = None, minus: s
     return StereoBlock(views, groups, images, errors, scene.run)
 
 
-def block_of_images(images: Sequence[str], alts: tuple[float, float] | None = None, band: int = 1) -> StereoBlock:
+def block_of_images(images: Sequence[str], alts: tuple[float, float] | None, band: int) -> StereoBlock:
     """Return the images with the cameras that come with them; altitudes are those of the cameras unless given."""
     views = [replace(view, alt_range=alts or view.alt_range) for view in load_views(images, band=band).views]
     for view in views:

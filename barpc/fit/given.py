@@ -18,7 +18,7 @@ from barpc.base.options import FitOptions
 from barpc.fit.certificate import RpcFit, roundtrip
 from barpc.fit.methods import FitSolution, normalization, solve
 from barpc.fit.points import checked_points, column_ranges, screened
-from barpc.fit.refit import accepted, best_method, certified, wrong_axes_of_grid
+from barpc.fit.refit import BETTER, accepted, best_method, certified, wrong_axes_of_grid
 from barpc.fit.system import FitProblem
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
@@ -28,7 +28,6 @@ WHOLE = 40
 """Points that determine the 39 unknowns of each coordinate of a whole RPC, and one to spare."""
 NOISY = 400
 """Points from which on the noise of a whole RPC's unknowns is a third of that of a point, or less."""
-BETTER = 0.9  # times the error left out: a larger model must be better by a tenth, the scatter of an error of 16 points
 _PASSES = 4  # in which a projective model is weighted by its denominator: it varies by some per cent
 
 

@@ -22,7 +22,8 @@ from barpc.sensor.image_corrections import Calibrated, Splined
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sampler import NEGLIGIBLE_FIT_ERROR, Errors, Scattered
 
-_ABOUT = 1.1  # times the error
+BETTER = 0.9
+"""Times the error left out: what is less plain must be better by a tenth, the scatter of an error of 16 points."""
 _MAX_MISSING_SHARE = 0.1  # part of the image without a ground point, at most
 _SCATTERED_CELLS = 72  # of ``gauss-newton``, along each side of the image
 
@@ -125,7 +126,7 @@ def _plainer(fit: RpcFit, plain: RpcFit) -> RpcFit:
     Its denominators are calmer; jitter that is faster than cubics of the row only makes the other one wave.
     """
     error, other = (float(np.linalg.norm(one.rmse_ckp)) for one in (fit, plain))
-    return plain if other <= _ABOUT * error or not fit.min_denominator > 0 else fit
+    return plain if error >= BETTER * other or not fit.min_denominator > 0 else fit
 
 
 def _points_for_method(

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.ndimage as ndi
 
 from barpc.base.geodesy import Array, ecef_from_ground
-from barpc.report.outcome import Carried
+from barpc.report.outcome import COPIED, Carried
 from barpc.scene import BoolArray, Camera, View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC
@@ -21,13 +21,12 @@ from barpc.tie.pixels import read_pixels
 
 _SAME = 0.01  # px: RPCs of bands are equal to 1e-8, of other images of a pass they differ by 50 and more
 _ALONG = 0.996  # cosine of 5 degrees: lines of sight that may be of one acquisition
-_MOST_SHOWN = 0.5  # of the smaller image: less is a neighbouring frame, which tie points join
 _SIDE = 512  # px of the coarser image that are compared
 _PEAK, _OFF = 8.0, 2  # standard deviations of the correlation at its peak, and the pixels that it may be off
 
 
 def one_each(
-    views: Sequence[View], sources: Sequence[Camera], band: int = 1, leads: frozenset[str] = frozenset()
+    views: Sequence[View], sources: Sequence[Camera], band: int, leads: frozenset[str] = frozenset()
 ) -> tuple[list[int], tuple[Carried, ...]]:
     """Return the views that are adjusted (their indices), one an acquisition, and those that get their correction.
 
@@ -102,7 +101,7 @@ def _shown(view: View, lead: View, step: Array, start: Array) -> bool:
     low = np.maximum(start - 0.5 * step, -0.5)
     high = np.minimum(start + (np.array(lead.size) - 0.5) * step, np.array(view.size) - 0.5)
     common = np.prod(np.maximum(high - low, 0.0))
-    return bool(common >= _MOST_SHOWN * min(np.prod(view.size), np.prod(np.array(lead.size) * step)))
+    return bool(common >= COPIED * min(np.prod(view.size), np.prod(np.array(lead.size) * step)))
 
 
 def _same_scene(lead: View, view: View, step: Array, start: Array, band: int) -> bool:

@@ -21,7 +21,9 @@ from barpc.sensor.geometry import Several, convergence_angle
 from barpc.sensor.triangulation import epipolar_offset
 
 _SCATTER = 0.1  # px across epipolar lines: less does not matter
-_FEWER = 5.0  # times less scatter with the cameras exchanged: 10 to 360 of three public sets, 1 of right cameras
+FEWER = 5.0
+"""Times less scatter otherwise than as given that tell a mistake: cameras exchanged 10 to 360 of three public sets,
+right ones 1."""
 _MATCHES = 100  # of a pair
 _LEAST_ANGLE = 0.5  # deg between rays: along nearer ones no epipolar line is told
 _MOST_LEFT = 1.0  # px of scatter with the cameras exchanged
@@ -72,7 +74,7 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
         for k in met:  # the first pair that gains nothing ends most trials
             i, j = pairs[k].views
             after += _scatters(views, tracks, [pairs[k]], [(moved.get(i, i), moved.get(j, j))])
-            if not _FEWER * after[-1] < min(max(as_given[k], _SCATTER), _FEWER * _MOST_LEFT):
+            if not FEWER * after[-1] < min(max(as_given[k], _SCATTER), FEWER * _MOST_LEFT):
                 break
         else:
             found = Exchange(tuple(moved), tuple(moved.values()), float(np.median(before)), float(np.median(after)))

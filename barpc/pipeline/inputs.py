@@ -23,6 +23,7 @@ from barpc.base.remote import here, located, location
 from barpc.base.safe_io import IMAGE, read_names, versioned
 from barpc.base.statistics import robust_spread
 from barpc.base.tasks import Progress, ordered
+from barpc.pipeline.exchanged import FEWER
 from barpc.pointio.correspondences import read_altimetry
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.matches import Links, read_links, tracks_of
@@ -247,8 +248,8 @@ def _matches_inside(path: str | Path, views: Sequence[View], links: Links) -> Li
 _MAX_CAMERA_ERROR = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
 _ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
 
-_LEAST_FOR_UNIT, _LEAST_MISFIT, _FEWER = 3, 3.0, 5.0
-"""Points in several images, metres that altitudes scatter by, and times less in another unit, that tell the unit."""
+_LEAST_FOR_UNIT, _LEAST_MISFIT = 3, 3.0
+"""Points in several images, and metres that altitudes scatter by, that tell the unit."""
 
 _MISTAKES = {
     "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
@@ -414,7 +415,7 @@ def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:
     shown, given = shown[known], points.lonlatalt[known, 2]
     foot = metres_of("foot") or np.nan
     as_given, feet, metres = (float(np.std(shown - times * given)) for times in (1.0, foot, 1.0 / foot))
-    if as_given < _FEWER * min(feet, metres) or as_given < _LEAST_MISFIT:
+    if as_given < FEWER * min(feet, metres) or as_given < _LEAST_MISFIT:
         return ""
     unit, left = ("feet", feet) if feet < metres else ("metres and not feet", metres)
     return (

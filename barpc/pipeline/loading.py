@@ -190,7 +190,7 @@ class Twins:
     An image in which nothing varies, in these and in 36 more, is compared with none. Work is linear in the images.
     """
 
-    def __init__(self, band: int = 1) -> None:
+    def __init__(self, band: int) -> None:
         self._band = band
         self._known: dict[Hashable, str] = {}
         self._alike: dict[Hashable, str | None] = {}

@@ -119,8 +119,8 @@ def _spread(run: Run, ties: PairTies, half: float) -> IntArray:
     """Return rows of the matches of a pair, from left to right, whose tiles lie within both images."""
     within = np.ones(len(ties.a), dtype=bool)
     for rows, v in ((ties.a, ties.views[0]), (ties.b, ties.views[1])):
-        xy = run.tracks.xy[rows]
-        within &= ((xy > 1.5 * half) & (xy < np.array(run.views[v].size) - 1.5 * half)).all(axis=1)
+        xy, margin = run.tracks.xy[rows], 1.5 * half
+        within &= ((xy > margin) & (xy < np.array(run.views[v].size) - margin)).all(axis=1)
     rows = np.flatnonzero(within)
     rows = rows[np.argsort(run.tracks.xy[ties.a[rows], 0], kind="stable")]
     return rows[np.linspace(0, len(rows) - 1, min(_TILES, len(rows))).astype(np.int64)]

@@ -272,7 +272,7 @@ def plan(
     out_dir: str | Path | None = None,
     options: RunOptions | None = None,
     *,
-    processes: int = 1,
+    processes: int,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Plan:

@@ -14,7 +14,7 @@ import numpy as np
 
 from barpc.base.errors import InputError, plain
 from barpc.base.frozen import load_npz
-from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array
+from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array, is_lonlat
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, TABLE, Kind, read_head
 from barpc.pointio.gcp_formats import read_geojson, read_tags
@@ -22,7 +22,6 @@ from barpc.pointio.gcp_tables import GcpTable
 from barpc.pointio.tables import (
     COLUMNS,
     GROUND_SIGMA,
-    TURNS,
     Names,
     first_words,
     header_of,
@@ -182,7 +181,7 @@ def read_grid(path: PathOrUrl, altitudes: Sequence[float] | None = None) -> Corr
     alt = np.broadcast_to(np.asarray(altitudes, dtype=np.float64)[:, None, None], (layers, *col.shape))
     ground = np.stack([bands[::2], bands[1::2], alt], axis=-1).reshape(-1, 3)
     ok = np.isfinite(ground).all(axis=1)
-    if (np.abs(ground[ok]) > (TURNS, 90.0, MAX_COORDINATE)).any() or not (np.abs(image) <= MAX_COORDINATE).all():
+    if not (is_lonlat(ground[ok]).all() and (np.abs(np.append(ground[ok, 2], image)) <= MAX_COORDINATE).all()):
         raise InputError(f"{path}: a node of it is no longitude, latitude and altitude, or no image point")
     return Correspondences(ground[ok], image[ok])
 
@@ -216,7 +215,7 @@ def read_altimetry(path: Path | str, heights: str | None = None) -> Altimetry:
     if not known.any():
         raise InputError(f"{path}: holds no height")
     ground = np.column_stack([lon, lat, alt])[known]
-    wrong = ~(np.abs(ground[:, :2]) <= (TURNS, 90.0)).all(axis=1)  # NaN fails, too
+    wrong = ~is_lonlat(ground)
     if wrong.any():
         lon, lat = ground[wrong.argmax(), :2]
         raise InputError(

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import InputError, listed
-from barpc.base.geodesy import MAX_COORDINATE, STATED, Array, BoolArray, HeightDatum
+from barpc.base.geodesy import MAX_COORDINATE, STATED, TURNS, Array, BoolArray, HeightDatum
 from barpc.base.safe_io import TABLE, read_head
 from barpc.pointio.gcp_formats import GCP_FORMATS, MICMAC, open_gcps
 from barpc.pointio.gcp_tables import GcpTable, Row
 from barpc.pointio.names import ViewNames
-from barpc.pointio.tables import TURNS, Texts, distinct, index_texts
+from barpc.pointio.tables import Texts, distinct, index_texts
 from barpc.rasters.crs import crs_of
 from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.vertical import ELLIPSOID, FLAT, Vertical, geoid_of, vertical_of

@@ -25,7 +25,6 @@ from barpc.scene import IntArray
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
-TURNS = 540.0  # deg: longitudes are taken by whole turns
 
 Names = Mapping[str, Sequence[str]]
 """Quantity -> what files call it."""

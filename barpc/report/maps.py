@@ -76,12 +76,12 @@ def coordinate(value: float) -> str:
     return "0" if text == "-0" else text
 
 
-def round_ticks(low: float, high: float, most: int = 6) -> list[float]:
+def round_ticks(low: float, high: float, most: int) -> list[float]:
     """Return at most `most` values of a step of 1, 2 or 5 times a power of ten in an interval.
 
     Examples
     --------
-    >>> round_ticks(-0.3, 1.1)
+    >>> round_ticks(-0.3, 1.1, 6)
     [0.0, 0.5, 1.0]
     """
     raw = (high - low) / most
@@ -125,7 +125,7 @@ def _plane_of(lonlat: Array) -> Plane:
     lon, lat = ((low + high) / 2).tolist()
     per_degree = metres_per_unit(np.array([lon, lat, 0.0]))[:2]
     extent = np.maximum((high - low) * per_degree, 1.0)
-    scale = float(min((WIDTH - 2 * _MAP_MARGIN) / extent[0], 420.0 / extent[1]))
+    scale = float(min((WIDTH - 2 * _MAP_MARGIN) / extent[0], WIDTH / extent[1]))
     return Plane(lon, lat, per_degree * scale, float(extent[1] * scale) + 2 * _MAP_MARGIN + 24, scale)
 
 
@@ -150,7 +150,7 @@ def ground_map(files: RunFiles) -> str:
     }
     named = worst_first([view for _, view, _ in drawn if view.name in middles])
     shown = map_labels([(view, middles[view.name]) for view in named], taken, triangles)
-    taken += [(x, y, 4.1 * len(name)) for _, name, x, y in shown] + triangles
+    taken += [(x, y, _half(name, bold=True)) for _, name, x, y in shown] + triangles
     counts = {"image": summary.views, "pair": summary.pairs, "GCP": summary.gcps, "check point": summary.check_points}
     text: str = template("drawings.svg.j2").module.ground(
         described=", ".join(counted(len(rows), noun) for noun, rows in counts.items() if rows) + ".",
@@ -200,8 +200,8 @@ def _point_labels(points: Sequence[tuple[str, float, float]], taken: OccupiedAre
     """Return names of points with where they begin, right of their marks or left of these, where there is room."""
     taken, found = list(taken), []
     for name, x, y in points:
-        half = 3.6 * len(name)
-        for middle in (x + 8.0 + half, x - 8.0 - half):
+        half = _half(name)
+        for middle in (x + side * (8.0 + half) for side in (1, -1)):
             if half < middle < WIDTH - half and _is_free(middle, y, half, taken):
                 taken.append((middle, y, half))
                 found.append((name, middle - half, y + 4.0))
@@ -245,7 +245,7 @@ def map_labels(
             view.name if len(view.name) <= _MAX_LABEL_LENGTH else f"…{view.name[1 - _MAX_LABEL_LENGTH :]}"
         )  # its end tells of a series
         name += f" and {alike} more" * bool(alike)
-        (x, y), half = place.tolist(), 4.1 * len(name)  # units of a bold character: 8.2, of digits
+        (x, y), half = place.tolist(), _half(name, bold=True)
         x = min(max(x, half), WIDTH - half)
         rows = [y + 1.1 * _LABEL_HEIGHT * k for k in (0, 1, -1, 2, -2)]
         free = [row for row in rows if _is_free(x, row, half, taken)]
@@ -256,6 +256,11 @@ def map_labels(
             names.append((view, name, x, y))
             counted_in |= same
     return names
+
+
+def _half(words: str, bold: bool = False) -> float:
+    """Return half the width of words [units], of digits."""
+    return (4.1 if bold else 3.6) * len(words)
 
 
 def _is_free(x: float, y: float, half: float, taken: OccupiedAreas) -> bool:
@@ -282,13 +287,13 @@ def _graticule(plane: Plane) -> tuple[list[Any], list[Any], tuple[float, float, 
         if 50 < x < right - 40:
             lines.append((x, 4, x, bottom))
             texts.append((x, bottom - 4, words, "middle"))
-            taken.append((x, bottom - 8, 3.6 * len(words)))
+            taken.append((x, bottom - 8, _half(words)))
     for lat in round_ticks(plane.lat - reach[1], plane.lat + reach[1], 4):
         y, words = float(plane(np.array([plane.lon, lat]))[1]), _degree_label(lat, "NS")
         if 16 < y < bottom - 20:
             lines.append((4, y, right, y))
             texts.append((4, y - 3, words, "start"))
-            taken.append((4 + 3.6 * len(words), y - 7, 3.6 * len(words)))
+            taken.append((4 + _half(words), y - 7, _half(words)))
     length = max(round_ticks(0.0, 110.0 / plane.scale, 3))
     words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     return lines, texts, (right - length * plane.scale, bottom + 9, length * plane.scale, words), taken
@@ -365,7 +370,8 @@ def residual_panels(
 def panel_box(view: ViewEntry) -> Array:
     """Return width and height (2,) of the panel of an image."""
     width, height = view.size
-    return np.array([_PANEL, _PANEL * min(max(height / width, 0.4), 2.5)])
+    most = 2.5
+    return np.array([_PANEL, _PANEL * min(max(height / width, 1.0 / most), most)])
 
 
 def _panel_note(cells: Cells) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from barpc.ba import Adjustment
 from barpc.ba.evidence.scan import CheckTies, ImageRegion, worst_regions
 from barpc.ba.interior import Calibration
-from barpc.base.geodesy import Array, HeightDatum, ground_from_ecef
+from barpc.base.geodesy import CHUNK, Array, HeightDatum, ground_from_ecef
 from barpc.base.options import RunOptions
 from barpc.base.statistics import CRITICAL
 from barpc.fit import RpcFit
@@ -29,12 +29,11 @@ from barpc.tie import PairReport, ReferenceControl
 from barpc.tie.detail import Gap, gap, in_parts
 from barpc.tie.matchers.report import FINE_STRUCTURE
 
-_TOGETHER = 1 << 16  # observations that are intersected at a time: 30 MB
 MAX_TRACKS = 200_000
 """Of more tracks, every n-th is written, so that the files of a huge run can still be opened."""
 WHOLE_PIXEL_TOLERANCE, MIN_WHOLE_SHARE = 0.05, 0.9
 """A whole shift [px], and the share of a pair's matches, `MIN_COPY_MATCHES` or more, that must have it."""
-_COPIED = 0.5  # of the smaller image: less is what two frames of a pass have in common
+COPIED = 0.5  # of the smaller image: less is what two frames of a pass have in common
 MIN_COPY_MATCHES = 20  # Of others a hundredth lies at a whole shift by chance: 18 of 20 never do
 WHOLE_PIXELS = 12**-0.5  # px: standard deviation of rounding to whole pixels, alike where images are shifted alike
 LEAST_MOVED = 0.1  # px over an eighth of an image: a finding that moves what is handed over by less is a remark
@@ -270,20 +269,18 @@ class Run:
         found: dict[str, str] = {}
         for ties in self.pairs:
             shift = self.tracks.xy[ties.b] - self.tracks.xy[ties.a]
-            if (
-                len(shift) < MIN_COPY_MATCHES
-                or np.mean((np.abs(shift - np.rint(shift)) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) < MIN_WHOLE_SHARE
-            ):
-                continue  # by no whole shift, whichever: most pairs
+            if len(shift) < MIN_COPY_MATCHES:
+                continue
             whole = np.rint(np.median(shift, axis=0))
+            if np.mean((np.abs(shift - whole) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) < MIN_WHOLE_SHARE:
+                continue  # most pairs
             first, second = (np.array(self.views[i].size) for i in ties.views)
             common = np.minimum(first, second - whole) - np.maximum(0.0, -whole)
-            if np.prod(common) < _COPIED * min(np.prod(first), np.prod(second)):
+            if np.prod(common) < COPIED * min(np.prod(first), np.prod(second)):
                 continue  # neighbouring frames of one pass
-            if np.mean((np.abs(shift - whole) <= WHOLE_PIXEL_TOLERANCE).all(axis=1)) >= MIN_WHOLE_SHARE:
-                names = [self.views[i].name for i in ties.views]
-                for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
-                    found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")
+            names = [self.views[i].name for i in ties.views]
+            for name, other, (col, row) in zip(names, names[::-1], (whole, 0.0 - whole), strict=True):
+                found.setdefault(name, f"{other}, moved by {col:.0f} columns and {row:.0f} rows")
         return found
 
     @cached_property
@@ -345,7 +342,7 @@ def triangulate_tracks(tracks: Tracks, sensors: Sequence[SensorModel], alt: floa
     rows = np.flatnonzero(keep)
     rows = rows[np.argsort(tracks.point[rows], kind="stable")]
     point = tracks.point[rows]
-    for part in np.split(rows, np.searchsorted(point, np.unique(point[_TOGETHER::_TOGETHER]))):  # of whole tracks
+    for part in np.split(rows, np.searchsorted(point, np.unique(point[CHUNK::CHUNK]))):  # of whole tracks
         own = tracks.point[part]
         first = int(own[0]) if len(own) else 0
         found = triangulate(sensors, tracks.view[part], own - first, tracks.xy[part], tracks.sigma[part], alt=alt)

@@ -9,6 +9,7 @@ import numpy as np
 from barpc.base.geodesy import Array
 from barpc.report.maps import WIDTH, evenly, panel_box, round_ticks, template
 from barpc.report.ranking import TABLE_ROWS_SHOWN, worst_first
+from barpc.report.records import MAX_SHOWN
 from barpc.report.runfiles import RunFiles
 from barpc.report.summary.block import AXES, ExplanationEntry, LeftEntry
 from barpc.report.summary.words import STATUS_WORDS, counted, medians
@@ -16,7 +17,6 @@ from barpc.report.summary.words import STATUS_WORDS, counted, medians
 PICTURE_KEY = (
     "On the pictures tie points used in an image are blue; those rejected there, but used in other images, are red."
 )
-_DOTS = 400  # tie points on a picture of an image, used and rejected ones each
 
 
 def image_panels(files: RunFiles) -> list[tuple[str, str]]:
@@ -28,7 +28,7 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
         k = number[view.name]
         box, own = panel_box(view), seen.view == k
         kept, cut = (
-            evenly((seen.xy[rows] + 0.5) * (box / view.size), _DOTS) for rows in (own & seen.used, own & ~seen.used)
+            evenly((seen.xy[rows] + 0.5) * (box / view.size), MAX_SHOWN) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
         text = template("drawings.svg.j2").module.thumbnail(

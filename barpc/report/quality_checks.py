@@ -32,7 +32,6 @@ WORST_LEFT = 0.15  # px: a larger misfit of one RPC anywhere needs review
 NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher states: more needs review
 
 _PARALLEL = 0.05  # sine of the angle between lines and axis under which a part across tells nothing of that along
-_SAMPLE = 200  # tie points at which the direction of the lines is measured
 _WHOLE = 0.9  # share of the rows or columns that is the whole image
 _CONTROL_WORDS = {
     "rejected": ("{} rejected, as the others contradict {}", "Check coordinates, axes and image positions"),
@@ -288,7 +287,7 @@ def _metres_a_pixel(run: Run, i: int, along: Array) -> float:
     views = max(shared, key=lambda pair: shared[pair])
     other = views[1 - views.index(i)]
     points = np.unique(run.tracks.point[(run.tracks.view == other) & run.keep])
-    ground = run.ground[points[:: max(1, len(points) // _SAMPLE)]]
+    ground = run.ground[points]
     ground = ground[np.isfinite(ground).all(axis=1)]
     ray = Several(run.cameras, np.full(len(ground), other))
     higher = ray.localize(ray.project(ground), ground[:, 2] + 1.0)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, listed, plain
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, is_lonlat
 from barpc.base.manifest import LAST
 from barpc.base.safe_io import GEOJSON, SUMMARY, parse_json, read_json, read_text
 from barpc.report.records import Number, Record, column, json_form
@@ -260,7 +260,7 @@ def _parsed_columns(
 
 
 def _in_degrees(places: Array) -> Array:
-    if not (np.abs(places[:, :2]) <= (540.0, 90.0)).all():
+    if not is_lonlat(places).all():
         raise ValueError("a place is no longitude and latitude")
     return places
 

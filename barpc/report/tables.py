@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from barpc.base.geodesy import Array, feature_collection, geojson_feature
+from barpc.base.geodesy import CHUNK, Array, feature_collection, geojson_feature
 from barpc.pointio.matches import matches_npz
 from barpc.pointio.names import cell
 from barpc.report.geopackage import Layer, point_shapes
@@ -28,7 +28,6 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.sensor.geometry import footprints
 
-ROWS_TOGETHER = 1 << 13  # rows of a table that are written at a time: 20 MB as numbers and texts of Python
 _RESIDUAL_CELLS = "{:.3f},{:.3f},{:.4f},{:.4f},{:.4f},{:.4f}".format
 
 
@@ -49,14 +48,14 @@ def _csv(header: Sequence[str], lines: Iterable[str]) -> Iterator[bytes]:
     """Yield a table, a part of its lines at a time."""
     yield f"{','.join(header)}\n".encode()
     rest = iter(lines)
-    while part := [*islice(rest, ROWS_TOGETHER)]:
+    while part := [*islice(rest, CHUNK)]:
         yield "\n".join([*part, ""]).encode()
 
 
 def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of columns as Python's values."""
-    for start in range(0, len(columns[0]), ROWS_TOGETHER):
-        yield from zip(*(column[start : start + ROWS_TOGETHER].tolist() for column in columns), strict=True)
+    for start in range(0, len(columns[0]), CHUNK):
+        yield from zip(*(column[start : start + CHUNK].tolist() for column in columns), strict=True)
 
 
 def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
@@ -70,7 +69,7 @@ def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
 def _observation_lines(run: Run) -> Iterator[str]:
     tracks, names = run.tracks, [cell(view.name) for view in run.views]
     rows = np.flatnonzero(np.isin(tracks.point, run.written_tracks))
-    for part in np.split(rows, range(ROWS_TOGETHER, len(rows), ROWS_TOGETHER)):
+    for part in np.split(rows, range(CHUNK, len(rows), CHUNK)):
         before = run.ties_before.residuals[part]
         after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals[part]
         numbers = np.column_stack([tracks.xy[part], before, after])

@@ -278,7 +278,7 @@ class Turn:
             return np.asarray(v - bent)
         return np.asarray(v - self._a * bent + self._b * cross(self._w, bent))
 
-    def back_and_rate(self, v: Array, error: float = 0.0) -> tuple[Array, Array]:
+    def back_and_rate(self, v: Array, error: float) -> tuple[Array, Array]:
         """Return `back` and `rate` of the same vectors."""
         bent = cross(self._w, v)
         if self._largest < error:

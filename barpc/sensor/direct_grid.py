@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import RpcError
-from barpc.base.geodesy import MAX_COORDINATE, NEWTON_STEPS, NEWTON_TOLERANCE, Array, wrap_longitude
+from barpc.base.geodesy import MAX_COORDINATE, NEWTON_STEPS, NEWTON_TOLERANCE, Array, is_lonlat, wrap_longitude
 from barpc.sensor import Pointwise, SensorModel
 from barpc.sensor.rational import DERIVATIVE, monomials
 
@@ -71,7 +71,7 @@ class DirectGrid(Pointwise):
             raise RpcError(f"localisation grid: lon, lat {self.lonlat.shape} on {shape[:3]} nodes")
         if not all((np.abs(axis) <= MAX_COORDINATE).all() and (np.diff(axis) > 0).all() for axis in axes):
             raise RpcError("localisation grid: columns, rows and altitudes must ascend")
-        if not (np.abs(self.lonlat) <= (540.0, 90.0)).all():  # NaN neither
+        if not is_lonlat(self.lonlat).all():
             raise RpcError("localisation grid: a node has no ground point")
         center = float(self.lonlat[shape[0] // 2, shape[1] // 2, shape[2] // 2, 0])
         coeffs = self.lonlat.copy()
@@ -157,7 +157,7 @@ class DirectGrid(Pointwise):
         basis = monomials(((np.column_stack([lonlat, alt]) - offset) / scale).T)
         image = basis.T @ coeffs
         for k, axis in enumerate((self.cols, self.rows)):
-            cell = 0.9 * (axis[1] - axis[0])
+            cell = axis[1] - axis[0]
             image[:, k] = np.clip(image[:, k], axis[0] - cell, axis[-1] + cell)
         by_lon, by_lat = (basis[:10].T @ (DERIVATIVE[k].T @ coeffs) / scale[k] for k in (0, 1))
         return image, by_lon, by_lat
@@ -235,7 +235,7 @@ def linear_axes(
                     break
                 tried = _CELLS_TRIED
                 continue
-            more = min(4.0, max(1.25, 1.1 * (worst * len(low) / tolerance) ** 0.5))
+            more = 1.1 * (worst * len(low) / tolerance) ** 0.5
             counts[axis] = min(_MAX_GRID_CELLS, int(np.ceil(counts[axis] * more)))
     if np.prod(counts + 1.0) > _MAX_GRID_NODES:
         return linear_axes(value, low, high, longest, 2 * tolerance)

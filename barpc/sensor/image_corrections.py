@@ -102,16 +102,20 @@ class ImageCorrected(Displaced):
 def bspline_pieces(u: Array, count: int, rate: bool = False) -> tuple[IntArray, Array]:
     """Return the first (n,) of the four uniform cubic B-splines that are not 0 at u (n,) in -1 .. 1, and these (4, n).
 
-    The first and the last value hold beyond; `rate`: their derivatives by u instead.
+    The first and the last value hold beyond; `rate`: their derivatives by u instead. By the recursion of de Boor.
     """
     at = (np.clip(np.nan_to_num(u), -1.0, 1.0) + 1.0) * (0.5 * (count - 3))
     first = np.minimum(at.astype(np.int64), count - 4)
     t = at - first
+    pieces = [np.ones(len(t))]
+    for degree in range(1, 3 if rate else 4):
+        low = [(k + 1 - t) / degree * piece for k, piece in enumerate(pieces)]
+        high = [(degree - 1 - k + t) / degree * piece for k, piece in enumerate(pieces)]
+        pieces = [low[0], *map(np.add, low[1:], high), high[-1]]
     if not rate:
-        pieces = (1.0 - t) ** 3, (3.0 * t - 6.0) * t**2 + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t**3
-        return first, np.stack(pieces) / 6.0
-    pieces = -((1.0 - t) ** 2), (3.0 * t - 4.0) * t, (2.0 - 3.0 * t) * t + 1.0, t**2
-    return first, np.stack(pieces) * np.where(np.abs(u) <= 1.0, 0.25 * (count - 3), 0.0)
+        return first, np.stack(pieces)
+    pieces = [-pieces[0], *map(np.subtract, pieces, pieces[1:]), pieces[-1]]
+    return first, np.stack(pieces) * np.where(np.abs(u) <= 1.0, 0.5 * (count - 3), 0.0)
 
 
 def bsplines(u: Array, count: int) -> Array:

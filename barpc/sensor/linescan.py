@@ -178,7 +178,7 @@ def _sigma(orbit: Array, attitude: Array) -> tuple[float, float] | None:
     if orbit.shape[1] < _SAMPLE_LISTS["EPH"][0] or attitude.shape[1] < _SAMPLE_LISTS["ATT"][0]:
         return None
     turn = 4.0 * attitude[:, [5, 9, 12, 14]].sum(axis=1).mean() / 3.0
-    place = orbit[:, [7, 10, 12]].sum(axis=1).mean() / 3.0
+    place = orbit[:, [7, 10, 12]].mean()
     return (math.sqrt(turn), math.sqrt(place)) if turn > 0 and place > 0 else None
 
 

@@ -133,7 +133,7 @@ class Pushbroom(Pointwise):
     Examples
     --------
     >>> from barpc.simulate import fly, looks
-    >>> camera = fly(np.array([5.4, 43.3, 120.0]), looks(3)[0], (1000, 1000), 0.5)
+    >>> camera = fly(np.array([5.4, 43.3, 120.0]), looks(3, 0.0)[0], (1000, 1000), 0.5)
     >>> camera.project([5.4, 43.3, 120.0]).round(1)
     array([499.5, 499.5])
     """

@@ -165,7 +165,7 @@ class RPC(Pointwise):
     def normalize(self, ground: Array, out: Array | None = None) -> Array:
         """Return longitude, latitude, altitude (3, N) of points (N, 3), from -1 to 1 in the RPC's box."""
         out = np.subtract(ground.T, self.ground_offset[:, None], out=out, order="C")
-        if not (out[0].max(initial=0.0) <= 180.0 and out[0].min(initial=0.0) >= -180.0):
+        if not np.abs(out[0]).max(initial=0.0) <= 180.0:
             out[0] = wrap_longitude(ground[:, 0], self.ground_offset[0]) - self.ground_offset[0]
         out /= self.ground_scale[:, None]
         return out

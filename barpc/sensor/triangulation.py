@@ -23,8 +23,8 @@ def epipolar_offset(
     sensor_b: SensorModel,
     image_a: Array,
     image_b: Array,
-    alt: float | npt.ArrayLike = 0.0,
-    steps: int = 6,
+    alt: float | npt.ArrayLike,
+    steps: int = 4,
 ) -> tuple[Array, Array]:
     """Return the distances of matches from their epipolar lines: the part of a mismatch that no altitude explains.
 
@@ -35,6 +35,7 @@ def epipolar_offset(
     ----------
     image_a, image_b : (N, 2), col, row [px] of the matches
     alt : float or (N,), first guess of the altitude [m]
+    steps : int, to the closest approach of the rays; the default: from the altitude of the scene
 
     Returns
     -------

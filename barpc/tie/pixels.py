@@ -31,7 +31,8 @@ CELL = 64
 SPAN = BLOCK_SIZE
 """Rows that are read at a time (at least one row of blocks), and what else is done in parts of so many."""
 PIECE = 1 << 22
-"""Pixels of pictures, or places of templates in them, that are worked on together; decides on no figure."""
+"""Pixels of pictures, places of templates in them, or numbers of descriptors that are worked on together; decides on no
+figure."""
 _STRETCH_BLOCKS = 5  # blocks a side whose pixels make the stretch
 _PERCENT = 0.5, 99.5  # of them that are black and white
 _WHITE = 255.0
@@ -91,7 +92,7 @@ def levelled(pixels: Pixels, valid: BoolArray) -> FloatImage:
 
 
 def read_pixels(
-    path: str | os.PathLike[str], box: Box, band: int = 1, size: tuple[int, int] | None = None
+    path: str | os.PathLike[str], box: Box, band: int, size: tuple[int, int] | None = None
 ) -> tuple[Pixels, BoolArray]:
     """Read the pixels (height, width) of a window as stored, 0 where invalid, and the mask of valid ones.
 
@@ -110,7 +111,7 @@ class PixelReader(ExitStack):
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None, thin: int = 1
+        self, path: str | os.PathLike[str], band: int, size: tuple[int, int] | None = None, thin: int = 1
     ) -> None:
         super().__init__()
         dataset = self.enter_context(open_raster(path))
@@ -212,7 +213,7 @@ class _RasterBand:
         return pixels, valid
 
 
-def sample_stretch(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Stretch | None:
+def sample_stretch(path: str | os.PathLike[str], band: int, size: tuple[int, int] | None = None) -> Stretch | None:
     """Estimate the stretch, 0.5 to 99.5 %, of a raster (or its picture); None where nothing varies."""
     found: list[Array] = []
     with open_raster(path) as dataset:
@@ -241,7 +242,7 @@ class Survey:
     band: int = 1
 
 
-def survey(path: str | os.PathLike[str], band: int = 1, size: tuple[int, int] | None = None) -> Survey | None:
+def survey(path: str | os.PathLike[str], band: int, size: tuple[int, int] | None = None) -> Survey | None:
     """Survey a raster: its stretch, or its picture of a size, and its layout; None where nothing varies."""
     stretch = sample_stretch(path, band, size)
     with open_raster(path) as dataset:
@@ -290,7 +291,7 @@ def _reduced(picture: ByteImage, valid: BoolArray, zoom: int) -> tuple[ByteImage
     return small, known
 
 
-def thumbnail(path: str | os.PathLike[str], size: tuple[int, int], side: int, band: int = 1) -> ByteImage | None:
+def thumbnail(path: str | os.PathLike[str], size: tuple[int, int], side: int, band: int) -> ByteImage | None:
     """Return an 8-bit picture of a whole raster of `size` (width, height), at most `side` px a side.
 
     None where nothing varies; invalid pixels are black. Two pixels a side are read for one, from overviews where the

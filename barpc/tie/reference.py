@@ -116,7 +116,7 @@ def register_views(
     views: Sequence[View],
     paths: Sequence[str],
     terrain: Terrain,
-    band: int = 1,
+    band: int,
     accuracy: Accuracy = DEFAULT_REFERENCE_ACCURACY,
     work: Work = HERE,
 ) -> ReferenceControl:
@@ -161,7 +161,7 @@ def search(
     """Match points x, y (n, 2) [px] of the reference on a patch with an image: shifts, and whether they beat decoys."""
     tile = PatchTile.same((of_reference(paths, patch), of_image(view, band, patch)), points, reach, HALF)
     place, ok, score = tile.found()
-    return place - tile.at, ok & (score > tile.decoys() + _DECOY_MARGIN) & tile.shown(1, place) & tile.returns(place)
+    return place - tile.at, ok & (score > tile.decoys() + _DECOY_MARGIN) & tile.shown(place) & tile.returns(place)
 
 
 # --- all of it --------------------------------------------------------------------------------------------

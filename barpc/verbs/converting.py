@@ -15,6 +15,7 @@ import shapely
 
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
+from barpc.base.geodesy import wrap_longitude
 from barpc.base.safe_io import plain_path
 from barpc.base.tasks import Progress
 from barpc.base.verb_options import ConvertOptions
@@ -265,7 +266,7 @@ def box_of(path: str | Path) -> GroundBox:
     outline = read_area(path).outline  # three times, a whole turn apart
     found = [shapely.clip_by_rect(outline, west, -90.0, west + 360.0, 90.0).bounds for west in (-180.0, 0.0)]
     west, south, east, north = min(found, key=lambda bounds: bounds[2] - bounds[0])
-    return west, south, east - 360.0 * (east > 180.0), north
+    return west, south, float(wrap_longitude(east)), north
 
 
 def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, dem: Dem | None) -> Window:

@@ -286,6 +286,6 @@ def _write_terrain(path: Path, camera: Camera, terrain: Dem, levels: tuple[float
         for rows in chunks(size[1], BLOCK_SIZE):
             at = np.meshgrid(left + np.arange(size[0]), top + np.arange(rows.start, rows.stop))
             heights = terrain(*grid.place(at[1].ravel(), at[0].ravel())).reshape(at[0].shape)
-            known = np.where(np.isfinite(heights), heights, -32768.0).astype(np.float32)
+            known = np.where(np.isfinite(heights), heights, what["nodata"]).astype(np.float32)
             file.write(known, 1, window=Window(0, rows.start, size[0], len(known)))
     return path

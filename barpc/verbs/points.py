@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import BarpcError, BarpcWarning, InputError, Remark, UsageError
-from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array, as_ground, as_image, as_numbers, ground_from_ecef, is_lonlat, wrap_longitude
 from barpc.base.keywords import Files, PathLike
 from barpc.base.remote import PathOrUrl
 from barpc.cameras import ImageLike, open_camera
@@ -280,7 +280,7 @@ def exchanged(camera: Camera, ground: Array) -> str:
     if not len(ground) or (camera.size is None and not isinstance(camera.model, RPC)):
         return ""
     swapped = ground[:, [1, 0, 2]]
-    if _on_image(camera, ground).any() or not _on_image(camera, swapped[np.abs(swapped[:, 1]) <= 90.0]).any():
+    if _on_image(camera, ground).any() or not _on_image(camera, swapped[is_lonlat(swapped)]).any():
         return ""
     return "far off the image, and on it with longitude and latitude exchanged: give LON first, then LAT"
 

@@ -72,6 +72,12 @@ def test_wrapping_a_longitude_leaves_near_ones_alone_to_the_bit():
     np.testing.assert_allclose(geodesy.wrap_longitude([-179.9], 179.9), [180.1])
 
 
+def test_a_longitude_by_whole_turns_and_a_latitude_are_places_and_nothing_else_is():
+    places = np.array([[5.4, 43.3], [540.0, -90.0], [-540.0, 90.0], [541.0, 0.0], [0.0, 90.1], [np.nan, 0.0]])
+    found = geodesy.is_lonlat(np.column_stack([places, np.full(6, np.nan)]))  # whatever its altitude
+    assert found.tolist() == geodesy.is_lonlat(places).tolist() == [True, True, True, False, False, False]
+
+
 def test_what_is_not_finite_stays_so_without_an_exception():
     assert np.isnan(geodesy.ecef_from_ground([np.nan, 0, 0])).any()
     assert np.isnan(geodesy.ground_from_ecef([np.nan, 0, 0])).any()

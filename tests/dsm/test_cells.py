@@ -125,7 +125,7 @@ def test_coarser_pictures_are_framed_by_the_middles_of_their_pixels(monkeypatch:
     size, near = sizes[1]  # of half as coarse pictures, near the matches of the coarse ones, among their altitudes
     assert size == [(201, 40), (201, 40)]
     assert near == ([14.5], [19.5], 2.0)
-    ends = 141.0 - 3.0 * stereo.ALLOWANCE, 239.0 + 3.0 * stereo.ALLOWANCE
+    ends = 141.0 - 3.0 * 4.0, 239.0 + 3.0 * 4.0
     assert (asked[-1][2].min(), asked[-1][2].max()) == pytest.approx(np.clip(ends, 100.0, 300.0))
 
 

@@ -270,7 +270,7 @@ def test_too_large_an_angle_and_radar_are_refused_with_exit_code_3(rendered, tmp
 
     radar = replace(views[0], sensor=RangeDoppler.from_annotation(read_annotation(Product().xml(), name="slc")))
     with pytest.raises(NoSurfaceError, match="view_00: a radar image"):
-        stereo.block_of_images([radar, views[1]])
+        stereo.block_of_images([radar, views[1]], None, 1)
     assert not list(tmp_path.iterdir())
 
 
@@ -312,7 +312,7 @@ def test_cells_that_hardly_a_match_falls_in_or_too_many_are_refused(side, said, 
 
 
 def test_a_tile_shows_as_many_pixels_whatever_the_cells(rendered):
-    block = block_of_images(rendered.paths[:2])
+    block = block_of_images(rendered.paths[:2], None, 1)
     usual, coarse = (surface_module.Grid(block, replace(OPTIONS, gsd=side)) for side in (None, 8.0))
     assert usual.side == 512
     assert coarse.side * coarse.whole.step <= 1.1 * usual.side * usual.whole.step

@@ -60,7 +60,7 @@ def test_a_band_gets_the_correction_of_its_image(tmp_path: Path) -> None:
 def test_an_image_of_something_else_with_such_an_rpc_is_no_band(tmp_path: Path) -> None:
     right, wrong = band(VIEWS[0], tmp_path / "a.tif"), band(VIEWS[1], tmp_path / "b.tif", turned=True)
     loaded = load_views([VIEWS[0], VIEWS[1], right, wrong])
-    kept, carried = one_each(loaded.views, loaded.sources)
+    kept, carried = one_each(loaded.views, loaded.sources, 1)
     assert [one.view.name for one in carried] == ["a"]
     assert [loaded.views[i].name for i in kept] == ["b", "view_00", "view_01"]
 
@@ -69,7 +69,7 @@ def test_the_finest_leads_and_parts_follow_the_whole(tmp_path: Path) -> None:
     middle, coarse = band(VIEWS[0], tmp_path / "b.tif", 2), band(VIEWS[0], tmp_path / "a.tif", 4)
     barpc.convert(VIEWS[0], tmp_path / "part.tif", window=(100, 200, 500, 600))
     loaded = load_views([coarse, middle, tmp_path / "part.tif", VIEWS[0], VIEWS[1]])
-    _, carried = one_each(loaded.views, loaded.sources)
+    _, carried = one_each(loaded.views, loaded.sources, 1)
     assert [(one.view.name, one.lead) for one in carried] == [("a", "view_00"), ("b", "view_00"), ("part", "view_00")]
     np.testing.assert_allclose(carried[0].step, 0.25, rtol=1e-9)
     np.testing.assert_allclose(carried[2].start, (-100.0, -200.0), atol=1e-6)
@@ -79,7 +79,7 @@ def test_neighbouring_frames_are_images_of_their_own(tmp_path: Path) -> None:
     for name, window in (("a", (0, 0, 1000, 560)), ("b", (0, 440, 1000, 560))):
         barpc.convert(VIEWS[0], tmp_path / f"{name}.tif", window=window)
     loaded = load_views([tmp_path / "a.tif", tmp_path / "b.tif", VIEWS[1]])
-    assert one_each(loaded.views, loaded.sources)[1] == ()
+    assert one_each(loaded.views, loaded.sources, 1)[1] == ()
 
 
 def test_an_image_and_its_band_alone_are_nothing_to_adjust(tmp_path: Path) -> None:
@@ -124,6 +124,6 @@ def test_the_cameras_of_a_pass_are_asked_for_all_others_at_once(monkeypatch) -> 
     project = RPC.project
     monkeypatch.setattr(RPC, "project", lambda self, ground: (asked.append(len(ground)), project(self, ground))[1])
     views = [replace(view, name=f"v{n}", sensor=one) for n, one in enumerate(moved)]
-    kept, carried = one_each(views, [None] * 40)  # type: ignore[list-item]  # cameras are handed on alone
+    kept, carried = one_each(views, [None] * 40, 1)  # type: ignore[list-item]  # cameras are handed on alone
     assert (kept, carried) == (list(range(40)), ())
     assert asked == list(range(40))

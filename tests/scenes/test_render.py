@@ -35,7 +35,7 @@ def surface() -> Surface:
     ],
 )
 def sensor(request):
-    return fly(TARGET, looks(3)[request.param], SIZE, 0.5)
+    return fly(TARGET, looks(3, 0.0)[request.param], SIZE, 0.5)
 
 
 def solid(terrain, x, y):

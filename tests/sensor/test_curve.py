@@ -49,7 +49,7 @@ def test_a_turn_is_the_exponential_of_its_vector_and_has_its_jacobian(together: 
             many[:, column] = given
             # R(w + dw) = R(w) R(J(-w) dw)
             expected = series(size * way, 0), series(-size * way, 0), series(-size * way, 1)
-            for one, other in zip(turn.back_and_rate(many), (turn.back(many), turn.rate(many)), strict=True):
+            for one, other in zip(turn.back_and_rate(many, 0.0), (turn.back(many), turn.rate(many)), strict=True):
                 np.testing.assert_allclose(one, other, rtol=1e-14)
             for found, matrix in zip((turn.forth(many), turn.back(many), turn.rate(many)), expected, strict=True):
                 np.testing.assert_allclose(found[:, column], matrix @ given, rtol=0, atol=4e-16 * (2 + 10 * size))

@@ -157,7 +157,7 @@ def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
     rng = np.random.default_rng(4)
     truth = a.localize(rng.uniform(4000, 15000, (50, 2)), rng.uniform(0, 1000, 50))
     xa, xb = a.project(truth), b.project(truth)
-    offset, alt = epipolar_offset(a, b, xa, xb)
+    offset, alt = epipolar_offset(a, b, xa, xb, 0.0)
     np.testing.assert_allclose(offset, 0, atol=1e-6)
     np.testing.assert_allclose(alt, truth[:, 2], atol=1e-5)
     start = np.full(50, 480.0)
@@ -169,7 +169,7 @@ def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
     rise = b.project(a.localize(xa, truth[:, 2] + 1)) - xb
     along = rise / np.linalg.norm(rise, axis=1)[:, None]
     across = np.column_stack([-along[:, 1], along[:, 0]])  # to the right of rising ground: rows run down
-    offset, alt = epipolar_offset(a, b, xa, xb + 3 * rise + 2 * across)
+    offset, alt = epipolar_offset(a, b, xa, xb + 3 * rise + 2 * across, 0.0)
     np.testing.assert_allclose(offset, 2, atol=1e-3)
     np.testing.assert_allclose(alt, truth[:, 2] + 3, atol=0.1)
 

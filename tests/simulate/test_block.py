@@ -249,7 +249,7 @@ def test_corrections_turn_about_where_the_satellite_is_in_the_middle_of_the_imag
     block, there, options = simulate_block(4, 50, **layout), sites(4, **layout), BlockOptions(size=(3000, 9000))
     for number, correction in enumerate(block.truth.corrections):
         lon, lat = there[number // 2]
-        flown = fly(np.array([lon, lat, 200.0]), looks(2)[number % 2], options.size, options.gsd)
+        flown = fly(np.array([lon, lat, 200.0]), looks(2, 0.0)[number % 2], options.size, options.gsd)
         assert np.linalg.norm(correction.center - flown.position(4499.5)) < 1.0
     low, high = block.views[0].alt_range
     assert (low, high) == pytest.approx((100.0 - 70.0, 300.0 + 70.0))  # a tenth of 200 m, and 50 m

@@ -76,9 +76,9 @@ def test_an_orbit_is_a_circle_in_space_and_the_earth_turns_below() -> None:
 
 
 def test_looks_spread_along_the_flight_evenly_and_across_it_by_the_golden_section() -> None:
-    one = looks(1)
+    one = looks(1, 0.0)
     assert [(look.incidence, look.azimuth, look.altitude) for look in one] == [(0.0, 192.0, 694e3)]
-    three = looks(3, altitude=5e5)
+    three = looks(3, 0.0, altitude=5e5)
     assert all(look.altitude == 5e5 for look in three)
     assert (three[0].incidence, three[0].azimuth) == pytest.approx((10.0, 12.0))  # behind, on the track
     for k, pitch in enumerate((-10.0, 0.0, 10.0)):

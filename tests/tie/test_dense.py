@@ -53,7 +53,7 @@ def test_a_part_of_two_images_is_matched_where_it_was_asked_and_not_beside(tmp_p
     alt = np.repeat([0.0, 100.0, 200.0], 9)
     a = np.tile(places, (3, 1))
     frame = epipolar_frame(a, a + np.column_stack([0.2 * alt, np.zeros(27)]), alt)
-    found = dense_matches([str(tmp_path / name) for name in ("a.tif", "b.tif")], [(300, 240)] * 2, frame)
+    found = dense_matches([str(tmp_path / name) for name in ("a.tif", "b.tif")], [(300, 240)] * 2, frame, 1)
     assert found is not None
     assert len(found.a) > 0.8 * 120 * 100
     assert found.a.min(axis=0) == pytest.approx([80.0, 60.0], abs=2.0)
@@ -81,7 +81,7 @@ def test_a_slope_is_found_about_a_coarser_surface(tmp_path, monkeypatch, off, me
     searched = []
     monkeypatch.setattr(dense, "_both_ways", lambda *given: (searched.append(given[3]), _both_ways(*given))[1])
     paths, sizes = [str(tmp_path / name) for name in ("a.tif", "b.tif")], [(320, 240), (380, 240)]
-    found = dense_matches(paths, sizes, frame, coarse=coarse)
+    found = dense_matches(paths, sizes, frame, 1, coarse=coarse)
     assert searched[0] <= 64 < 160 <= frame.num
     right = np.abs(found.b - found.a - np.column_stack([10.0 + 0.25 * found.a[:, 0], np.zeros(len(found.a))])) < 0.3
     share = right.all(axis=1).sum() / (120 * 100)

@@ -24,7 +24,9 @@ def test_cameras_far_off_are_found_on_an_orthoimage(shared_data: Path, off: tupl
     camera = barpc.open_camera(file)
     (there,) = moved([camera], (*off, 0.0), None)
     view = View("a", str(file), camera.extent, there.model, camera.alt_range)
-    found = register_views([view], [str(folder / "ortho_05_0182.tif")], Dem.open([str(folder / "dem.tif")], None, None))
+    found = register_views(
+        [view], [str(folder / "ortho_05_0182.tif")], Dem.open([str(folder / "dem.tif")], None, None), 1
+    )
     (match,) = found.views
     assert match.peak > 10.0
     assert match.points > 300
@@ -39,5 +41,5 @@ def test_an_orthoimage_of_another_place_is_refused(shared_data: Path) -> None:
     (there,) = moved([camera], (2500.0, -1500.0, 0.0), None)
     view = View("a", str(file), camera.extent, there.model, camera.alt_range)
     dem = Dem.open([str(folder / "dem.tif")], None, None)
-    found = register_views([view], [str(folder / "ortho_05_0182.tif")], dem)
+    found = register_views([view], [str(folder / "ortho_05_0182.tif")], dem, 1)
     assert found.control is None

@@ -235,7 +235,7 @@ def test_a_spot_is_found_where_it_stands_however_closely_it_is_looked_at(tmp_pat
     spots = np.array([[101.3, 80.6], [240.0, 200.5], [120.4, 310.9]])
     picture = sum(np.exp(-0.5 * ((col - x) ** 2 + (row - y) ** 2) / (4.0 * zoom) ** 2) for x, y in spots)
     path = write_image(tmp_path / "a.tif", (100 + 2000 * np.asarray(picture)).astype(np.uint16))
-    known = survey(path)
+    known = survey(path, 1)
     assert known is not None
     found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, zoom))
     near = np.abs(found.xy[:, None] - spots).max(axis=2)
@@ -253,7 +253,7 @@ def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, sh
     spots = places + np.random.default_rng(2).uniform(-3, 3, places.shape)
     picture = sum(np.exp(-0.5 * ((col - x) ** 2 + (row - y) ** 2) / 4.0**2) for x, y in spots)
     path = write_image(tmp_path / "a.tif", (100 + 20000 * (share * picture + (col > 420))).astype(np.uint16))
-    known = survey(path)
+    known = survey(path, 1)
     assert known is not None
     found = detect_tile(str(path), (480, 400), (0, 0, 480, 400), known, KeypointDensity(0.1, 1))
     near = np.abs(found.xy[:, None] - spots).max(axis=2) < 1.0
@@ -262,7 +262,7 @@ def test_spots_of_a_twentieth_of_the_span_of_grey_values_are_enough(tmp_path, sh
 
 def test_a_box_looked_at_in_parts_has_the_keypoints_that_the_whole_has_there(tmp_path, texture) -> None:
     path, box, size = write_image(tmp_path / "a.tif", texture), (64, 128, 384, 256), (500, 400)
-    known = survey(path)
+    known = survey(path, 1)
     assert known is not None
     boxes, sides = [(0, 0, *size), box, box], [512, 512, 128]
     whole, once, parts = (

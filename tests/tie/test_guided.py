@@ -9,10 +9,10 @@ import pytest
 
 from barpc.tie import TieOptions
 from barpc.tie.matchers.features import KeypointDensity, Keypoints, Sift, detect_tile, join_keypoints, quota, ranked
-from barpc.tie.matchers.guided import _PAIRS, Guided, _Described, _pairs_in_band
+from barpc.tie.matchers.guided import Guided, _Described, _pairs_in_band
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
-from barpc.tie.pixels import Stretch, grow, read_pixels, sample_stretch, survey, tiles
+from barpc.tie.pixels import PIECE, Stretch, grow, read_pixels, sample_stretch, survey, tiles
 from tests.constants import Sized, chosen
 from tests.geotiffs import write_image
 
@@ -172,7 +172,7 @@ def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path)
     data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
     data[:, 250:] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0)
-    stored = survey(path)
+    stored = survey(path, 1)
     assert stored is not None
     with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
         boxes = tiles((320, 320), options.tile)
@@ -207,20 +207,20 @@ def test_a_stretch_takes_its_ends_to_0_and_255_and_holes_to_the_mean() -> None:
 def test_the_stretch_lies_between_the_percentiles_of_the_valid_pixels(tmp_path) -> None:
     values = np.arange(1, 60_001, dtype=np.uint16).reshape(200, 300)
     shuffled = np.random.default_rng(0).permutation(values.ravel()).reshape(200, 300)
-    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled))
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled), 1)
     assert stretch is not None
     assert stretch.low == pytest.approx(300, rel=0.15)
     assert stretch.high == pytest.approx(59_700, rel=0.003)
     flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
     for range_, varies in ((6.0, False), (10.0, True)):
         flat[20:30] = 2.0**23 + range_
-        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat)) is not None) == varies
+        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat), 1) is not None) == varies
 
 
 def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_path) -> None:
     data = np.full((60, 60), 7, np.uint16)
     data[:, :5], data[40:44, 40:44], data[20:25, 20:25], data[50, 50] = 0, 0, 0, 65535
-    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60))
+    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60), 1)
     expected = np.ones((60, 60), bool)
     expected[:, :5] = expected[20:25, 20:25] = expected[50, 50] = False
     np.testing.assert_array_equal(valid, expected)
@@ -272,7 +272,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
     in_boxes = len(asked) * len(turned) / 2000**2 * (reach[1] - reach[0]) * 4.0 * tilt / 3.0
     assert len(pairs) < 1.2 * in_boxes  # at random: two of six sectors, two strips
     most = np.bincount(pairs[:, 0]).max()
-    assert max(len(part) for part in seen) <= _PAIRS + most
+    assert max(len(part) for part in seen) <= PIECE // 128 + most
     assert len({int(row) for part in seen for row in np.unique(part[:, 0])}) == sum(
         len(np.unique(part[:, 0])) for part in seen
     )
@@ -281,7 +281,7 @@ def test_all_points_of_slanted_bands_are_looked_at_and_few_others(slope: float, 
 def test_candidates_come_in_portions_that_hold_all_of_a_point(pair, sized: Sized) -> None:
     a, b, where = pair
     whole = guided(a, b, where, 0.85)
-    sized(candidates_together=7)
+    sized(candidates_together=7 * 128)
     parts = guided(a, b, where, 0.85)
     np.testing.assert_array_equal(whole.index, parts.index)
     assert len(whole) > 40

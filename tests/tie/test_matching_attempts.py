@@ -15,7 +15,7 @@ from barpc.tie import Matches, TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
-from barpc.tie.matchers.matching import GroundAltitudes, match_pair, match_pairs
+from barpc.tie.matchers.matching import FALSE_SHARE, GroundAltitudes, match_pair, match_pairs
 from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.tracks import _merge_registered, _unlike, _with_unregistered, link
@@ -40,10 +40,10 @@ def attempts(monkeypatch, shares):
     def scripted(*reports: PairReport) -> list[TieOptions]:
         script = iter(reports)
 
-        def attempt(_views, _keypoints, _pair, options: TieOptions, _looked=None, share=0.0) -> Any:
+        def attempt(_views, _keypoints, _pair, options: TieOptions, _looked=None, share=FALSE_SHARE) -> Any:
             made.append(options)
             shares.append(share)
-            return NO_MATCHES, replace(next(script), matcher=options.matcher, loosened=share > 0.0)
+            return NO_MATCHES, replace(next(script), matcher=options.matcher, loosened=share > FALSE_SHARE)
 
         monkeypatch.setattr(matching, "_attempt", attempt)
         return made
@@ -79,7 +79,7 @@ def test_a_pair_with_fewer_is_tried_again_with_looser_thresholds(attempts, share
     found = match_pair((None, None), NOBODY, PAIR, TieOptions(**given))[1]  # type: ignore[arg-type]
     assert found == replace(report(120), loosened=True, beaten=("guided 99 of 100",))
     assert (made[1].ratio, shares[1], made[1].min_matches) == loosened
-    assert shares[0] == 0.0  # the usual one
+    assert shares[0] == FALSE_SHARE
     assert len(made) == 2
 
 

@@ -17,10 +17,10 @@ RNG = np.random.default_rng(0)
 def test_every_real_type_is_read_and_stretched_over_the_whole_range(tmp_path, dtype: str) -> None:
     data = RNG.integers(10, 120, (300, 200)).astype(dtype)
     path = write_image(tmp_path / "a.tif", data)
-    pixels, valid = read_pixels(path, (5, 7, 50, 60))
+    pixels, valid = read_pixels(path, (5, 7, 50, 60), 1)
     assert valid.all()
     np.testing.assert_array_equal(pixels, data[7:67, 5:55])
-    stretch = sample_stretch(path)
+    stretch = sample_stretch(path, 1)
     assert stretch is not None
     picture = stretch.apply(pixels, valid)
     assert picture.min() < 15
@@ -49,9 +49,9 @@ def test_neither_the_picture_nor_the_registration_sees_scale_and_offset(tmp_path
     scaled = write_image(tmp_path / "scaled.tif", (data * ratio + offset).astype(dtype))
     seen = []
     for path in (plain, scaled):
-        stretch = sample_stretch(path)
+        stretch = sample_stretch(path, 1)
         assert stretch is not None
-        pixels, valid = read_pixels(path, (0, 0, 90, 120))
+        pixels, valid = read_pixels(path, (0, 0, 90, 120), 1)
         assert valid.all()
         patch = levelled(pixels, valid)
         assert patch.dtype == np.float32
@@ -63,7 +63,7 @@ def test_neither_the_picture_nor_the_registration_sees_scale_and_offset(tmp_path
 def test_a_hot_pixel_does_not_drown_the_others(tmp_path) -> None:
     data = RNG.uniform(10, 1000, (60, 60))
     data[30, 30] = 1e300
-    pixels, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60))
+    pixels, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60), 1)
     patch = levelled(pixels, valid)
     assert np.isfinite(patch).all()
     assert np.corrcoef(patch[:29].ravel(), data[:29].ravel())[0, 1] > 1 - 1e-9
@@ -81,7 +81,7 @@ def test_the_scale_of_a_window_is_that_of_all_its_pixels() -> None:
 def test_complex_pixels_are_refused_with_advice(tmp_path) -> None:
     path = write_image(tmp_path / "slc.tif", np.ones((64, 64), np.complex64))
     with pytest.raises(ImageError, match=r"slc\.tif: band 1 is complex; give its amplitude"):
-        sample_stretch(path)
+        sample_stretch(path, 1)
 
 
 def test_a_band_that_does_not_exist_is_refused(tmp_path) -> None:
@@ -99,11 +99,11 @@ def test_the_band_that_is_asked_for_is_read(tmp_path) -> None:
 def test_nodata_nan_saturated_and_zero_borders_are_invalid_but_a_lone_zero_is_not(tmp_path) -> None:
     data = RNG.uniform(1, 100, (60, 60)).astype(np.float32)
     data[0, 0], data[1, 1], data[2, 2] = np.nan, np.inf, -9999
-    _, valid = read_pixels(write_image(tmp_path / "float.tif", data, nodata=-9999), (0, 0, 60, 60))
+    _, valid = read_pixels(write_image(tmp_path / "float.tif", data, nodata=-9999), (0, 0, 60, 60), 1)
     assert np.flatnonzero(~valid).tolist() == [0, 61, 122]
     whole = RNG.integers(1, 60000, (60, 60)).astype(np.uint16)
     whole[:10], whole[30, 30], whole[40, 40] = 0, 0, 65535
-    _, valid = read_pixels(write_image(tmp_path / "whole.tif", whole), (0, 0, 60, 60))
+    _, valid = read_pixels(write_image(tmp_path / "whole.tif", whole), (0, 0, 60, 60), 1)
     assert not valid[:10].any()
     assert valid[30, 30]
     assert not valid[40, 40]
@@ -115,11 +115,11 @@ def test_nodata_nan_saturated_and_zero_borders_are_invalid_but_a_lone_zero_is_no
     [(0, "uint16"), (7, "uint16"), (65535, "uint16"), (7e40, "float64"), (np.nan, "float32")],
 )
 def test_a_constant_image_has_no_stretch(tmp_path, value: float, dtype: str) -> None:
-    assert sample_stretch(write_image(tmp_path / "a.tif", np.full((90, 90), value, dtype))) is None
+    assert sample_stretch(write_image(tmp_path / "a.tif", np.full((90, 90), value, dtype)), 1) is None
 
 
 def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:
-    assert sample_stretch(write_image(tmp_path / "a.tif", np.ones((1, 1), np.uint8))) is None
+    assert sample_stretch(write_image(tmp_path / "a.tif", np.ones((1, 1), np.uint8)), 1) is None
 
 
 def test_a_box_grows_up_to_the_border_of_the_image() -> None:
@@ -149,7 +149,7 @@ def test_the_stretch_sees_the_whole_image_up_to_its_last_pixels(tmp_path, side: 
         "middle": np.s_[440:460],
     }[side]  # fmt: skip
     data[part] = 5000
-    stretch = sample_stretch(write_image(tmp_path / "a.tif", data))
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", data), 1)
     assert stretch is not None
     assert stretch.low == pytest.approx(100, abs=1)
     assert stretch.high == 5000
@@ -157,7 +157,7 @@ def test_the_stretch_sees_the_whole_image_up_to_its_last_pixels(tmp_path, side: 
 
 def test_the_stretch_is_that_of_the_usual_values_not_of_the_extreme_ones(tmp_path) -> None:
     data = np.tile(np.arange(1000, 2000), (1000, 1)).astype(np.uint16)
-    stretch = sample_stretch(write_image(tmp_path / "a.tif", RNG.permuted(data, axis=1)))
+    stretch = sample_stretch(write_image(tmp_path / "a.tif", RNG.permuted(data, axis=1)), 1)
     assert stretch is not None
     assert stretch.low == pytest.approx(1005, abs=1.5)
     assert stretch.high == pytest.approx(1994, abs=1.5)
@@ -189,7 +189,7 @@ def test_a_stretch_of_jpeg_2000_is_that_of_its_overviews(tmp_path) -> None:
         path = tmp_path / driver
         with rasterio.open(path, "w", driver, 900, 700, 1, dtype="uint16", **place, **given) as file:
             file.write(noise, 1)
-        stretch = sample_stretch(path)
+        stretch = sample_stretch(path, 1)
         assert stretch is not None
         found[driver] = (stretch.high - stretch.low) / 515.2  # 0.5 to 99.5 % of a normal distribution
     assert found["GTiff"] == pytest.approx(1.0, abs=0.03)

@@ -92,7 +92,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
 @pytest.mark.parametrize("px", rest_slow([(120.0, -90.0), (0.0, 0.0)], mark=pytest.mark.nightly))
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):
     view = shifted(views[0], px)
-    found = register_views([view], [reference], dem)
+    found = register_views([view], [reference], dem, 1)
     (match,) = found.views
     assert match.peak > PEAK
     assert match.points > 100
@@ -116,7 +116,7 @@ def read_rpc_of(truth, name: str) -> RPC:
 @pytest.mark.nightly
 def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem, reference, truth, tmp_path):
     there = str(write_reference(tmp_path / "ref.tif", scene, season, GSD, shift=(6.0, -4.0)))
-    first, second = (register_views(views, [path], dem, accuracy=Accuracy(5.0)) for path in (reference, there))
+    first, second = (register_views(views, [path], dem, 1, accuracy=Accuracy(5.0)) for path in (reference, there))
     moved = np.subtract(second.views[0].offset, first.views[0].offset)
     assert moved == pytest.approx([-6.0, 4.0], abs=0.2)
     assert second.control.bias[:2] == pytest.approx([5.0, 5.0])
@@ -128,7 +128,7 @@ def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_
     plain = Grid(season.origin, season.step, np.full_like(season.values, 0.3))
     for name, grid in (("mirrored", mirrored), ("plain", plain)):
         path = str(write_reference(tmp_path / f"{name}.tif", scene, grid, GSD))
-        found = register_views(views, [path], dem)
+        found = register_views(views, [path], dem, 1)
         assert found.control is None, name
         assert found.views[0].peak < PEAK - 1.0
         assert found.views[0].points == 0
@@ -137,7 +137,7 @@ def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_
 @pytest.mark.slow
 def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, season, dem, tmp_path):
     path = str(write_reference(tmp_path / "far.tif", scene, season, GSD, shift=(5000.0, 0.0)))
-    found = register_views(views, [path], dem)
+    found = register_views(views, [path], dem, 1)
     assert found.control is None
     assert found.views[0].peak == 0.0
 
@@ -150,10 +150,10 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
     for name, part, left in (("west", pixels[:, :half], 0), ("east", pixels[:, half:], half)):
         profile.update(width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f))
         paths.append(str(write_image(tmp_path / f"{name}.tif", part, **profile)))
-    whole, parts = register_views(views, [reference], dem), register_views(views, paths, dem)
+    whole, parts = register_views(views, [reference], dem, 1), register_views(views, paths, dem, 1)
     assert parts.views[0].points > 0.6 * whole.views[0].points
     assert np.subtract(parts.views[0].offset, whole.views[0].offset) == pytest.approx([0, 0], abs=0.2)
-    east = register_views(views, paths[1:], dem).control.points
+    east = register_views(views, paths[1:], dem, 1).control.points
     whole_east = whole.control.points.lonlatalt[:, 0].max()
     assert east.lonlatalt[:, 0].max() == pytest.approx(whole_east, abs=1e-3)
     assert east.lonlatalt[:, 0].min() > whole.control.points.lonlatalt[:, 0].min() + 1e-3
@@ -161,7 +161,7 @@ def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
 
 def test_a_raster_without_a_place_is_refused(views):
     with pytest.raises(InputError, match="no place on the ground"):
-        register_views(views, [views[0].path], flat)
+        register_views(views, [views[0].path], flat, 1)
     assert read_rpc(views[0].path) is not None
 
 
@@ -232,7 +232,7 @@ def test_every_camera_of_a_plain_is_off_by_what_was_done_to_it(plains):
     seen, _, reference, _ = plains
     (first, one), (second, two) = wrong(seen[0], (20.0, -11.0)), wrong(seen[1], (-7.5, 4.25))
     assert one == pytest.approx([-41.7, -23.0], abs=0.5)  # of 2.08 m; rows run south
-    found = register_views([first, second], [reference], flat, accuracy=Accuracy(None, 7.0, 3.0))
+    found = register_views([first, second], [reference], flat, 1, accuracy=Accuracy(None, 7.0, 3.0))
     for match, off in zip(found.views, (one, two), strict=True):
         assert match.offset == pytest.approx(off, abs=0.2)
         assert match.peak > 3 * PEAK
@@ -289,7 +289,7 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
     seen, grey, _, folder = plains
     other, far = plain(folder / "other.tif", ground(2)), plain(folder / "far.tif", grey, left=3000)
     for path in (other, far):
-        found = register_views(seen[:1], [path], flat)
+        found = register_views(seen[:1], [path], flat, 1)
         assert found.control is None
         assert found.views[0].peak < PEAK - 1.0
         assert (found.views[0].tried, found.views[0].points) == (0, 0)
@@ -297,7 +297,7 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
         plain(folder / "w.tif", grey[:, : WIDE // 2]),
         plain(folder / "e.tif", grey[:, WIDE // 2 :], WIDE // 2),
     ]
-    mixed = register_views(seen[:1], [far, *halves], flat, accuracy=Accuracy(5.0))
+    mixed = register_views(seen[:1], [far, *halves], flat, 1, accuracy=Accuracy(5.0))
     assert 150 < mixed.views[0].points < 260
     assert mixed.views[0].offset == pytest.approx([0.0, 0.0], abs=0.1)
     east = mixed.control.points.lonlatalt[:, 0] / DEGREES
@@ -317,8 +317,8 @@ def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_be
     write_image(path, np.ones((50, 50), np.uint8), transform=corner, crs="EPSG:4326")
     monkeypatch.setattr(_ReferenceWork, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
     view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
-    assert register_views([view], [str(path)], flat).sigma == pytest.approx(sigma, rel=0.02)
-    assert register_views([view], [str(path)], flat, accuracy=Accuracy(7.0)).sigma == 7.0
+    assert register_views([view], [str(path)], flat, 1).sigma == pytest.approx(sigma, rel=0.02)
+    assert register_views([view], [str(path)], flat, 1, accuracy=Accuracy(7.0)).sigma == 7.0
 
 
 # --- pieces -------------------------------------------------------------------------------------------------

@@ -143,7 +143,7 @@ def test_a_pair_reads_the_tiles_that_it_needs(pair, tmp_path, sized: Sized) -> N
 @pytest.mark.parametrize("damage", rest_slow(["cut", "gone", "empty", "other"], keep=2))
 def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path, damage: str) -> None:
     store, view, box = Store(str(tmp_path / "kept"), str(tmp_path)), pair[0], (0, 0, 256, 256)
-    found = survey(view.path)
+    found = survey(view.path, 1)
     task = (store, "tile/a", (view.path, view.size, box, found, KeypointDensity(0.002)))
     count = keep_tile(*task)
     path = tmp_path / "kept/tile/a.npz"
@@ -192,7 +192,7 @@ def test_a_picture_is_the_same_however_the_file_is_stored(tmp_path, zoom: int, p
     data = quiet(10.0)[:702, :801].copy()
     data[100:130, 200:260] = 0
     path = write_image(tmp_path / "a.tif", data, nodata=0, **profile)
-    known = survey(path)
+    known = survey(path, 1)
     assert known is not None
     picture, valid = read_picture(path, (64, 64, 737, 638), known, zoom)
     assert picture.shape == valid.shape == (638 // zoom, 737 // zoom)
@@ -216,7 +216,7 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, sid
     warnings.simplefilter("ignore")
     with rasterio.open(paths[1], "w", width=side, height=side, count=1, dtype="uint16", **lossless) as out:
         out.write(data, 1)
-    found = [survey(path) for path in paths]
+    found = [survey(path, 1) for path in paths]
     assert [known and known.levels for known in found] == [False, True]
     share = KeypointDensity(1.0, zoom)
     at = [detect_tile(str(p), (side, side), (0, 0, side, side), f, share) for p, f in zip(paths, found, strict=True)]  # type: ignore[arg-type]
@@ -235,7 +235,7 @@ def test_a_jpeg_2000_has_levels_where_every_second_and_fourth_pixel_are_stored(t
     layout = {"driver": "JP2OpenJPEG", "RESOLUTIONS": resolutions, "width": side, "height": side, "count": 1}
     with rasterio.open(tmp_path / "a.jp2", "w", dtype="uint8", **layout) as out:
         out.write(np.tile(np.arange(side, dtype=np.uint8), (side, 1)), 1)
-    found = survey(tmp_path / "a.jp2")
+    found = survey(tmp_path / "a.jp2", 1)
     assert found is not None
     assert found.levels == levels
 
@@ -294,7 +294,7 @@ def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zo
         return read(band, box, zoom)
 
     monkeypatch.setattr(reading._RasterBand, "read", noted)
-    known = survey(views[0].path)
+    known = survey(views[0].path, 1)
     assert known is not None
     assert 0.0 < decoded(log)[views[0].path] <= surveyed
     log.clear()
@@ -329,7 +329,7 @@ def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zo
 
 @pytest.mark.slow
 def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
-    found = survey(pair[0].path)
+    found = survey(pair[0].path, 1)
     assert found is not None
     wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 128))
     whole = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 1024))
@@ -348,10 +348,10 @@ def test_the_store_goes_with_the_run_folder(tmp_path) -> None:
 def test_a_block_that_two_windows_share_is_decoded_once(tmp_path) -> None:
     """The pixels are gone from the file when the second window asks for them."""
     path = write_image(tmp_path / "a.tif", quiet(10.0), **BLOCKS)
-    with reading.PixelReader(path) as reader:
+    with reading.PixelReader(path, 1) as reader:
         before = reader.read((10, 10, 600, 600))[0]
         with path.open("r+b") as file:
             file.write(bytes(path.stat().st_size))
         np.testing.assert_array_equal(reader.read((100, 200, 300, 400))[0], before[190:590, 90:390])
     with pytest.raises(ImageError):
-        reading.read_pixels(path, (100, 200, 300, 400))
+        reading.read_pixels(path, (100, 200, 300, 400), 1)

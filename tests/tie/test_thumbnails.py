@@ -32,7 +32,7 @@ def test_a_thumbnail_is_the_image_as_it_lies_stretched_with_black_where_nothing_
             '<SourceBand>1</SourceBand><SrcRect xOff="0" yOff="0" xSize="1300" ySize="900"/>'
             '<DstRect xOff="0" yOff="0" xSize="1300" ySize="900"/></SimpleSource></VRTRasterBand></VRTDataset>'
         )
-    grey = thumbnail(path, (1300, 900), 2000 if kind == "small" else 130)
+    grey = thumbnail(path, (1300, 900), 2000 if kind == "small" else 130, 1)
     assert grey.shape == ((900, 1300) if kind == "small" else (90, 130))
     shown = cv2.resize(grey, (130, 90), interpolation=cv2.INTER_AREA).astype(float)
     assert (shown[:, :12] == 0).all()
@@ -45,7 +45,7 @@ def test_a_thumbnail_is_the_image_as_it_lies_stretched_with_black_where_nothing_
 
 def test_an_image_without_contrast_has_no_thumbnail_and_one_of_noise_fits_its_bytes(tmp_path):
     flat = write_image(tmp_path / "flat.tif", np.full((50, 50), 9, np.uint8))
-    assert thumbnail(flat, (50, 50), 48) is None
+    assert thumbnail(flat, (50, 50), 48, 1) is None
     noise = np.random.default_rng(1).integers(0, 255, (480, 480)).astype(np.uint8)
     assert len(jpeg(noise)) > 60_000
     for most in (60_000, 25_000, 1000, 1):
@@ -57,6 +57,6 @@ def test_an_image_without_contrast_has_no_thumbnail_and_one_of_noise_fits_its_by
 @pytest.mark.parametrize("size", [(20, 30_000), (30_000, 3), (1, 1), (2, 1)])
 def test_an_image_of_few_columns_or_rows_has_a_thumbnail_or_none(tmp_path, size):
     pixels = (np.arange(size[0] * size[1]) % 251).reshape(size[1], size[0]).astype(np.uint8)
-    grey = thumbnail(write_image(tmp_path / "thin.tif", pixels, nodata=255), size, 480)
+    grey = thumbnail(write_image(tmp_path / "thin.tif", pixels, nodata=255), size, 480, 1)
     assert grey is None or (max(grey.shape) <= 480 and min(grey.shape) >= 1)
     assert (grey is None) <= (max(size) < 3)

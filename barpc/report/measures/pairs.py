@@ -19,7 +19,6 @@ from barpc.sensor import SensorModel
 from barpc.sensor.geometry import Several, base_to_height, convergence_angle, ground_sample_distance
 from barpc.sensor.triangulation import epipolar_offset
 
-_FROM_FAR = 4  # steps to a pair's closest approach, from the altitude of the scene
 MAX_PER_PAIR = 1000  # Matches of a pair that its epipolar offset is measured on, evenly taken
 
 _PAIR_REPORT_FIELDS = attrgetter("means", "control_share", "spread", "beaten", "reason")
@@ -75,7 +74,7 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple
     height = np.where(np.isfinite(alt), alt, run.altitude)[run.tracks.point[a]]
     offset, xy = np.empty(len(a)), run.tracks.xy
     for part, first, second in _match_parts(run, sensors, a, b):
-        offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part], steps=_FROM_FAR)
+        offset[part], _ = epipolar_offset(first, second, xy[a[part]], xy[b[part]], height[part])
     used, num = run.keep[a] & run.keep[b], len(every)
     return _offset_entries(offset, pair, num), _offset_entries(offset[used], pair[used], num)
 

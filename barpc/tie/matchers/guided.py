@@ -15,6 +15,7 @@ from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
+from barpc.tie.pixels import PIECE
 
 FloatArray = npt.NDArray[np.float32]
 
@@ -22,7 +23,6 @@ CLEAR_RATIO = 0.8
 """Largest ratio where only clear matches count."""
 _MAX_TURN = np.radians(30.0)  # between the orientation seen and the one expected
 _SECTORS = int(np.rint(np.pi / _MAX_TURN))  # of twice that
-_PAIRS = 2**15  # that are looked at at a time: some 30 MB of descriptors if all of them are compared
 
 
 class Guided:
@@ -154,7 +154,7 @@ def _pairs_in_band(
     begin = np.searchsorted(key[order], start + np.searchsorted(u, left, "left")[:, None, None])
     end = np.searchsorted(key[order], start + np.searchsorted(u, right, "right")[:, None, None])
     size = np.maximum(end - begin, 0)
-    portion = np.cumsum(size.sum(axis=(1, 2))) // _PAIRS
+    portion = np.cumsum(size.sum(axis=(1, 2))) * first.values.shape[1] // PIECE
     for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(portion)) + 1):
         sizes = size[some].ravel()
         at = np.repeat(begin[some].ravel() - (np.cumsum(sizes) - sizes), sizes) + np.arange(sizes.sum())

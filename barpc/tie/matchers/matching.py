@@ -22,7 +22,7 @@ from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import FEW, MANY, SAMPLE, STEPS, SURELY, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, View
-from barpc.sensor.sampler import image_grid
+from barpc.sensor.sampler import GRID_NODES, image_grid
 from barpc.tie.matchers.features import AMPLE, KeypointFiles, Keypoints, join_keypoints
 from barpc.tie.matchers.guided import CLEAR_RATIO, Guided
 from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Hook, Matcher, Matches, Prediction, hooked
@@ -39,6 +39,7 @@ from barpc.tie.matchers.report import (
 from barpc.tie.matchers.structural import FineStructure, GradientStructure
 from barpc.tie.pairing.epipolar import (
     LEAST_REACH,
+    LEAST_SIGMA,
     EpipolarSegments,
     coherent,
     common_range,
@@ -72,7 +73,6 @@ FALSE_SHARE = 0.01
 _LOOSE_RATIO, _LOOSE_FALSE_SHARE, _LOOSE_NEEDED = 0.95, 0.05, 2 / 3
 """Ratio and false share of the second attempt; its part of the matches that a pair needs."""
 _MARGINS = 150.0, 50.0  # m beyond known altitudes: how wrong cameras make them, and seldom do
-_PROBES = 12  # pixels along a side at which the terrain is asked
 _BOTH = Pair((0, 1), 1.0, 0.0)  # two views, of which nothing else is asked
 
 
@@ -103,7 +103,7 @@ class GroundAltitudes:
         low, high = common_range(*views)
         if self.terrain is not None:
             middle = 0.5 * (low + high)
-            ground = views[0].sensor.localize(*image_grid(views[0].size, (middle, middle), (_PROBES, 1)))
+            ground = views[0].sensor.localize(*image_grid(views[0].size, (middle, middle), (GRID_NODES[0], 1)))
             heights = self.terrain(ground[:, 0], ground[:, 1])
             other = views[1].sensor.project(np.column_stack([ground[:, :2], heights]))
             with np.errstate(invalid="ignore"):
@@ -173,15 +173,15 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _PairSearch] | None = None,
-    loosened: float = 0.0,
+    false_share: float = FALSE_SHARE,
 ) -> tuple[Matches, PairReport]:
     """Match a pair by all passes of one matcher; searches in `looked` are shared between attempts.
 
-    `loosened`: the share of false matches that a second attempt accepts.
+    `false_share`: the share of false matches that is accepted, larger in a second attempt.
     """
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     known: dict[str, Any] = {"angle": pair.angle, "overlap": pair.overlap, "reason": pair.reason}
-    report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=bool(loosened), **known)
+    report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=false_share > FALSE_SHARE, **known)
     kind = matcher_named(options.matcher)
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
@@ -197,7 +197,7 @@ def _attempt(
     report = replace(report, matches=len(tight))
     if len(tight) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few matches")
-    found, control = search.trusted(search.local(tight), loosened or FALSE_SHARE)
+    found, control = search.trusted(search.local(tight), false_share)
     errors = search.errors(found)
     keep, residual = coherent(found.xy[:, 0], errors[:, 1])
     report = replace(report, matches=len(found), verified=int(keep.sum()), control_share=control)
@@ -210,7 +210,7 @@ def _attempt(
     if kind.detects:
         index = np.stack([number[column] for number, column in zip(numbers, found.index.T, strict=True)], axis=-1)
         found = replace(found, index=index)
-    return replace(found.select(keep), sigma=max(spread, 0.05)), report
+    return replace(found.select(keep), sigma=max(spread, LEAST_SIGMA)), report
 
 
 def _overlap_keypoints(

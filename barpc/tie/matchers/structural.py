@@ -100,7 +100,7 @@ class _GridSearch:
             wanted, count = (4, GRID_POINTS[1]) if half > _LONGER else (2, GRID_POINTS[1 + (half < _LONG)])
         else:
             width = self._prediction.half_width  # a twentieth of the image, or the altitudes, may be wide
-            wanted, count = int(max(width / 20.0, min(half / 80.0, 4.0), 2.0)), GRID_POINTS[0]
+            wanted, count = max(int(width / 20.0), 4 if half > _LONGER else 2), GRID_POINTS[0]
         boxes = np.array(windows)
         side = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
         step = 1 << int(np.ceil(np.log2(wanted)))
@@ -148,7 +148,7 @@ class _GridSearch:
         sampling = self._sampling(self._step, at)
         linear = sampling.linear
         axes = np.stack([where.axis, [-where.axis[1], where.axis[0]]])
-        half = max(asked.half_width, 0.75 * self._step)
+        half = max(asked.half_width, MAX_PATCH_SHIFT)
         wide = half if asked.probes else 2.0 * asked.half_width + INVALID_MARGIN + half
         wide = min(wide, float(np.abs(axes[1]) @ self._files[1][1]))  # B is no wider
         shift, longest = self._part_in_b(where, middle, rows, wide)

@@ -13,7 +13,7 @@ import shapely
 from shapely import affinity
 
 from barpc.base.errors import InputError, plain
-from barpc.base.geodesy import Array, wrap_longitude
+from barpc.base.geodesy import Array, is_lonlat, wrap_longitude
 from barpc.base.safe_io import GEOJSON, read_json
 from barpc.scene import BoolArray
 
@@ -99,7 +99,7 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
         for part in parts:
             rings = [_ring_vertices(ring) for ring in part]
             for hole in rings[1:]:
-                hole[:, 0] += 360.0 * np.rint((rings[0][0, 0] - hole[0, 0]) / 360.0)
+                hole[:, 0] += wrap_longitude(hole[0, 0], rings[0][0, 0]) - hole[0, 0]
             yield shapely.Polygon(rings[0], rings[1:])
     else:
         raise ValueError(f"a {kind} is no polygon")
@@ -108,10 +108,10 @@ def _polygons(data: dict[str, Any]) -> Iterator[shapely.Polygon]:
 def _ring_vertices(positions: list[list[float]]) -> Array:
     """Return the vertices (N, 2) of an outline, the first between -180 and 180, its longitudes without jumps."""
     ring = np.array([position[:2] for position in positions], dtype=np.float64).reshape(-1, 2)
-    if not (np.isfinite(ring).all() and (np.abs(ring) <= [540.0, 90.0]).all()):
+    if not is_lonlat(ring).all():
         raise ValueError("a position is not a longitude and a latitude")
     step = np.diff(ring[:, 0])
     # a full turn is no jump, but an edge along a parallel
-    ring[1:, 0] -= 360.0 * np.cumsum(np.where(np.abs(step) < 360.0, np.rint(step / 360.0), 0.0))
+    ring[1:, 0] -= np.cumsum(np.where(np.abs(step) < 360.0, step - wrap_longitude(step), 0.0))
     ring[:, 0] += wrap_longitude(ring[:1, 0]) - ring[0, 0]
     return ring

@@ -10,12 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import NEWTON_STEPS, Array
 from barpc.base.statistics import BIWEIGHT, FEW, SURELY, kd_tree, robust_spread
 from barpc.scene import BoolArray, IntArray, View
 
 LEAST_REACH = 5.0
 """Half a segment [px] below which places along it say nothing of altitudes."""
+SIGMA = 0.1
+"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
+LEAST_SIGMA = 0.02
+"""Standard deviation of a place [px] at least: of a rendered one that is matched best."""
 _MIN_AGREEING_SHARE = 1 / 3
 """Part of the neighbours that agree: beside a straight edge half of them are of one side, less two standard deviations
 of `FEW` draws."""
@@ -119,7 +123,7 @@ def _design(xy: Array, middle: Array, scale: Array) -> Array:
     return np.column_stack([np.ones(len(xy)), (xy - middle) / scale])
 
 
-def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
+def robust_affine(xy: Array, values: Array) -> Affine:
     """Fit values (N,) at positions (N, 2) [px] by an affine function, a constant for few points, despite outliers.
 
     Tukey's biweight on a scale that follows the residuals' MAD.
@@ -128,7 +132,7 @@ def robust_affine(xy: Array, values: Array, steps: int = 12) -> Affine:
     design = _design(xy, middle, scale)
     columns = 3 if len(xy) >= FEW else 1
     coefficients = np.array([np.median(values), 0.0, 0.0])
-    for _ in range(steps):
+    for _ in range(NEWTON_STEPS):
         residual = values - design @ coefficients
         spread = max(robust_spread(residual), 1e-3)
         weight = np.maximum(0.0, 1.0 - (residual / (BIWEIGHT * spread)) ** 2)  # the biweight's root
@@ -152,12 +156,12 @@ def gradient(xy: Array, values: Array) -> Array:
     return fitted.coefficients[1:] / fitted.scale
 
 
-def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, Array]:
+def coherent(xy: Array, values: Array) -> tuple[BoolArray, Array]:
     """Return the mask of values (N,) [px] at positions (N, 2) [px] that neighbours share, and values less medians.
 
     An image may jump at a row or a column, so that no function of position holds all of it: a value that agrees with
     enough of the `FEW` nearest is none that came by chance. It does within `SURELY` robust standard deviations, or
-    `floor` [px].
+    `SIGMA`.
     """
     if len(values) < 2:
         return np.ones(len(values), dtype=bool), np.zeros(len(values))
@@ -165,7 +169,7 @@ def coherent(xy: Array, values: Array, floor: float = 0.3) -> tuple[BoolArray, A
     near = kd_tree(xy).query(xy, k=min(FEW + 1, len(xy)))[1]
     others = level[near]
     residual = level - np.median(others, axis=1)
-    agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), floor)
+    agree = np.abs(others - level[:, None]) <= max(SURELY * robust_spread(residual), SIGMA)
     return agree.sum(axis=1) - 1 >= _MIN_AGREEING_SHARE * (near.shape[1] - 1), residual
 
 

@@ -238,7 +238,7 @@ def picture(
     picture = np.asarray(sum(levelled(pixels, known) for pixels, known in each), np.float32)
     picture[~valid] = picture[valid].mean()
     cv2.setNumThreads(1)
-    if (left := apart / thin) > 1.1:
+    if (left := apart / thin) > 1.0:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.5 * (left**2 - 1.0) ** 0.5), np.float32)
     rows, cols = (_between_all(n) for n in shape)
     nodes = (np.where(known[..., None], nodes, 0.0) + 0.5) / thin - 0.5 - box[:2]

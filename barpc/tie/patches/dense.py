@@ -18,7 +18,7 @@ ACROSS = 0.02
 """A part in which an affine frame misses the epipolar lines by more [px] is too large for one."""
 COLUMNS_PER_PIXEL = 2
 """Columns of the frame a pixel: heights of a Pleiades triplet differ by 0.62 m (NMAD), with one by 0.83 m."""
-ALLOWANCE = 4.0
+_ALLOWANCE = 4.0
 """Pixels of a coarser picture that a surface may lie beyond what that shows."""
 WINDOW = 7
 """Pixels a side over which the step of least squares compares grey values, and matches of one surface are averaged."""
@@ -131,7 +131,7 @@ def dense_matches(
     images: Sequence[str],
     sizes: Sequence[tuple[int, int]],
     frame: EpipolarFrame,
-    band: int = 1,
+    band: int,
     coarse: tuple[Array, Array, float] | None = None,
 ) -> DenseMatches | None:
     """Match a part of two images; None where they do not show enough of it.
@@ -252,9 +252,18 @@ def _coarse_disparity(
     level = level[: shape[1], : shape[0]]
     place = np.clip(np.rint(a).astype(np.int64), 0, np.array(shape) - 1)
     beside = disparity - level[place[:, 1], place[:, 0]]
-    first, last = np.percentile(beside, [1.0, 99.0]) + np.array([-1.0, 1.0]) * ALLOWANCE * coarse[2] * COLUMNS_PER_PIXEL
+    first, last = span_of_surface(beside, coarse[2] * COLUMNS_PER_PIXEL)
     first = int(np.floor(first))
     return np.asarray(level, np.float32), first, 16 * int(np.ceil((last - first) / 16))
+
+
+def span_of_surface(values: Array, pixel: float) -> tuple[float, float]:
+    """Return the ends of a surface of which a coarser picture shows `values` (n,), a pixel of it standing for `pixel`.
+
+    Values of the hundredth part at either end are not believed.
+    """
+    low, high = np.percentile(values, [1.0, 99.0])
+    return float(low - _ALLOWANCE * pixel), float(high + _ALLOWANCE * pixel)
 
 
 def _about_coarse(

@@ -17,13 +17,11 @@ from barpc.base.options import TieOptions
 from barpc.base.statistics import FEW, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
-from barpc.tie.pairing.epipolar import LEAST_REACH, coherent, epipolar_segments, grouped, linear_map
-from barpc.tie.patches import oriented
+from barpc.tie.pairing.epipolar import LEAST_REACH, LEAST_SIGMA, SIGMA, coherent, epipolar_segments, grouped, linear_map
 from barpc.tie.patches.register import Part, PatchRegistration, register_parts, task_parts
 from barpc.tie.pixels import SPAN
 
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
-_LEAST_END_SIGMA = 0.02  # px, of an observation: a rendered one that is matched best
 
 
 def refine(
@@ -46,7 +44,7 @@ def refine(
     if not len(tracks):
         return tracks
     # channels register less exactly: what compares by grey values is the better reference
-    exact = {ends: spread + oriented.SIGMA * (ends in structural) for ends, spread in spreads.items()}
+    exact = {ends: spread + SIGMA * (ends in structural) for ends, spread in spreads.items()}
     of_track = references(tracks, exact, len(views))
     other = np.flatnonzero(np.arange(len(tracks)) != of_track[tracks.point])
     links = _Registrations(views, tracks, of_track[tracks.point[other]], other, frozenset(structural))
@@ -161,7 +159,7 @@ class _Registrations:
         views = self.tracks.view
         three = views[self.reference[first]], views[self.other[first]], views[self.other[second]]
         for group in grouped(*three):
-            agree = coherent(self.origin[first[group]], apart[group], 2 * oriented.SIGMA)[0]
+            agree = coherent(self.origin[first[group]], apart[group])[0]
             for end in (first[group], second[group]):
                 compared[end] = True
                 agreed[end[agree]] = True
@@ -173,7 +171,7 @@ class _Registrations:
         for group in self.groups():
             group = group[good[group]]
             if len(group) >= FEW:
-                residual = coherent(self.origin[group], across[group], oriented.SIGMA)[1]
+                residual = coherent(self.origin[group], across[group])[1]
                 sigma[group] *= max(1.0, robust_spread(residual / sigma[group]))
         return sigma
 
@@ -195,7 +193,7 @@ def _shared_variance(tracks: Tracks, of_track: IntArray, rows: IntArray, xy: Arr
     placed, keep = np.rint(tracks.xy), np.zeros(len(tracks), dtype=bool)
     placed[rows], keep[rows] = xy, True
     keep[of_track] = count > 0
-    return Tracks(tracks.view, tracks.point, placed, np.sqrt(variance).clip(_LEAST_END_SIGMA)).select(keep)
+    return Tracks(tracks.view, tracks.point, placed, np.sqrt(variance).clip(LEAST_SIGMA)).select(keep)
 
 
 def references(tracks: Tracks, spreads: Mapping[tuple[int, int], float], num_views: int) -> IntArray:

@@ -22,8 +22,6 @@ ImageFiles = Sequence[tuple[str, tuple[int, int]]]
 
 TEMPLATE_REACH = 24
 """How far one reaches when matches are registered [px]."""
-SIGMA = 0.1
-"""Standard deviation of a place registered by structure [px]; as much across an epipolar line is always tolerated."""
 HALF = 16
 """How far a template reaches to each side [px]."""
 MIN_PICTURE_SHARE = 0.9
@@ -186,10 +184,10 @@ class PatchTile:
             missed.append(np.hypot(x - search, y - search))
         return np.asarray(np.concatenate(missed) <= MAX_PATCH_SHIFT)
 
-    def shown(self, which: int = 0, place: Array | None = None) -> BoolArray:
-        """Return the mask of places (n, 2) in a picture with structure about them; of templates by default."""
+    def shown(self, place: Array | None = None) -> BoolArray:
+        """Return the mask of places (n, 2) in the second picture, or of templates, with structure about them."""
         at = self.at if place is None else np.rint(place).astype(np.int64)
-        known = (np.abs(self.pictures[which]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
+        known = (np.abs(self.pictures[place is not None]).sum(axis=0, keepdims=True) > 0).astype(np.float32)
         return np.asarray(windows_around(known, at, self.half, self.half).mean(axis=(1, 2, 3)) > MIN_PICTURE_SHARE)
 
     def in_b(self, place: Array) -> Array:

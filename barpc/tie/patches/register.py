@@ -18,7 +18,7 @@ from barpc.base.fields import field_values
 from barpc.base.frozen import join_fields
 from barpc.base.geodesy import CHUNK, NEWTON_STEPS, Array
 from barpc.scene import BoolArray, IntArray
-from barpc.tie.pairing.epipolar import grouped
+from barpc.tie.pairing.epipolar import SIGMA, grouped
 from barpc.tie.patches import oriented
 from barpc.tie.pixels import SPAN, FloatImage, OpenReaders, PixelReader, grow, levelled
 
@@ -173,7 +173,7 @@ def register_parts(parts: Sequence[Part], band: int) -> PatchRegistration:
         for files, reference, start, linear, structural in parts:
             if structural:
                 xy, ok, correlation = oriented.register_oriented(files, band, reference, start, linear, readers)
-                found.append(PatchRegistration(xy, correlation, np.full(len(xy), oriented.SIGMA), ok))
+                found.append(PatchRegistration(xy, correlation, np.full(len(xy), SIGMA), ok))
             else:
                 one = register_places(files, band, reference, start, linear, PATCH, readers)
                 found.append(replace(one, ok=one.ok & (one.correlation >= MIN_CORRELATION)))
@@ -210,7 +210,7 @@ def register_patches(
     for rows in _chunks(np.flatnonzero(best.ok)):  # on a step of the ground the inner part goes elsewhere
         inner = template.find(fine, reference[rows].astype(np.int64), best.xy[rows], linear[rows], 10 / _SAMPLER_STEPS)
         apart = np.hypot(*(inner.xy - best.xy[rows]).T)
-        best.ok[rows] = apart <= 5.0 * np.maximum(oriented.SIGMA, inner.sigma)
+        best.ok[rows] = apart <= 5.0 * np.maximum(SIGMA, inner.sigma)
     return best
 
 
