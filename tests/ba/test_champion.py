@@ -172,24 +172,6 @@ def test_a_deck_that_covers_more_than_half_is_told_by_the_priors(monkeypatch: py
     assert member.mean() == pytest.approx(0.6, abs=0.01)
 
 
-@pytest.mark.parametrize(("low", "high", "across"), [(0.6, 1.0, True), (0.0, 0.5, True), (0.3, 0.7, False)])
-def test_a_group_across_the_scan_lies_on_one_side_of_a_row(block: Any, low: float, high: float, across: bool) -> None:
-    ties = join(block.views, block.tracks, None, AdjustOptions())
-    rng, inside = np.random.default_rng(2), np.zeros(len(ties.view), dtype=bool)
-    for v in range(3):
-        rows = ties.view == v
-        edges = np.quantile(ties.xy[1, rows], (low, high))
-        inside[rows] = (ties.xy[1, rows] >= edges[0]) & (ties.xy[1, rows] <= edges[1])
-    inside ^= rng.random(len(inside)) < 0.05
-    parts = models.Parts(ties, np.zeros_like(inside), inside.astype(np.int64))
-    assert parts.is_split_by_row() == across
-    few = rng.random(len(inside)) < 0.05  # nearly all others lie on one side of some row: that tells nothing
-    assert not models.Parts(ties, np.zeros_like(few), few.astype(np.int64)).is_split_by_row()
-    swapped = parts.exchanged()
-    np.testing.assert_array_equal(swapped.group > 0, ~inside)
-    assert swapped.is_split_by_row() == across
-
-
 @pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")  # angles of wrong matches
 def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(monkeypatch: pytest.MonkeyPatch) -> None:

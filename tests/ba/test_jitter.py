@@ -80,6 +80,15 @@ def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks)
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize("views", [8, 16])
+def test_jitter_of_many_images_is_no_moving_ground(views):
+    """A motion of each image, of a part of the ground, follows a part of the jitter of each: 0.07 and 0.8 px of it."""
+    found, after = solved("jitter 0.5 at 1 Hz", 1, pitch=tuple(np.linspace(-25.0, 25.0, views)))
+    assert not found.findings
+    assert 0.005 < after.across < 0.03
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize(("seeds", "tracks"), SHAKEN)
 def test_jitter_that_is_not_followed_stays_and_bends_heights_no_less(seeds, tracks):
     name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}

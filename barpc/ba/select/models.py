@@ -271,10 +271,10 @@ def _without_moving_ground(
         before = measure(found.problem, found.final.params, less.outer)
         if is_better(before, tried.after, less.outer) or not _may_move(last.moved, tried, found, parts):
             break
-        if less.is_split_by_row():  # errors of the rows of all images may explain as much
-            smooth, still = with_splines(found, parts, options), less.without_motion(found, last.moved)
-            if not is_closer(tried, smooth, parts.ties(), still):
-                break
+        # a motion in each image follows a part of the jitter of many images
+        smooth, still = with_splines(found, parts, options), less.without_motion(found, last.moved)
+        if not is_closer(tried, smooth, parts.ties(), still):
+            break
         tried, less = _likelier_ground(tried, less, options, solve)
         found, parts = tried, less
         groups.append(last)

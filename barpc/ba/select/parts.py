@@ -16,7 +16,6 @@ from barpc.base.options import AdjustOptions
 from barpc.base.statistics import LEVEL
 from barpc.scene import BoolArray, IntArray
 
-_MIN_SEPARATION = 0.8  # Kolmogorov-Smirnov distance of the rows of two groups: a tenth of each may be beyond one row
 _COMPASS_SIDES = ("west", "east"), ("south", "north")
 
 
@@ -80,18 +79,6 @@ class Parts:
         """Return the largest motion of a group between two images, in pixels of the coarser one."""
         view = self.inner.view
         return one.metres / max(one.ground.pixel_of(np.flatnonzero(view == v)) for v in one.between)
-
-    def is_split_by_row(self) -> bool:
-        """Return whether a row of every image separates the last moving group from the ground, but a tenth of each."""
-        number = self.group.max(initial=0)
-        ties = (self.block.point < self.block.num_tracks) & self.block.use & np.isin(self.group, (0, number))
-        for v in range(len(self.block.views)):
-            rows = np.flatnonzero(ties & (self.block.view == v))
-            moves = self.group[rows[np.argsort(self.block.xy[1, rows], kind="stable")]] == number
-            below = [np.cumsum(one) / max(one.sum(), 1) for one in (moves, ~moves)]
-            if len(rows) and np.abs(below[0] - below[1]).max() < _MIN_SEPARATION:
-                return False
-        return True
 
     def exchanged(self) -> Parts:
         """Return the parts with the last moving group as ground, and the ground as the moving group."""
