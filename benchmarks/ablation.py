@@ -60,7 +60,7 @@ MECHANISMS: dict[str, Any] = {
     "drift of a higher degree": ("solution._with_more_drift", lambda first, *_: first),
     "control that distorts": ("solution._without_distorting_control", lambda found, *_: found),
     "foreign camera": ("select.models.find_foreign_camera", lambda *_: (None, None)),
-    "search of terms": ("select.models.search_terms", lambda *_: importlib.import_module(_BEAM).Selection()),
+    "search of terms": ("select.models.search_terms", lambda *_, **__: importlib.import_module(_BEAM).Selection()),
     "veto of check tracks": ("select.image_terms.is_admitted", lambda *_: True),
     "terms in the images": ("select.models.with_terms", lambda found, *_: found),
     "splines and detectors": ("select.models.with_splines select.image_terms.with_splines", lambda found, *_: found),

@@ -567,7 +567,7 @@ def followed(monkeypatch, error: float, prior: Any = None, affine: float = 0.5) 
         return Said("followed", SimpleNamespace(error=error))
 
     monkeypatch.setattr(models, "with_splines", follow)
-    monkeypatch.setattr(models, "search_terms", lambda *_: Selection())
+    monkeypatch.setattr(models, "search_terms", lambda *_, **__: Selection())
     monkeypatch.setattr(models, "with_terms", lambda found, *_: found)
     monkeypatch.setattr(models, "_without_moving_ground", lambda found, parts, *_: (found, parts, Selection()))
     parts: Any = SimpleNamespace(inner=None, outer=None)

@@ -227,10 +227,11 @@ class TermSearch:
     first : list of Interval
         Significant intervals of the solved block.
     floor, sigma : float, least displacement to find, and standard deviation of observations [px]
+    moving : bool, whether moving objects are searched for
     """
 
-    def __init__(self, seen: Residuals, first: list[Interval], floor: float, sigma: float) -> None:
-        self.start, self.first, self.floor, self.sigma = seen, first, floor, sigma
+    def __init__(self, seen: Residuals, first: list[Interval], floor: float, sigma: float, moving: bool = True) -> None:
+        self.start, self.first, self.floor, self.sigma, self.moving = seen, first, floor, sigma, moving
         self.seen, self.taken = seen, tuple[_SelectedTerm, ...]()
         self.group: list[Term] = []  # moving groups, searched for once
         self.tested: dict[int, tuple[MixtureFit, list[Interval], list[Period]]] = {}  # by the identity of the fit
@@ -289,7 +290,7 @@ class TermSearch:
         made = self._with_fits([], self._most_promising(list(proposed(seen, out, periods))))
         made = self._refined(self._with_fits(made, made[0][0].alternatives(seen, made[0][1]) if made else []))
         moves = out or self.group or (not self.taken and MovingObjects.may_move(seen))
-        if moves and not (self._explains_all(made) and self._shows_no_motion(made[0])):
+        if self.moving and moves and not (self._explains_all(made) and self._shows_no_motion(made[0])):
             made = self._sorted([row[:2] for row in (*made, *self._motion_candidates())])
         least = self.floor * _MIN_AMPLITUDE
         return self._sorted(row[:2] for row in made if row[0].amplitude(seen, row[1]) >= least)

@@ -150,7 +150,7 @@ def _search_models(first: Solution, parts: Parts, options: AdjustOptions, solve:
         found = with_lines_lost(with_terms(found, selected, parts, options), parts, options)
     smooth = with_splines(found, parts, options) if geometric else found
     if smooth is not found:
-        beside = search_terms(smooth.outcome, parts.inner, options.noise_floor)
+        beside = search_terms(smooth.outcome, parts.inner, options.noise_floor, moving=False)  # found before
         smooth = with_terms_beside_splines(smooth, beside, parts, options)
     if searched is None and (given or found.outcome is first.outcome):
         return SelectedModel(smooth, parts)

@@ -26,8 +26,10 @@ MAX_OBSERVATIONS = KEPT
 _NEAREST = 12  # views that are searched together in a large block
 
 
-def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
+def search_terms(outcome: Outcome, block: Block, floor: float, moving: bool = True) -> Selection:
     """Find the terms of a block beside its cameras, in order of selection; none if no residuals are significant.
+
+    With `moving`, moving objects are among them.
 
     In a block of more unknowns than `SMALL` each image with significant residuals is searched together with those
     that share most tracks with it. A search that selects moving objects there is discarded.
@@ -41,20 +43,20 @@ def search_terms(outcome: Outcome, block: Block, floor: float) -> Selection:
     if size <= SMALL:
         # moving ground may have systematic residuals without a significant interval of rows or columns
         systematic = outcome.smooth.found(floor).any()
-        return _search_views(outcome, block, floor, views) if suspects or systematic else Selection()
+        return _search_views(outcome, block, floor, views, moving) if suspects or systematic else Selection()
     found = Selection((), np.zeros((len(views), size // len(views))), outcome.inlier.astype(np.float64))
     done: set[int] = set()
     for view in dict.fromkeys(suspects):
         if view not in done:
             views = _neighbour_views(block, view)
             done.update(views.tolist())
-            one = _search_views(outcome, block, floor, views)
+            one = _search_views(outcome, block, floor, views, moving)
             if one.findings and one.findings[-1].moved is None:
                 found = _with_findings(found, one, views, np.flatnonzero(np.isin(block.view, views)))
     return found if found.findings else Selection()
 
 
-def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray) -> Selection:
+def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray, moving: bool) -> Selection:
     """Search the tie points of some views; the result numbers views and observations from 0 among these."""
     found = linearised_among(outcome, block, views)
     if found is None:
@@ -69,7 +71,7 @@ def _search_views(outcome: Outcome, block: Block, floor: float, views: IntArray)
         base, few = _base_fit(linear, outcome, rows), linear.thinned()
         seen = Residuals(linear, few, ground, place, image_sizes(block)[:, views], base, nothing, np.zeros(0))
         first = [replace(one, view=int(number[one.view])) for one in outs if number[one.view] >= 0]
-        return TermSearch(seen, first, floor, float(np.median(block.sigma))).run()
+        return TermSearch(seen, first, floor, float(np.median(block.sigma)), moving).run()
     except np.linalg.LinAlgError as error:  # priors so wide that rounding dominates the weakest mode
         logger.warning("the residuals of the tie points are not explained: %s", error)
         return Selection()
