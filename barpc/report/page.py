@@ -40,10 +40,10 @@ from barpc.report.summary.pairs import PairEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import capital, counted, known, largest, metres, two_digits
 from barpc.scene import connected_groups
-from barpc.sensor.sampler import NEGLIGIBLE_FIT_ERROR
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
+_ROUNDING = 1e-6  # px
 _SIGNIFICANT = 1e-4  # probability of the F test below which residuals are systematic: `SmoothTest.found`
 _FOOTER = (
     "Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of the first pixel. The numbers of this page "
@@ -352,11 +352,7 @@ def _files_section(files: RunFiles) -> Section | None:
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
     if not tables:
         return None
-    exact = (
-        "Not known for every image"
-        if worst is None
-        else f"Yes, to within {two_digits(max(worst, NEGLIGIBLE_FIT_ERROR))} px"
-    )
+    exact = "Not known for every image" if worst is None else f"Yes, to within {two_digits(max(worst, _ROUNDING))} px"
     answer = f"{exact}. The original images still carry the delivered RPC."
     return Section("files", "Do the new RPC files reproduce the corrected cameras?", answer, tables=tables)
 

@@ -503,9 +503,9 @@ def test_tie_points_of_a_view_count_together_at_most_as_the_floor_says(observati
 def test_what_a_camera_cannot_follow_is_as_good_as_fourteen_independent_errors(observations):
     counts, block, _ = observations
     use = np.ones(len(block.view), dtype=bool)
-    misfit = np.array([0.5, 2.0, 9.0])  # px
+    misfit = np.array([0.5, 2.0, 9.0])  # px; more than three would loosen the view that causes it
     weight = counts.weight(use, 1.0, misfit)
-    for v, size in enumerate(misfit):
+    for v, size in enumerate((0.5, 2.0, 3.0)):
         ties = (block.view == v) & (block.point < 10)
         free = ((1 / block.sigma[ties]) ** 2).sum()
         assert (weight[ties] ** 2).sum() == pytest.approx(min(free, 1 / (0.05**2 + size**2 / 14)), rel=1e-12)

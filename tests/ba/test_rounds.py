@@ -51,11 +51,11 @@ def moved_together(block: SimulatedBlock, view: int, share: float, by: float) ->
 
 
 def test_a_clean_block_is_solved_twice_and_nothing_is_looked_at_again(clean, monkeypatch) -> None:
-    again = seen(monkeypatch, solution, "agreeing")
+    again = seen(monkeypatch, rounds, "retriangulate_rejected"), seen(monkeypatch, solution, "agreeing")
     solves = seen(monkeypatch, rounds, "minimise")
     found = solve(clean, **CALM)
     assert found.status.startswith("2 passes of cutting")
-    assert again == []
+    assert again == ([], [])
     coarse, exact = (given[4] for given in solves)
     assert coarse > 1e-3  # the second pass follows always
     assert exact <= 1e-6
@@ -66,6 +66,19 @@ def test_rounds_go_on_until_the_noise_stands(clean) -> None:
     found = solve(replace(clean, tracks=tracks), **CALM)
     assert 2 <= int(found.status.split()[0]) <= 4
     assert found.noise == pytest.approx(5.0, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("outliers", "looked"), [pytest.param(0.05, True, marks=pytest.mark.slow), (0.008, True), (0.004, False)]
+)
+def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
+    again = seen(monkeypatch, rounds, "retriangulate_rejected")
+    dirty = simulate_block(3, 400, seed=5, outliers=outliers)
+    found = solve(dirty, **CALM)
+    assert 0.99 - 3 * outliers < found.inlier.mean() < 1.0
+    # before every pass but the first
+    assert len(again) == (int(found.status.split()[0]) - 1 if looked else 0)
 
 
 def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypatch) -> None:
@@ -319,8 +332,16 @@ def test_rounds_that_go_on_from_an_outcome_end_at_once_where_nothing_changes(
     assert passes(monkeypatch, cut, noise, prior, known=True)[0] == expected
 
 
-@pytest.mark.parametrize(("cut", "revived"), [([9], [2]), ([50, 101, 150, 150], [2, 3, 4])])
-def test_tracks_are_revived_before_every_pass_but_the_first(monkeypatch, cut, revived) -> None:
+@pytest.mark.parametrize(
+    ("cut", "revived"),
+    [
+        ([99], []),
+        ([101], [2]),  # more than a hundredth, and not before the first
+        ([101, 50, 50], [2]),
+        ([50, 101, 150, 150], [3, 4]),
+    ],
+)
+def test_tracks_are_revived_where_more_than_a_hundredth_was_cut(monkeypatch, cut, revived) -> None:
     assert passes(monkeypatch, cut, [1.0], [1.0])[1] == revived
 
 

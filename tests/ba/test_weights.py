@@ -89,7 +89,7 @@ def test_the_floor_is_that_of_every_stretch_of_a_spline() -> None:
         information = TRACKS / 0.1**2
         assert (weight**2).sum() == pytest.approx(min(information, stretches / 0.3**2))
     misfit = observations().weight(use, 1.0, np.array([2.0, 9.0])).reshape(2, 7)[:, :TRACKS]
-    np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 9.0**2])
+    np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 3.0**2])
 
 
 @pytest.mark.parametrize(

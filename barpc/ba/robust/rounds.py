@@ -41,6 +41,7 @@ logger = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # RMS of smooth parts [sigmas] above which they and the points are estimated alternately
 _MIN_NOISE_RATIO = 0.5  # least noise in the robust steps, observed over stated standard deviation
+_MANY_REJECTED = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
 _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
@@ -113,6 +114,7 @@ class Rounds:
         self.misfit: Array | float = 0.0
         if known is not None and self.goes_on:
             self.misfit = known.smooth.misfit()
+        self.scatter: Array | None = None  # residuals without smooth parts; None: not computed yet
         self.weight = self.counted
 
     def run(self, once: bool = False) -> Outcome:
@@ -138,7 +140,7 @@ class Rounds:
         """Return the result of `_robust`, with the cameras estimated from a sample of the tracks.
 
         Tracks are drawn until each view has `MANY` observations. The result is None if there are few views, a joint
-        prior, or a reference image. It is None if the sample has half of all observations or more. It is also None
+        prior, or a reference image. It is None if the sample is a quarter of all observations or more. It is also None
         if a view lost a significantly larger share of its sample than the others: its smooth part cannot be
         estimated from so few observations.
         """
@@ -150,7 +152,7 @@ class Rounds:
         chosen = np.isin(np.arange(structure.num_points), structure.point[~self.observations.is_tie])
         chosen[structure.point[order[np.arange(len(order)) - structure.bounds[structure.view] < MANY]]] = True
         rest = ~chosen[structure.point]
-        if rest.sum() <= 0.5 * len(rest):
+        if rest.sum() <= 0.75 * len(rest):
             return None
         part = self.block.without(rest)
         seen = make_structure(part.view, part.point, structure.num_views, structure.num_points, structure.place)
@@ -174,11 +176,13 @@ class Rounds:
         The outcome is returned by the last pass only; else None.
         """
         was_in_use = self.use
-        if self.passes:
+        many_rejected = self.use.sum() < (1.0 - _MANY_REJECTED) * self.everything.sum()
+        if self.passes and many_rejected:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = retriangulate_rejected(
                 self.problem, self.state, self.residual, self.use, weight, self.projected
             )
+            self.scatter = None
         self.problem = self.heights.hold(self.problem, self.state.points)
         self.passes += 1
         self._reject()
@@ -221,7 +225,8 @@ class Rounds:
 
     def _reject(self) -> None:
         """Reject observations by their residuals without the smooth part."""
-        s = self.observations.squared(self._scatter(), self.use.astype(np.float64))
+        scatter = self._scatter() if self.scatter is None else self.scatter
+        s = self.observations.squared(scatter, self.use.astype(np.float64))
         near = self.observations.is_near(s, CRITICAL * self.noise)
         self.use = self.observations.tied(self.everything & near)
 
@@ -246,7 +251,8 @@ class Rounds:
         """Estimate the noise and the misfit of the observations in use; return the test of their smooth part."""
         fit = self.smooth.fit(self.residual, self.counted)
         tested = self.smooth.test(self.residual, self.use, fit)
-        self.noise = self.observations.noise(self._scatter(fit), self.use, self.problem, 2 * NUM_TERMS * len(fit))
+        self.scatter = self._scatter(fit)
+        self.noise = self.observations.noise(self.scatter, self.use, self.problem, 2 * NUM_TERMS * len(fit))
         self.misfit = tested.misfit()
         return tested
 

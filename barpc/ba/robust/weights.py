@@ -17,6 +17,7 @@ from barpc.base.statistics import FEWEST, GROSS, OUTLIER
 from barpc.scene import BoolArray
 
 MEDIAN = 0.55  # median of a squared residual over its mean; 1 (two views) to 2 (many) degrees of freedom
+_LARGEST_MISFIT = 3.0  # px: upper limit; a larger misfit would take all weight from the view that causes it
 _LITTLE_NOISE = 0.04
 """Standard deviation of tie points [px] below which the noise floor is reduced in proportion to it.
 
@@ -110,7 +111,7 @@ class Observations:
         information, noise_px = np.maximum(own, self.told), np.sqrt(ties / np.maximum(own, 1e-300))
         # at least a tenth of the noise floor, because copies of an image have no noise
         common = (self.noise_floor * np.clip(noise_px / _LITTLE_NOISE, 0.1, 1.0)) ** 2
-        floor = common / self.stretches + np.square(misfit) / SPLINES
+        floor = common / self.stretches + np.minimum(misfit, _LARGEST_MISFIT) ** 2 / SPLINES
         cap = 1.0 / np.sqrt(np.maximum(information * floor, 1.0))
         count = self.structure.sum_views((use & self.of_reference).astype(np.float64)[None])[:, 0]
         reduction = np.sqrt(np.minimum(MAX_INDEPENDENT_ERRORS / np.maximum(count, 1.0), 1.0))

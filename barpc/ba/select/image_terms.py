@@ -20,7 +20,7 @@ from barpc.ba.terms.step import Step
 from barpc.ba.terms.term import Finding
 from barpc.base.geodesy import Array
 from barpc.base.options import AUTO, OFF, AdjustOptions
-from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SURE
+from barpc.base.statistics import CRITICAL, LARGEST, MUCH_NOISE, SURE, SURELY
 
 _SPACING = 2000.0  # rows between knots of the fewest splines: platforms oscillate with periods of seconds
 _SPLINE_FACTOR = 1.5  # ratio of successive numbers of splines: 7, 10, 15, 22, 33
@@ -115,7 +115,7 @@ def with_lines_lost(found: Solution, parts: Parts, options: AdjustOptions) -> So
         lines, sigma = float(pull[1] / known[1, 1]), float(known[1, 1] ** -0.5)
         misfit = float(pull @ np.linalg.solve(known, pull) - lines * pull[1])
         off = abs(lines - round(lines))
-        is_only_one = CRITICAL * sigma < 1.0 - off  # a pair may not observe the rows: any number would be nearly whole
+        is_only_one = SURELY * sigma < 1.0 - off  # a pair may not observe the rows: any number would be nearly whole
         if round(lines) and off < _LINE_TOLERANCE and is_only_one and misfit < CRITICAL**2:
             findings[at] = replace(one, kind=LinesLost.NAME, size=np.array([0.0, round(lines)]))
             index += [one.view * found.final.params.shape[1] + int(k) for k in own]

@@ -173,12 +173,14 @@ def _attempt(
     pair: Pair,
     options: TieOptions,
     looked: dict[str, _PairSearch] | None = None,
-    false_share: float = FALSE_SHARE,
+    false_share: float | None = None,
 ) -> tuple[Matches, PairReport]:
     """Match a pair by all passes of one matcher; searches in `looked` are shared between attempts.
 
-    `false_share`: the share of false matches that is accepted, larger in a second attempt.
+    `false_share`: the share of false matches that is accepted, by default `FALSE_SHARE`.
     """
+    looked = {} if looked is None else looked
+    false_share = FALSE_SHARE if false_share is None else false_share
     names, counts = (views[0].name, views[1].name), (len(keypoints[0]), len(keypoints[1]))
     known: dict[str, Any] = {"angle": pair.angle, "overlap": pair.overlap, "reason": pair.reason}
     report = PairReport(names, "ok", counts, matcher=options.matcher, loosened=false_share > FALSE_SHARE, **known)
@@ -186,7 +188,6 @@ def _attempt(
     if kind.detects and min(counts) < options.min_matches:
         return NO_MATCHES, replace(report, status="too few keypoints")
     loaded, numbers = _overlap_keypoints(views, keypoints, options.search)
-    looked = {} if looked is None else looked
     before = looked.get(options.matcher)
     search = _PairSearch(views, loaded, options) if before is None else before.loosened(loaded, options)
     looked[options.matcher] = search
