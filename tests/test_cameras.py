@@ -279,7 +279,6 @@ class Own:
         return self.inner.localize(image, alt)
 
 
-@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
     from barpc.pipeline import load_views

@@ -6,7 +6,7 @@ import pytest
 
 from tests.costs import allowed
 
-MOST = 280.0  # CPU seconds of all cases at a landing that say that they take longer
+MOST = 120.0  # CPU seconds of all cases at a landing that say that they take longer
 
 CASES = """
 import pytest, time

@@ -532,7 +532,6 @@ with Workspace(sys.argv[1], overwrite=sys.argv[4] == "overwrite", names=["a", "b
 """
 
 
-@pytest.mark.costs(4)
 @pytest.mark.skipif(os.name != "posix", reason="no SIGKILL here")
 @pytest.mark.parametrize(
     ("mode", "numbers"),

@@ -129,7 +129,9 @@ def checked_points(ground: npt.ArrayLike, image: npt.ArrayLike) -> tuple[Array, 
             raise FitError(f"points: {wrong:g} is not a {name}: are the columns swapped? Give lon, lat [deg], alt [m]")
     if not (np.abs(image) <= MAX_COORDINATE).all():
         raise FitError(f"points: {np.abs(image).max():g} px is no place in an image")
-    return np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]]), image
+    if np.ptp(ground[:, 0]) > 180.0:  # across the antimeridian; others are not copied
+        ground = np.column_stack([wrap_longitude(ground[:, 0], ground[0, 0]), ground[:, 1:]])
+    return ground, image
 
 
 def _checked_slope(ground: Array, image: Array) -> Array:

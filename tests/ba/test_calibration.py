@@ -124,7 +124,7 @@ def test_a_curve_that_changes_is_dated(sensor: Sensor) -> None:
     assert nats > 20.0
 
 
-@pytest.mark.costs(5)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_a_block_shows_its_own_curve_whole_and_none_of_another(found: Learnt, sensor: Sensor) -> None:
     for seed in range(3):

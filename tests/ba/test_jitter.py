@@ -336,7 +336,7 @@ def swings(rows: int, size: float, count: int, rng: np.random.Generator):
     return lambda row: size / largest * shape(row)
 
 
-@pytest.mark.costs(10)
+@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 0, 2, 3])

@@ -351,7 +351,6 @@ CASES = [
 ]
 
 
-@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("case", rest_slow(CASES, keep=2, mark=pytest.mark.nightly), ids=str)
@@ -439,7 +438,7 @@ def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.costs(10)
+@pytest.mark.costs(9)
 def test_ground_that_moved_beyond_a_row_of_all_images_is_no_jitter() -> None:
     """A fault of 1.2 m across the scan of four images: splines fit a half of it, and motion all that they had cut."""
     world = make("fault", 4)

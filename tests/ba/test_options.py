@@ -334,7 +334,6 @@ def test_views_turn_about_the_centre_that_is_asked_for(dirty):
         assert np.linalg.norm(far.center - near.center) > 1e4
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_no_terms_is_the_plain_model_and_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     block = simulate_block(3, 1500, seed=21)

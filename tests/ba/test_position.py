@@ -194,7 +194,6 @@ def test_accuracies_that_are_shared_are_in_the_summary() -> None:
     assert json_form(summary)["scene"]["prior_shared"] == pytest.approx(found.prior.shared)
 
 
-@pytest.mark.costs(5)
 @pytest.mark.slow
 def test_what_delivered_cameras_let_the_scene_be_off_by_is_what_it_is_off_by_held_or_not() -> None:
     """GCPs find where it was; the points that they hold do not make delivered cameras better."""

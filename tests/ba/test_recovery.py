@@ -157,7 +157,6 @@ def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
     assert block.held_out_rms(list(found.sensors)) < 0.02
 
 
-@pytest.mark.costs(6)
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([(3,), (1, 2, 3)], mark=pytest.mark.nightly))
 def test_drift_is_corrected_as_if_there_were_none(seeds):

@@ -98,7 +98,6 @@ def test_the_drift_is_learnt_as_large_as_it_is():
     assert 1.5 < three < 6.0
 
 
-@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_priors_three_times_too_narrow_are_widened_and_the_stated_place_with_them():
     found = verdicts("3 x the prior")

@@ -282,7 +282,7 @@ def test_a_dem_with_waves_places_a_scene_as_well_as_it_is_said_to(hills: bool, s
     assert np.sqrt(np.mean(np.square(off))) < (0.7 if hills else 0.85) * np.sqrt(np.mean(np.square(delivered)))
 
 
-@pytest.mark.costs(9)
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(

@@ -180,7 +180,6 @@ WORLDS: dict[str, tuple[tuple[Displacement, ...], int, dict[tuple[str, int], flo
 """What is displaced, the seed of the block, and what is to be named, with its size [px]."""
 
 
-@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.parametrize("world", rest_slow(WORLDS))
 def test_terms_are_named_that_together_explain_most_though_another_does_by_itself(sized, world: str) -> None:
@@ -202,7 +201,7 @@ def test_terms_are_named_that_together_explain_most_though_another_does_by_itsel
 
 
 @pytest.mark.slow
-@pytest.mark.costs(7)
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.few(1)
 @pytest.mark.parametrize("seed", [41, 43, 5, 9, 13])

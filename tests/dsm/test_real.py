@@ -49,7 +49,7 @@ def test_pairs_of_the_triplet_by_delivered_cameras_do_not_agree(run, surface, tm
     assert surface[0].nmad < 0.5 * before.nmad
 
 
-@pytest.mark.costs(8)
+@pytest.mark.costs(6)
 def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre(surface):
     after = surface[0]
     assert after.pairs[0] == "img_01 - img_03"  # the largest angle

@@ -67,7 +67,6 @@ def sound(folder: Path) -> None:
     assert {one.now for one in prove(folder)} <= set(PASSED_STATES)
 
 
-@pytest.mark.costs(3)
 def test_an_image_alone_is_added_to_a_run(eleven: Path, archive: Path, made: SimulatedBlock, tmp_path: Path) -> None:
     """Its camera is written, those of the run are not, and what they should do is said."""
     before = {path: path.read_bytes() for path in (eleven / "first").rglob("*") if path.is_file()}

@@ -62,7 +62,7 @@ def test_a_run_with_exchanged_rpcs_ends_or_leaves_them_out(tmp_path: Path, keep_
         barpc.check(given, points_per_image=500)
 
 
-@pytest.mark.costs(8)
+@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("order", rest_slow([*ORDERS, (1, 0)], 2, mark=pytest.mark.nightly))

@@ -47,7 +47,6 @@ def spread(views, tracks, i: int, j: int) -> float:
     return robust_spread(coherent(first, epipolar_segments(views[i], views[j], first).errors(second)[:, 1])[1])
 
 
-@pytest.mark.costs(5)
 @pytest.mark.slow
 def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tmp_path) -> None:
     images = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))

@@ -88,7 +88,7 @@ def test_cameras_that_do_not_agree_with_new_images_are_said_to(tmp_path: Path) -
     assert found.record.status == "look"
 
 
-@pytest.mark.costs(8)
+@pytest.mark.costs(5)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (0, 2, 1)])

@@ -135,7 +135,6 @@ def test_a_later_run_goes_on_from_an_earlier_block(known, matched, tmp_path):
         adjust(known.images, tmp_path / "none", RunOptions(add_to=str(tmp_path)))
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_a_dem_holds_heights_and_says_what_it_took(shared_data, tmp_path):
     source = shared_data / "optical/phr_ventoux"

@@ -183,7 +183,6 @@ def test_samples_opened_where_they_are_and_after_their_images_moved(tmp_path):
         assert barpc.open_run(tmp_path / "other/run").views[2].sensor == result.views[2].sensor
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_a_real_run_with_text_files_alone_and_its_matches_again(shared_data, tmp_path):
     images = sorted((shared_data / "optical/phr_triplet_north").glob("*.tif"))

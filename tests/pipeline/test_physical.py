@@ -52,7 +52,6 @@ def images(folder):
     return [f"{path},model=physical" for path in sorted(folder.glob("*.tif"))]
 
 
-@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 def test_an_adjustment_on_physical_models(folder, tmp_path):

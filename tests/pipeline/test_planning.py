@@ -69,7 +69,6 @@ def test_memory_grows_with_processes_and_images():
     assert one.memory_mb < three.memory_mb
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_the_pairs_and_the_time_are_those_of_the_run(shared_data, tmp_path):
     """CPU within a factor of four: cores differ."""

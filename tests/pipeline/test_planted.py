@@ -30,7 +30,7 @@ def start(shared_data):
     return made
 
 
-@pytest.mark.costs(18)
+@pytest.mark.costs(9)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize(

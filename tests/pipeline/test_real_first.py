@@ -15,7 +15,7 @@ from benchmarks import real_crops
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.costs(12)
+@pytest.mark.costs(7)
 @pytest.mark.parametrize(
     ("name", "parts"),
     [

@@ -187,7 +187,7 @@ def coarser(path, step: float, folder):
     return write_image(folder / f"{path.stem}_{step:g}.tif", pixels, **how)
 
 
-@pytest.mark.costs(4)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
 @pytest.mark.parametrize(

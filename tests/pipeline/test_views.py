@@ -300,7 +300,6 @@ def test_a_copy_in_another_folder_is_found_whatever_its_name(pair, tmp_path) -> 
     refused([pair[0], Path(copy)], r"z\.tif: shows the same pixels as .*a\.tif")
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_an_image_that_its_rpc_is_not_for_is_left_out_and_said(corner, tmp_path) -> None:
     """Mirrored, as some readers write images: the two others are adjusted as without it."""

@@ -61,7 +61,6 @@ def as_jp2(path: Path) -> Path:
     return target
 
 
-@pytest.mark.costs(4)
 @pytest.mark.parametrize(
     ("images", "levels"),
     [

@@ -174,7 +174,6 @@ def test_no_verb_is_silent_about_an_edit(project, undisturbed, tmp_path, monkeyp
     assert refused == refused_by
 
 
-@pytest.mark.costs(3)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["all is moved", "all is copied", "the runs are copied", "the inputs are beside"])

@@ -33,7 +33,7 @@ def sweep(trials: int, seed: int) -> dict[str, object]:
     return json.loads(done.stdout)
 
 
-@pytest.mark.costs(14)
+@pytest.mark.costs(4)
 @posix
 @pytest.mark.parametrize(
     "trials", [pytest.param(2, marks=pytest.mark.slow), pytest.param(50, marks=pytest.mark.nightly)]
@@ -92,7 +92,6 @@ def wide(tmp_path_factory) -> list[Path]:
     return [crop(path, folder / path.name, side=360, start=300) for path in SAMPLES[:2]]
 
 
-@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @posix
 @pytest.mark.slow
@@ -155,7 +154,6 @@ def test_a_worker_that_dies_is_one_line_and_the_same_command_goes_on(wide, tmp_p
     assert outputs(tmp_path / "out") == outputs(tmp_path / "alone")
 
 
-@pytest.mark.costs(4)
 @posix
 @pytest.mark.slow
 def test_workers_end_with_a_parent_that_was_killed(wide, tmp_path):

@@ -169,7 +169,6 @@ def test_a_worker_says_what_its_own_memory_is(monkeypatch) -> None:
     assert outcome[2] is MAPPED
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.landing(2)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems bound no address space")

@@ -48,7 +48,7 @@ def test_a_rerun_gives_the_same_bytes(scene, alone):
     assert outputs(scene / "again") == alone
 
 
-@pytest.mark.costs(9)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", rest_slow([2, 4], mark=pytest.mark.nightly))
 def test_any_number_of_workers_gives_the_same_bytes(scene, alone, jobs):

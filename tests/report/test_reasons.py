@@ -49,7 +49,6 @@ def test_an_option_in_a_remedy_is_one_of_its_table():
     assert "min_overlap" in declared(TieOptions)
 
 
-@pytest.mark.costs(4)
 @pytest.mark.slow
 def test_every_flag_that_any_message_names_exists_in_some_verb():
     known = {"--help", "--version"}.union(

@@ -52,7 +52,6 @@ def test_a_pair_with_a_jump_says_by_how_much_heights_behind_are_off() -> None:
     assert not summarize(run).passed
 
 
-@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.few(1)

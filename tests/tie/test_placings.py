@@ -71,7 +71,7 @@ def test_a_picture_that_lies_otherwise_is_named_and_how(render, tmp_path, how: s
     assert caught.value.groups == (tuple(v.name for k, v in enumerate(views) if k != wrong), (name,))
 
 
-@pytest.mark.costs(7)
+@pytest.mark.costs(4)
 @pytest.mark.landing(1)
 @pytest.mark.slow
 @pytest.mark.parametrize("how", LAID)

@@ -196,7 +196,7 @@ def heights(shared_data: Path, lonlat: Array) -> Array:
         return dem.read(1)[row, col].astype(float) + GEOID
 
 
-@pytest.mark.costs(5)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("number", rest_slow(range(4), mark=pytest.mark.nightly))
 def test_a_satellite_and_an_aerial_camera_are_tied_over_twelve_years(shared_data, number) -> None:

@@ -77,7 +77,7 @@ def test_registration_more_than_halves_the_spread_of_keypoints_on_steep_ground(v
     assert robust_spread(residual) <= 0.45 * raw_spread(ventoux)[0, 1]
 
 
-@pytest.mark.costs(4)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_matches_are_many_and_hardly_any_is_false(triplet, triplet_ties: TieResult, every_tie) -> None:
     areas = [w * h / 1e6 for w, h in (view.size for view in triplet)]

@@ -87,7 +87,7 @@ def shifted(view: View, px: tuple[float, float]) -> View:
     return replace(view, sensor=replace(sensor, image_offset=sensor.image_offset + px))
 
 
-@pytest.mark.costs(7)
+@pytest.mark.costs(4)
 @pytest.mark.slow
 @pytest.mark.parametrize("px", rest_slow([(120.0, -90.0), (0.0, 0.0)], mark=pytest.mark.nightly))
 def test_the_camera_is_off_by_what_was_done_to_it(px, views, reference, dem, truth):

@@ -278,7 +278,6 @@ def test_real_crops_of_a_few_hundred_pixels_are_tied_at_any_two_resolutions(
     assert ("by keypoints" in result.pairs[0].means) == (coarsest.max() == 4 and coarsest.min() == 4)
 
 
-@pytest.mark.costs(3)
 @pytest.mark.slow
 @pytest.mark.parametrize("swapped", rest_slow([False, True], mark=pytest.mark.nightly))
 def test_a_multispectral_image_is_tied_to_the_panchromatic_one_of_the_other_view(

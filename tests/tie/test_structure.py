@@ -57,7 +57,7 @@ def tied(winter):
     return find_tracks(winter)
 
 
-@pytest.mark.costs(7)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, tied) -> None:
     report = tied.pairs[0]

@@ -204,7 +204,7 @@ def moved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array(cv2.phaseCorrelate(a.astype(np.float64), b.astype(np.float64), window)[0])
 
 
-@pytest.mark.costs(6)
+@pytest.mark.costs(3)
 @pytest.mark.slow
 def test_orthoimages_of_one_scene_lie_on_each_other(tmp_path):
     """Rendered views of bare ground, 25 degrees apart: their maps agree on true heights, and not on a level."""
