@@ -25,7 +25,7 @@ from barpc.rasters.raster import GRID_TAG, driver_at, driver_of, earth_crs, open
 from barpc.rpcio import read_rpc_source
 from barpc.rpcio.formats import SIGN
 from barpc.rpcio.plausible import RasterFrame, corners_off, doubts_of
-from barpc.rpcio.sources import at_tile, described, metadata_beside, only_physical, scene_beside
+from barpc.rpcio.sources import at_tile, metadata_beside, only_physical, scene_beside, stated_in_xml
 from barpc.scene import Camera, View
 from barpc.sensor import SensorModel
 from barpc.sensor.rpc import RPC, altitude_range
@@ -134,15 +134,15 @@ def open_split(path: PathOrUrl, texts: Mapping[str, str], **choices: Any) -> Cam
         size = None if frame is None else frame.size
     if opener.whole and size not in (None, camera.size):
         raise InputError(f"{path}: is {size} px large, its physical model in {camera.path} of {camera.size}")
-    return _doubted(camera if size is None else replace(camera, size=size), frame)
+    return _with_doubts(camera if size is None else replace(camera, size=size), frame)
 
 
-def checked(camera: Camera, dataset: Any) -> Camera:
+def checked_camera(camera: Camera, dataset: Any) -> Camera:
     """Return a camera with the doubts that the open raster of its image raises."""
-    return _doubted(camera, _frame(dataset))
+    return _with_doubts(camera, _frame(dataset))
 
 
-def _doubted(camera: Camera, frame: RasterFrame | None) -> Camera:
+def _with_doubts(camera: Camera, frame: RasterFrame | None) -> Camera:
     if camera.size is None or not isinstance(camera.model, RPC):
         return camera
     return replace(camera, doubts=doubts_of(camera.model, camera.size, frame))
@@ -241,7 +241,7 @@ def _open_rpc(path: PathOrUrl, first_pixel: float | None = None, band: int = 1) 
     source = read_rpc_source(path, first_pixel=first_pixel, band=band)
     size, notes = source.size, source.notes
     if source.path == path and source.format in ("xml", "dimap"):  # given alone: it speaks of its whole image
-        size, physical = described(path)
+        size, physical = stated_in_xml(path)
         if physical:
             notes = (*notes, "it holds a physical camera model, too: FILE,model=physical")
     return Camera(source.rpc, source.path, source.format, size, altitude_range(source.rpc), notes)

@@ -15,7 +15,7 @@ from barpc.pointio.gcp_tables import KNOWN
 from barpc.pointio.tables import COLUMNS
 from barpc.rasters.raster import DRIVERS, MOSAICS
 from barpc.rpcio.formats import CARRIERS, FORMATS
-from barpc.rpcio.sources import _OWN, _sidecar_names
+from barpc.rpcio.sources import _RPC_READERS, _sidecar_names
 
 PAGE = Path(__file__).with_name("formats.md")
 BEGIN = "<!-- Written by docs/generate_formats.py -->"
@@ -45,8 +45,8 @@ def sources() -> list[str]:
     found: dict[str, bool] = {}
     for kind, name, before in _sidecar_names(f"{IMAGE}.tif"):
         found.setdefault(PRODUCTS.get(kind, f"`{name.replace(IMAGE, 'X')}`"), before)
-    last = sorted({*DRIVERS.values(), "ENVI"} - _OWN.keys() - {*MOSAICS})
-    own = f"**the image's own** ({', '.join(_OWN)})"
+    last = sorted({*DRIVERS.values(), "ENVI"} - _RPC_READERS.keys() - {*MOSAICS})
+    own = f"**the image's own** ({', '.join(_RPC_READERS)})"
     order = [*(name for name in found if found[name]), own, *(name for name in found if not found[name])]
     return [*order, f"what GDAL shows of {', '.join(last)}"]
 

@@ -138,7 +138,7 @@ def _solved_adjustment(
         found.heights.warn()
         _warn(found.outcome)
         whole = replace(_adjustment(model, found, options, common), altimetry=heights)
-        whole = _with_unseen(whole, found, parts.inner)
+        whole = _with_undetectable(whole, found, parts.inner)
         if apart is None or not apart.clear:
             return replace(whole, apart=apart)
         return _with_foreign_view(whole, apart, found, parts.inner, given)
@@ -324,7 +324,7 @@ def _scene_accuracy(found: Solution, block: Block, covariance: Covariance) -> tu
     return gauge, shares
 
 
-def _with_unseen(whole: Adjustment, found: Solution, block: Block) -> Adjustment:
+def _with_undetectable(whole: Adjustment, found: Solution, block: Block) -> Adjustment:
     """Return the result; for two images without findings, with the uncertainty by undetectable displacements."""
     cameras = found.problem.cameras
     index = np.flatnonzero(np.isfinite(whole.points[:, 0]) & ~whole.held)

@@ -92,7 +92,7 @@ def unseen_steps(
     shown, by_heights = _by_heights(ground, steps * pull[..., None], known)
     for v, axis in np.ndindex(2, 2):
         smooth = np.vander(2.0 * image[:, v, axis] / sizes[v, axis] - 1.0, DRIFTS)  # absorbed by the cameras
-        seen, even = (_residuals(smooth, s) for s in (steps[:, v, axis] * across[:, v, axis, None], steps[:, v, axis]))
+        seen, even = (_rough(smooth, s) for s in (steps[:, v, axis] * across[:, v, axis, None], steps[:, v, axis]))
         size = np.linalg.norm(seen, axis=0) / np.sqrt(sigma**2 + floor**2 * (even**2).sum(axis=0))
         limit = least / np.maximum(size, least / LARGEST_STEPS[axis])
         found[v, axis] = np.median(np.minimum(limit, by_heights[v, axis]))
@@ -116,7 +116,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
     at = (at - at[fits].mean(axis=0)) * metres_per_unit(ground[0])[:2]
     fits[fits] = without_outliers(error[fits])
     smooth, columns = quadratic_basis(at / np.abs(at[fits]).max()), rises.reshape(len(rises), -1)
-    error, columns = _residuals(smooth[fits], error[fits, None])[:, 0], _residuals(smooth[fits], columns[fits])
+    error, columns = _rough(smooth[fits], error[fits, None])[:, 0], _rough(smooth[fits], columns[fits])
     square = np.maximum((columns**2).sum(axis=0), 1e-9)
     pixels = columns.T @ error / square
     best = int(np.argmax(pixels**2 * square))
@@ -130,7 +130,7 @@ def _by_heights(ground: Array, rises: Array, known: Array) -> tuple[Shown | None
     return shown if is_shown else None, np.maximum(CRITICAL * sigma, np.abs(pixels)).reshape(limits.shape)
 
 
-def _residuals(smooth: Array, columns: Array) -> Array:
+def _rough(smooth: Array, columns: Array) -> Array:
     """Return the residuals of columns (n, k) after a least-squares fit of smooth columns (n, m)."""
     return np.asarray(columns - smooth @ np.linalg.lstsq(smooth, columns, rcond=None)[0])
 

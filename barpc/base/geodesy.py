@@ -19,6 +19,9 @@ from barpc.base.errors import InputError
 Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+ByteImage = npt.NDArray[np.uint8]
+Box = tuple[int, int, int, int]
+"""Pixels of an image: col, row of the first one, width, height [px]."""
 
 WGS84_A = 6378137.0  # semi-major axis [m]
 WGS84_F = 1.0 / 298.257223563  # flattening

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 
 _MAPS = Path("/proc/self/maps")
-_NAMES = [f"{prefix}openblas_%s_num_threads{suffix}" for prefix, suffix in product(("scipy_", ""), ("64_", ""))]
+_BLAS_NAMES = [f"{prefix}openblas_%s_num_threads{suffix}" for prefix, suffix in product(("scipy_", ""), ("64_", ""))]
 
 
 def peak_memory() -> int:
@@ -52,6 +52,6 @@ def _switches() -> Iterator[tuple[Callable[[], int], Callable[[int], object]]]:
     for path in sorted({line.split(maxsplit=5)[-1] for line in lines if "openblas" in line.rpartition("/")[2]}):
         with suppress(OSError):
             library = ctypes.CDLL(path)
-            for name in _NAMES:
+            for name in _BLAS_NAMES:
                 if hasattr(library, name % "set"):
                     yield getattr(library, name % "get"), getattr(library, name % "set")

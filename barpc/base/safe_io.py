@@ -32,9 +32,9 @@ MB = 1 << 20
 BYTES_PER_NUMBER = 8
 """Bytes of what an element of a file becomes in memory, however small it is kept there."""
 MAX_XML = 32 * MB  # the largest in use, a day of precise orbits, has 5 MB
-_FLAGS = os.O_RDONLY
-for _flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
-    _FLAGS |= getattr(os, _flag, 0)
+_OPEN_FLAGS = os.O_RDONLY
+for _system_flag in ("O_NONBLOCK", "O_CLOEXEC", "O_NOCTTY", "O_BINARY"):  # not every system has all
+    _OPEN_FLAGS |= getattr(os, _system_flag, 0)
 _KINDS = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
 _ENCODING_BYTES, _MIN_LETTERS = 16, 4  # bytes that tell an encoding; letters of them, at least
 
@@ -123,7 +123,7 @@ def _regular(path: Path | str, kind: Kind) -> io.BufferedReader:
         kind.check(path, elsewhere.size)
         return io.BufferedReader(elsewhere, REQUEST_BYTES)
     try:
-        descriptor = os.open(path, _FLAGS)
+        descriptor = os.open(path, _OPEN_FLAGS)
     except (FileNotFoundError, NotADirectoryError):
         raise kind.error(f"{path}: no such file; {kind.words} is needed") from None
     except ValueError as error:  # a zero byte in the name

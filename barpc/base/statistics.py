@@ -141,11 +141,11 @@ def robust_spread(values: Array, center: float | Array = 0.0) -> Any:
     if not len(values):
         return 0.0
     distance = np.abs(values - center)
-    spread = MAD * (np.median(distance, axis=-1) if distance.ndim > 1 else _median(distance))
+    spread = MAD * (np.median(distance, axis=-1) if distance.ndim > 1 else _quick_median(distance))
     return spread if spread.ndim else float(spread)
 
 
-def _median(values: Array) -> Any:
+def _quick_median(values: Array) -> Any:
     """Return the median of values (n,), NaN where one is: `np.median`, which takes six times as long for a hundred."""
     middle = len(values) // 2
     part = np.partition(values, [middle - 1, middle, -1] if len(values) > 1 else 0)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, paper, run_options, with_flags
+from barpc.cli.flags import ADJUSTMENT, MATCH, RUN, TIE, Grouped, image_paths, options_of_flags, paper, with_flags
 from barpc.cli.process import Kept
 from barpc.cli.terminal import EXIT_GATE, at_work, is_quiet, output_width, print_summary, tell, tell_gate, wants_json
 
@@ -88,7 +88,7 @@ def check(**flags: Any) -> int:
 
 def _run_pipeline(work: Callable[..., Any], flags: dict[str, Any], tell_of: Callable[[Any], int] | None = None) -> int:
     """Run a verb of the pipeline with the options of the flags, and print the result."""
-    options, where = run_options(flags, flags["options_file"]), [flags["out_dir"]] if "out_dir" in flags else []
+    options, where = options_of_flags(flags, flags["options_file"]), [flags["out_dir"]] if "out_dir" in flags else []
     images = image_paths(flags["images"], flags["image_list"], options.keep_going)
     kept = click.get_current_context().find_object(Kept) or Kept()
     kept.folder = Path(where[0]) if where and where[0] else None

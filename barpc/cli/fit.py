@@ -8,7 +8,7 @@ import click
 
 from barpc.base.declarations import declared
 from barpc.base.verb_options import RefitOptions
-from barpc.cli.flags import flag, flags_of, given_flags, paper, run_options
+from barpc.cli.flags import flag, flags_of, given_flags, options_of_flags, paper
 from barpc.cli.terminal import at_work, tell, tell_gate, wants_json
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ def fit(source: str, output: str | None, **flags: Any) -> int:
     """
     from barpc.verbs.fitting import fitted
 
-    options, own = run_options(flags, flags["options_file"]), {name: flags[name] for name in declared(RefitOptions)}
+    options = options_of_flags(flags, flags["options_file"])
+    own = {name: flags[name] for name in declared(RefitOptions)}
     with at_work() as progress:
         done = fitted(source, output, options, given_flags(own), progress)
     verdict = done.verdict

@@ -226,7 +226,7 @@ _RUN_OPTIONS = (
 )
 
 
-def run_options(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
+def options_of_flags(flags: Mapping[str, Any], options_file: str | None) -> RunOptions:
     """Return defaults, or the paper's options, then the options file, then the flags that were given."""
     options = with_values(RunOptions(), PAPER if flags.get("paper") else {})
     options = options if options_file is None else read_options(options_file, options)

@@ -113,7 +113,7 @@ def triangulate(images: tuple[str, ...], at: tuple[tuple[float, float], ...], po
 # --- tables of points -------------------------------------------------------------------------------------
 
 
-_POINTS = replace(TABLE, empty=True)  # no points, as standard input may have none
+_POINT_TABLE = replace(TABLE, empty=True)  # no points, as standard input may have none
 
 
 def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str], fill: float | None = None) -> Array:
@@ -123,7 +123,7 @@ def given_points(numbers: Sequence[float], file: str | None, names: Sequence[str
     column where it is not given.
     """
     if file is not None:
-        with nullcontext(sys.stdin) if file == "-" else opened_text(file, _POINTS, newline="") as stream:
+        with nullcontext(sys.stdin) if file == "-" else opened_text(file, _POINT_TABLE, newline="") as stream:
             return _point_table(stream, file, names, fill)
     width = len(names) if fill is None else len(names) - 1
     if not numbers or len(numbers) % width:

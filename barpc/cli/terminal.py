@@ -124,7 +124,7 @@ def print_summary(summary: Summary) -> None:
             commands = (_COMMAND + command.replace(" . ", f" {folder} ") for command in step.commands)
             steps += [step.text, *commands]
     if _general("verbose"):
-        for title, texts, more in _tables(summary):
+        for title, texts, more in _printed_tables(summary):
             _echo_table(title, texts, width, more)
     else:
         counted = width and max(width, _TERMINAL_COLUMNS)  # nothing is dropped because a terminal is narrow
@@ -146,7 +146,7 @@ def _fitting(groups: Sequence[Sequence[str]], room: int, width: int | None) -> I
         yield [line for line, _ in taken]
 
 
-def _tables(summary: Summary) -> list[tuple[str, list[list[str]], str]]:
+def _printed_tables(summary: Summary) -> list[tuple[str, list[list[str]], str]]:
     """Return titles, cells and a remark on omitted rows: of many rows the worst of those beyond a limit are kept."""
     from barpc.report import ranking
     from barpc.report.records import table

@@ -68,7 +68,7 @@ _MAX_DISPARITY_SPAN = (
 )
 _COARSE = 8  # times a pixel at most of the coarser picture
 _SPLIT = 3  # times that a part is halved at most
-_TRIED = 400  # matches that make a cubic, and as many that test it
+_CUBIC_MATCHES = 400  # matches that make a cubic, and as many that test it
 _EXACT = 1e-3  # m: errors of a cubic in place of intersections; of Pleiades' 2e-6
 
 TilePoints = tuple[Array, Array, float, float]
@@ -204,10 +204,10 @@ def _intersected(pair: tuple[View, View], tile: Tile, found: DenseMatches) -> Ar
     if len(points) > CHUNK:
         middle, size = found.place.mean(axis=1, keepdims=True), np.ptp(found.place, axis=1, keepdims=True) + 1.0
         ends = np.concatenate([found.place.argmin(axis=1), found.place.argmax(axis=1)])
-        tried = np.append(np.random.default_rng(0).choice(len(points), 2 * _TRIED, replace=False), ends)
+        tried = np.append(np.random.default_rng(0).choice(len(points), 2 * _CUBIC_MATCHES, replace=False), ends)
         exact, terms = intersected(tried), basis(tried).T
         if np.isfinite(exact).all():
-            coeffs = np.linalg.lstsq(terms[:_TRIED], exact[:_TRIED] - exact[0], rcond=None)[0]
+            coeffs = np.linalg.lstsq(terms[:_CUBIC_MATCHES], exact[:_CUBIC_MATCHES] - exact[0], rcond=None)[0]
             if np.abs(terms @ coeffs + exact[0] - exact).max() < _EXACT:
                 for part in parts(len(points)):
                     points[part] = basis(part).T @ coeffs + exact[0]

@@ -64,7 +64,7 @@ from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
-BANDS = (
+SURFACE_BANDS = (
     "height above the WGS84 ellipsoid [m]",
     "pairs of images",
     "disagreement of the pairs: NMAD [m]",
@@ -243,7 +243,7 @@ class Grid:
     def _bands(self, tile: Tile, groups: Groups, results: Sequence[Sequence[F32]], shared: Array) -> F32:
         """Return the bands (5, rows, cols) of a tile: of one group of pairs, or of the first minus the second."""
         height, *minus = (one[0] for one in results)
-        bands, errors = np.full((len(BANDS), *height.shape), np.nan, np.float32), self.block.errors
+        bands, errors = np.full((len(SURFACE_BANDS), *height.shape), np.nan, np.float32), self.block.errors
         bands[0], bands[1], bands[2] = height - sum(minus), 0.0, np.sqrt(sum(one[1] ** 2 for one in results))
         known, seen = np.isfinite(bands[0]), np.stack([np.asarray(one[3], np.int64) for one in results])
         for patterns in np.unique(seen[:, known], axis=1).T:
@@ -276,9 +276,9 @@ class Grid:
         kind = {"dtype": "float32", "nodata": float("nan"), "compress": "deflate"}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            file = rasterio.open(path, "w", "GTiff", *cells.size, len(BANDS), **place, **kind, **layout)
+            file = rasterio.open(path, "w", "GTiff", *cells.size, len(SURFACE_BANDS), **place, **kind, **layout)
         file.update_tags(BARPC=__version__, VERTICAL_REFERENCE="WGS84 ellipsoid", IMAGES=self.block.source)
-        file.descriptions = (BANDS[0] if len(self.block.groups) == 1 else CHANGE, *BANDS[1:])
+        file.descriptions = (SURFACE_BANDS[0] if len(self.block.groups) == 1 else CHANGE, *SURFACE_BANDS[1:])
         return file
 
 

@@ -14,28 +14,26 @@ import numpy as np
 import numpy.typing as npt
 
 from barpc.base.errors import InputError, UsageError
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, Box, ByteImage
 from barpc.base.remote import is_url
 from barpc.base.verb_options import ExportOptions
-from barpc.export.files import Files, as_json, ply
+from barpc.export.files import FileContents, as_json, ply
 from barpc.export.light import lit
 from barpc.export.pinholes import Picture, Pinhole, mapped, pictures_of, pinhole_of
-from barpc.export.shots import Scene, Shot, Window, relative_link
+from barpc.export.shots import Scene, Shot, relative_link
 from barpc.rasters.raster import open_raster
 from barpc.report.records import flat_options
 from barpc.scene import BoolArray, IntArray
 
-ByteImage = npt.NDArray[np.uint8]
-
-TOLERANCE = 0.1
+PINHOLE_TOLERANCE = 0.1
 """px that a picture's pinhole may miss: as much as tie points of good images scatter (0.04 to 0.2 px)."""
 _CORNER = 0.5  # px from the corner of the first pixel, where COLMAP counts from, to its centre
-_MARGIN = 8  # px around what a picture shows: of the spline
+_SPLINE_MARGIN = 8  # px around what a picture shows: of the spline
 _GCP_NODES = 5  # a side: GDAL's polynomials of order 2 follow the homographies of satellites to 1e-4 px
 
 
 @dataclass(frozen=True, eq=False)
-class _Entry:
+class _ModelImage:
     """An image of the model: its name in ``images``, size, camera, largest error [px] and tie points.
 
     `index` (n,), `xy` (n, 2): tie points, places among the scene's points, and where the picture shows them [px],
@@ -52,7 +50,7 @@ class _Entry:
     picture: Picture | None = None
 
 
-def colmap(scene: Scene, out: Path, how: ExportOptions) -> Files:
+def colmap(scene: Scene, out: Path, how: ExportOptions) -> FileContents:
     """Write a model of pinhole cameras in COLMAP's text, tie points as PLY, and ``transforms.json`` of nerfstudio.
 
     ``world.json`` places the model on Earth. Cameras are central: square pixels, the principal point in the middle; the
@@ -69,17 +67,19 @@ def colmap(scene: Scene, out: Path, how: ExportOptions) -> Files:
     scene = lit(scene, needed=False)
     if how.exact:
         entries = _whole_images(scene)
-        return _model(scene, out, entries, np.full((len(scene.points), 3), 128, np.uint8))
-    tolerance = TOLERANCE if how.tolerance is None else how.tolerance
+        return _written_model(scene, out, entries, np.full((len(scene.points), 3), 128, np.uint8))
+    tolerance = PINHOLE_TOLERANCE if how.tolerance is None else how.tolerance
     entries = _pictures(scene, tolerance, ".png" if how.images else ".tif")
-    pixels = {shot.name: _Pixels(shot) for shot in scene.shots}
-    files = _model(scene, out, entries, _colours(scene, entries, pixels), masks=how.images, tolerance_px=tolerance)
+    pixels = {shot.name: _ShotPixels(shot) for shot in scene.shots}
+    files = _written_model(
+        scene, out, entries, _colours(scene, entries, pixels), masks=how.images, tolerance_px=tolerance
+    )
     if how.images:
         return {**files, **_resampled(entries, pixels)}
     return {**files, **_for_gdal(entries, pixels, out)}
 
 
-def _whole_images(scene: Scene) -> list[_Entry]:
+def _whole_images(scene: Scene) -> list[_ModelImage]:
     entries = []
     for shot, name in zip(scene.shots, _called(scene), strict=True):
         if any(char.isspace() for char in name):
@@ -87,11 +87,11 @@ def _whole_images(scene: Scene) -> list[_Entry]:
                 f"{shot.file}: COLMAP ends the name of an image at a space; rename it, or give a link without one"
             )
         pinhole, error = pinhole_of(scene, shot)
-        entries.append(_Entry(shot, name, shot.size, pinhole, error, shot.index, shot.xy + _CORNER))
+        entries.append(_ModelImage(shot, name, shot.size, pinhole, error, shot.index, shot.xy + _CORNER))
     return entries
 
 
-def _pictures(scene: Scene, tolerance: float, suffix: str) -> list[_Entry]:
+def _pictures(scene: Scene, tolerance: float, suffix: str) -> list[_ModelImage]:
     """Return the pictures of all images; a tie point is of the part that holds it, so that it counts once an image."""
     entries = []
     for shot, name in zip(scene.shots, _called(scene), strict=True):
@@ -107,7 +107,7 @@ def _pictures(scene: Scene, tolerance: float, suffix: str) -> list[_Entry]:
             )
             xy = mapped(picture.inverse, shot.xy[inside] + _CORNER)
             one = picture.size, picture.pinhole, picture.error, shot.index[inside], xy, picture
-            entries.append(_Entry(shot, f"{stem}{place}{suffix}", *one))
+            entries.append(_ModelImage(shot, f"{stem}{place}{suffix}", *one))
     if len({one.name for one in entries}) < len(entries):
         entries = [replace(one, name=f"{k}_{one.name}") for k, one in enumerate(entries)]
     return entries
@@ -116,9 +116,9 @@ def _pictures(scene: Scene, tolerance: float, suffix: str) -> list[_Entry]:
 # --- the model ----------------------------------------------------------------------------------------------
 
 
-def _model(
-    scene: Scene, out: Path, entries: Sequence[_Entry], colours: ByteImage, masks: bool = False, **about: Any
-) -> Files:
+def _written_model(
+    scene: Scene, out: Path, entries: Sequence[_ModelImage], colours: ByteImage, masks: bool = False, **about: Any
+) -> FileContents:
     """Return the text model, its points and ``transforms.json``, and ``world.json`` with more keys, `about` it."""
     from scipy.spatial.transform import Rotation  # of no other tool
 
@@ -153,7 +153,7 @@ def _model(
     }
 
 
-def _transforms(entries: Iterable[_Entry], masks: bool) -> dict[str, Any]:
+def _transforms(entries: Iterable[_ModelImage], masks: bool) -> dict[str, Any]:
     """Return the cameras in nerfstudio's JSON: they look along -z, y is up."""
     frames = []
     for one in entries:
@@ -167,7 +167,7 @@ def _transforms(entries: Iterable[_Entry], masks: bool) -> dict[str, Any]:
     return {"camera_model": "PINHOLE", "frames": frames, "ply_file_path": "sparse/0/points3D.ply"}
 
 
-def _world(scene: Scene, entries: Sequence[_Entry], out: Path) -> dict[str, Any]:
+def _world(scene: Scene, entries: Sequence[_ModelImage], out: Path) -> dict[str, Any]:
     """Return the place of the model on Earth, and the image and homography of each picture."""
     lon, lat, alt = scene.origin
     found: dict[str, Any] = {
@@ -218,7 +218,7 @@ def _text_line(*values: float | str) -> str:
 # --- pixels -------------------------------------------------------------------------------------------------
 
 
-class _Pixels:
+class _ShotPixels:
     """The pixels of a shot in 8 bits: red, green and blue where its bands are so called, else the band of its run."""
 
     def __init__(self, shot: Shot) -> None:
@@ -236,7 +236,7 @@ class _Pixels:
         if len(self.surveys) < len(bands):
             raise InputError(f"{self.file}: nothing varies in it: no picture is made of it")
 
-    def read(self, box: Window) -> tuple[ByteImage, BoolArray]:
+    def read(self, box: Box) -> tuple[ByteImage, BoolArray]:
         """Return the colours (height, width, 3) of a window, and where they are valid."""
         from barpc.tie.pixels import read_picture
 
@@ -245,7 +245,7 @@ class _Pixels:
         return np.stack([one for one, _ in parts] * (3 if grey else 1), axis=-1), np.all([v for _, v in parts], axis=0)
 
 
-def _colours(scene: Scene, entries: Iterable[_Entry], pixels: dict[str, _Pixels]) -> ByteImage:
+def _colours(scene: Scene, entries: Iterable[_ModelImage], pixels: dict[str, _ShotPixels]) -> ByteImage:
     """Return the mean colours (P, 3) of tie points in the images that show them."""
     sums, counts = np.zeros((len(scene.points), 3)), np.zeros(len(scene.points))
     for one in entries:
@@ -261,7 +261,7 @@ def _colours(scene: Scene, entries: Iterable[_Entry], pixels: dict[str, _Pixels]
     return np.rint(sums / np.maximum(counts, 1)[:, None]).astype(np.uint8)
 
 
-def _resampled(entries: Sequence[_Entry], pixels: dict[str, _Pixels]) -> Files:
+def _resampled(entries: Sequence[_ModelImage], pixels: dict[str, _ShotPixels]) -> FileContents:
     """Return the pictures and their masks, made when they are written, one after the other."""
 
     @lru_cache(1)
@@ -275,15 +275,15 @@ def _resampled(entries: Sequence[_Entry], pixels: dict[str, _Pixels]) -> Files:
     return files
 
 
-def _rendered(one: _Entry, pixels: _Pixels) -> tuple[ByteImage, BoolArray]:
+def _rendered(one: _ModelImage, pixels: _ShotPixels) -> tuple[ByteImage, BoolArray]:
     """Return a picture (h, w, 3), by cubic splines, and where it shows valid pixels."""
     from scipy.ndimage import map_coordinates
 
     assert one.picture is not None
     nodes = np.stack(np.meshgrid(*(np.arange(n) + _CORNER for n in one.size)), axis=-1).reshape(-1, 2)
     at = mapped(one.picture.homography, nodes) - _CORNER
-    low = np.clip(np.floor(at.min(axis=0)).astype(int) - _MARGIN, 0, None)
-    size = np.minimum(np.ceil(at.max(axis=0)).astype(int) + _MARGIN, one.shot.size) - low
+    low = np.clip(np.floor(at.min(axis=0)).astype(int) - _SPLINE_MARGIN, 0, None)
+    size = np.minimum(np.ceil(at.max(axis=0)).astype(int) + _SPLINE_MARGIN, one.shot.size) - low
     shown, valid = pixels.read((int(low[0]), int(low[1]), int(size[0]), int(size[1])))
     place, shape = (at - low).T[::-1], one.size[::-1]
     known = map_coordinates(valid.astype(np.float32), place, order=1, cval=0.0) > 0.999
@@ -302,7 +302,7 @@ def _png(render: Callable[[], tuple[ByteImage, BoolArray]], of_picture: bool) ->
     return bytes(cv2.imencode(".png", np.concatenate(layers, axis=-1) if of_picture else mask)[1])
 
 
-def _for_gdal(entries: Iterable[_Entry], pixels: dict[str, _Pixels], out: Path) -> Files:
+def _for_gdal(entries: Iterable[_ModelImage], pixels: dict[str, _ShotPixels], out: Path) -> FileContents:
     """Return ``warp.sh``, with which GDAL makes the pictures, of 8-bit VRTs that have the homography as GCPs."""
     lines, files = ["#!/bin/sh", "# run in this folder", "mkdir -p images"], {}
     for one in entries:
@@ -315,7 +315,7 @@ def _for_gdal(entries: Iterable[_Entry], pixels: dict[str, _Pixels], out: Path) 
     return {**files, "warp.sh": ("\n".join(lines) + "\n").encode()}
 
 
-def _vrt(one: _Entry, pixels: _Pixels, folder: Path) -> bytes:
+def _vrt(one: _ModelImage, pixels: _ShotPixels, folder: Path) -> bytes:
     """Return a VRT of an image in 8 bits whose GCPs lie in the picture, y upwards from its lower border."""
     assert one.picture is not None
     nodes = np.stack(np.meshgrid(*(np.linspace(0, n, _GCP_NODES) for n in one.size)), axis=-1).reshape(-1, 2)

@@ -21,7 +21,7 @@ from barpc.report.records import json_form
 from barpc.rpcio import WRITABLE
 from barpc.sensor.geometry import footprint
 
-Files = Mapping[str, bytes | Callable[[], bytes]]
+FileContents = Mapping[str, bytes | Callable[[], bytes]]
 """Content of files by name, or what makes it when it is written."""
 
 _COLLECTION = "collection.json"
@@ -68,7 +68,7 @@ def _record(scene: Scene, shot: Shot, img: str) -> dict[str, Any]:
     }
 
 
-def satnerf(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+def satnerf(scene: Scene, out: Path, _how: ExportOptions) -> FileContents:
     """Write ``<image>.json`` each, the points in ``pts3d.npy`` (ECEF), ``train.txt`` and ``test.txt``; EOGS reads them.
 
     UnknownTimeError for an image whose time of acquisition is unknown.
@@ -98,13 +98,13 @@ def _rpc_text(shot: Shot, name: str) -> bytes:
     return write(shot.rpc).encode()
 
 
-def s2p(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+def s2p(scene: Scene, out: Path, _how: ExportOptions) -> FileContents:
     """Write ``config.json``: the images, the first as reference, each with its corrected RPC."""
     images = [{"img": _image(shot, out), "rpc": shot.rpc.to_rpcm_dict()} for shot in scene.shots]
     return {"config.json": as_json({"out_dir": "s2p_out", "images": images, "full_img": True})}
 
 
-def cars(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+def cars(scene: Scene, out: Path, _how: ExportOptions) -> FileContents:
     """Write ``inputs.yaml``, with the pairs whose angle shows heights, and a ``.geom`` an image."""
     sensors = {}
     for shot in scene.shots:
@@ -116,7 +116,7 @@ def cars(scene: Scene, out: Path, _how: ExportOptions) -> Files:
     return {**files, "inputs.yaml": as_json(found)}  # (JSON is YAML)
 
 
-def asp(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+def asp(scene: Scene, out: Path, _how: ExportOptions) -> FileContents:
     """Write ``<image>.xml`` each (in Maxar's form), and lists of images and cameras for its tools, run in `out`."""
     files = {f"{shot.name}.xml": _rpc_text(shot, "xml") for shot in scene.shots}
     lists = {"images.txt": [_image(shot, out) for shot in scene.shots], "cameras.txt": list(files)}
@@ -126,7 +126,7 @@ def asp(scene: Scene, out: Path, _how: ExportOptions) -> Files:
 # --- catalogues and points --------------------------------------------------------------------------------
 
 
-def stac(scene: Scene, out: Path, _how: ExportOptions) -> Files:
+def stac(scene: Scene, out: Path, _how: ExportOptions) -> FileContents:
     """Write ``collection.json``, and ``<image>.json``: a STAC item of every image with its files in the run folder.
 
     UnknownTimeError for an image whose day of acquisition is unknown.
@@ -212,7 +212,7 @@ def _asset(path: Path, out: Path) -> dict[str, Any]:
     return {"href": relative_link(path, out), "type": kind, "roles": ["data" if of_pixels else "metadata"]}
 
 
-def points(scene: Scene, _out: Path, _how: ExportOptions) -> Files:
+def points(scene: Scene, _out: Path, _how: ExportOptions) -> FileContents:
     """Write ``points.csv`` and ``points.ply``: every tie point with the covariance of its place, east, north, up [m2].
 
     It is what the noise of the observations leaves with cameras as they are; what is common to all points, the place of

@@ -11,14 +11,14 @@ from itertools import pairwise
 import numpy as np
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import Array
-from barpc.export.shots import Scene, Shot, Window
+from barpc.base.geodesy import Array, Box
+from barpc.export.shots import Scene, Shot
 from barpc.sensor.sampler import Sample, image_grid
 
 _DISTANCE_FACTORS = None, 1.0, 2.0, 3.0  # any; an image that is affine along its flight is best seen from farther away
 _PINHOLE_STEPS = 100  # at most
-_LARGEST = 1600  # px a side of a picture: trainers reduce larger ones, and with them what they learn
-_SMALLEST = 64  # px a side of a part: below, relief asks for thousands of pictures
+_MAX_SIDE = 1600  # px a side of a picture: trainers reduce larger ones, and with them what they learn
+_MIN_SIDE = 64  # px a side of a part: below, relief asks for thousands of pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class Picture:
     `error`: the largest distance [px] of a ground point in the picture from its projection by `pinhole`.
     """
 
-    window: Window
+    window: Box
     size: tuple[int, int]
     pinhole: Pinhole
     homography: Array
@@ -160,10 +160,10 @@ def pictures_of(scene: Scene, shot: Shot, tolerance: float) -> list[Picture]:
     InputError
         They would be too small, or no pinhole camera comes near the RPC.
     """
-    side, error = float(_LARGEST), np.inf
-    while side >= _SMALLEST:
+    side, error = float(_MAX_SIDE), np.inf
+    while side >= _MIN_SIDE:
         error, pictures = 0.0, list[Picture]()
-        for window in _parts(shot.size, side):
+        for window in _boxes(shot.size, side):
             pictures.append(central_picture(scene, shot, window))
             error = max(error, pictures[-1].error)
             if error > tolerance:
@@ -172,19 +172,19 @@ def pictures_of(scene: Scene, shot: Shot, tolerance: float) -> list[Picture]:
             return pictures
         side *= min(0.9, max(0.3, 0.95 * tolerance / error))  # the error is nearly linear in it
     raise InputError(
-        f"{shot.name}: parts of {_SMALLEST} px are not within {tolerance:g} px of a central pinhole over altitudes "
+        f"{shot.name}: parts of {_MIN_SIDE} px are not within {tolerance:g} px of a central pinhole over altitudes "
         f"{scene.alt_range[0]:g} to {scene.alt_range[1]:g} m: a larger --tolerance, a narrower --alt"
     )
 
 
-def _parts(size: tuple[int, int], side: float) -> list[Window]:
+def _boxes(size: tuple[int, int], side: float) -> list[Box]:
     """Return the windows of equal parts of an image, at most `side` large, row by row."""
     ends = [np.linspace(0, n, int(np.ceil(n / side)) + 1).round().astype(int).tolist() for n in size]
     (lefts, tops) = ([(a, b - a) for a, b in pairwise(e)] for e in ends)
     return [(left, top, width, height) for top, height in tops for left, width in lefts]
 
 
-def central_picture(scene: Scene, shot: Shot, window: Window) -> Picture:
+def central_picture(scene: Scene, shot: Shot, window: Box) -> Picture:
     """Return the picture of a part of a shot.
 
     Cameras of one centre differ by a homography of their pictures: what counts is the centre, that of the projective
@@ -207,7 +207,7 @@ def central_picture(scene: Scene, shot: Shot, window: Window) -> Picture:
     return min(pictures, key=lambda one: one.error)
 
 
-def _seen_from(scene: Scene, shot: Shot, window: Window, camera: Array, aim: Array) -> Picture:
+def _seen_from(scene: Scene, shot: Shot, window: Box, camera: Array, aim: Array) -> Picture:
     """Return the picture that a projective camera (3, 4) sees towards the ground, `aim` (3,) from its centre."""
     forward = aim / np.linalg.norm(aim)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -234,10 +234,10 @@ def _seen_from(scene: Scene, shot: Shot, window: Window, camera: Array, aim: Arr
     center = -np.linalg.solve(camera[:, :3], camera[:, 3])
     pinhole = Pinhole(np.full(2, focal), (np.array(size) - 1.0) / 2, rotation, -rotation @ center)
     homography = corner @ to_image @ shift
-    return Picture(window, (size[0], size[1]), pinhole, homography, _error(scene, shot, size, pinhole, homography))
+    return Picture(window, (size[0], size[1]), pinhole, homography, _max_error(scene, shot, size, pinhole, homography))
 
 
-def _error(scene: Scene, shot: Shot, size: tuple[int, ...], pinhole: Pinhole, homography: Array) -> float:
+def _max_error(scene: Scene, shot: Shot, size: tuple[int, ...], pinhole: Pinhole, homography: Array) -> float:
     """Return the largest error [px] of a picture's pinhole over the pixels that the image has in it."""
     nodes, alt = image_grid((size[0] + 1, size[1] + 1), scene.alt_range, (21, 9))  # from border to border
     image = mapped(homography, nodes) - 0.5

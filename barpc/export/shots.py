@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError
-from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef, wrap_longitude
+from barpc.base.geodesy import Array, Box, ecef_from_ground, enu_basis, ground_from_ecef, wrap_longitude
 from barpc.base.remote import is_url
 from barpc.base.safe_io import plain_path
 from barpc.rasters.raster import open_raster, sources_of
@@ -32,9 +32,6 @@ from barpc.sensor.geometry import footprint
 from barpc.sensor.rpc import RPC
 from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
 from barpc.sensor.triangulation import triangulate
-
-Window = tuple[int, int, int, int]
-"""col, row of the first pixel, width, height [px]."""
 
 ALTITUDE_MARGIN = 20.0
 """m that the altitudes of a scene reach beyond its tie points, besides a tenth of their range."""
@@ -116,7 +113,7 @@ class Scene:
         away = ecef_from_ground(ground) - ecef_from_ground(self.origin)
         return np.asarray(away @ enu_basis(self.origin).T)
 
-    def samples(self, shot: Shot, part: Window | None = None, checked: bool = False) -> Sample:
+    def samples(self, shot: Shot, part: Box | None = None, checked: bool = False) -> Sample:
         """Return the points over an image, or a part of it, and altitudes; to measure errors on, more of them."""
         nodes = (2 * GRID_NODES[0] - 1, 2 * GRID_NODES[1] - 1) if checked else GRID_NODES  # between them, too
         col, row, *size = part or (0, 0, *shot.size)
@@ -240,17 +237,17 @@ def _shot(newest: FinishedRun, run: FinishedRun, view: ViewEntry, of_images: boo
     _check_names(folder, view.name, view.path)
     if PurePath(view.name).name != view.name or view.name == "..":
         raise InputError(f"{folder / 'summary.json'}: an image is called {view.name}, no name of a file")
-    writer, files, rpc = _written(newest, run, view)
+    writer, files, rpc = _newest_rpc(newest, run, view)
     file, light = str(run.sealed.located(view.path)), Acquisition()
     if of_images:
         file, source = (run.input(path) for path in (view.path, view.rpc_source.path if view.rpc_source else ""))
-        light = _light(view, file, source)
+        light = _acquisition_of(view, file, source)
     none: IntArray = np.empty(0, dtype=np.int64)
     carrier = _carrier(writer, view.name, files)
     return Shot(view, run, rpc, writer, files, file, carrier, light, none, np.empty((0, 2)))
 
 
-def _light(view: ViewEntry, file: str, source: str) -> Acquisition:
+def _acquisition_of(view: ViewEntry, file: str, source: str) -> Acquisition:
     """Return the sensor, time and sun of an image by its files; the day that the run was given where these state none.
 
     The date of a TIFF is that of the file: it is none of an acquisition.
@@ -263,7 +260,7 @@ def _light(view: ViewEntry, file: str, source: str) -> Acquisition:
     return light if light.time or view.date == light.day(tags) else replace(light, time=view.date)
 
 
-def _written(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[FinishedRun, tuple[str, ...], RPC]:
+def _newest_rpc(newest: FinishedRun, run: FinishedRun, view: ViewEntry) -> tuple[FinishedRun, tuple[str, ...], RPC]:
     """Return the newest run that wrote the camera of an image, the files there that hold it, and its RPC."""
     of_view = [one for before in run.lineage for one in before.summary.views if one.name == view.name]
     names = tuple(dict.fromkeys(name for one in of_view for name in one.outputs))

@@ -15,7 +15,7 @@ from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
 from barpc.base.verb_options import ExportOptions
 from barpc.export.colmap import colmap, image_links
-from barpc.export.files import Files, asp, cars, points, s2p, satnerf, stac
+from barpc.export.files import FileContents, asp, cars, points, s2p, satnerf, stac
 from barpc.export.light import dated
 from barpc.export.shots import Scene, read_scene, relative_link
 from barpc.workspace import Workspace
@@ -25,7 +25,7 @@ __all__ = ["TARGETS", "export_run"]
 logger = logging.getLogger(__name__)
 _DEFAULTS = ExportOptions()
 
-TARGETS: dict[str, Callable[[Scene, Path, ExportOptions], Files]] = {
+TARGETS: dict[str, Callable[[Scene, Path, ExportOptions], FileContents]] = {
     make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, stac, points)
 }
 """Tool -> the files made for it, by name, of a scene, the folder where they will lie, and options."""

@@ -28,7 +28,7 @@ WHOLE = 40
 """Points that determine the 39 unknowns of each coordinate of a whole RPC, and one to spare."""
 NOISY = 400
 """Points from which on the noise of a whole RPC's unknowns is a third of that of a point, or less."""
-_PASSES = 4  # in which a projective model is weighted by its denominator: it varies by some per cent
+_WEIGHTINGS = 4  # in which a projective model is weighted by its denominator: it varies by some per cent
 
 
 def fit_rpc_points(
@@ -243,15 +243,15 @@ def fit_few(place: Array, image: Array, weight: Array | None = None) -> FewFit:
     usable = [model for model in MODELS if count >= model.least and (model.terms == 3 or not flat)]
     if not usable:
         raise FitError(f"points: {count} are too few: 4 give an affine at their altitude, {WHOLE} a whole RPC")
-    best = _fitted(usable[0], place, image, root)
+    best = _few_fit(usable[0], place, image, root)
     for model in usable[1:]:
-        tried = _fitted(model, place, image, root)
+        tried = _few_fit(model, place, image, root)
         if tried.error < BETTER * best.error or best.model.terms == 3:  # heights are asked for where they vary
             best = tried
     return best
 
 
-def _fitted(model: SmallModel, place: Array, image: Array, root: Array) -> FewFit:
+def _few_fit(model: SmallModel, place: Array, image: Array, root: Array) -> FewFit:
     out = np.empty_like(image)
     for n in range(len(place)):
         kept = np.arange(len(place)) != n
@@ -275,7 +275,7 @@ def _coefficients(model: SmallModel, place: Array, image: Array, root: Array) ->
         coeffs[[0, 2], : model.terms] = found.T
         return coeffs
     none, weight = np.zeros_like(terms), root
-    for _ in range(_PASSES):
+    for _ in range(_WEIGHTINGS):
         of_col = np.hstack([terms, none, -image[:, :1] * terms[:, 1:]])
         of_row = np.hstack([none, terms, -image[:, 1:] * terms[:, 1:]])
         rows, right = np.vstack([of_col, of_row]) * np.tile(weight, 2)[:, None], image.T.ravel() * np.tile(weight, 2)

@@ -19,10 +19,10 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.sampler import image_grid
 from barpc.tie.pixels import read_pixels
 
-_SAME = 0.01  # px: RPCs of bands are equal to 1e-8, of other images of a pass they differ by 50 and more
+_SAME_RPC = 0.01  # px: RPCs of bands are equal to 1e-8, of other images of a pass they differ by 50 and more
 _ALONG = 0.996  # cosine of 5 degrees: lines of sight that may be of one acquisition
-_SIDE = 512  # px of the coarser image that are compared
-_PEAK, _OFF = 8.0, 2  # standard deviations of the correlation at its peak, and the pixels that it may be off
+_COMPARED_SIDE = 512  # px of the coarser image that are compared
+_LEAST_PEAK, _MAX_SHIFT = 8.0, 2  # standard deviations of the correlation at its peak, and pixels it may be off
 
 
 def one_each(
@@ -79,7 +79,7 @@ def _pixel(view: View) -> float:
 def _same_rays(sensor: SensorModel, ends: Array) -> BoolArray:
     """Return which lines of sight with ends (n, 2, 3) a camera sees as points."""
     seen = sensor.project(ends)
-    return np.asarray(np.abs(seen[:, 1] - seen[:, 0]).max(axis=1) < _SAME)
+    return np.asarray(np.abs(seen[:, 1] - seen[:, 0]).max(axis=1) < _SAME_RPC)
 
 
 def _image_map(one: View, other: View) -> tuple[Array, Array] | None:
@@ -93,7 +93,7 @@ def _image_map(one: View, other: View) -> tuple[Array, Array] | None:
     step = (apart * seen).sum(axis=0) / (apart**2).sum(axis=0)
     start = seen.mean(axis=0) - step * middle
     off = np.abs(at * step + start - seen).max()
-    return (step, start) if off < _SAME * max(1.0, *step) and (step > 0).all() else None
+    return (step, start) if off < _SAME_RPC * max(1.0, *step) and (step > 0).all() else None
 
 
 def _shown(view: View, lead: View, step: Array, start: Array) -> bool:
@@ -110,9 +110,9 @@ def _same_scene(lead: View, view: View, step: Array, start: Array, band: int) ->
         return False
     low = np.maximum(start, 0.0)
     high = np.minimum(start + (np.array(lead.size) - 1.0) * step, np.array(view.size) - 1.0)
-    side = np.minimum(high - low, _SIDE).astype(np.int64)
+    side = np.minimum(high - low, _COMPARED_SIDE).astype(np.int64)
     first = (0.5 * (low + high - side)).astype(np.int64)
-    if side.min() < _SIDE // 8:
+    if side.min() < _COMPARED_SIDE // 8:
         return False
     ours, _ = read_pixels(view.path, (*first.tolist(), *side.tolist()), band)
     corner = np.floor((first - 1.0 - start) / step).astype(np.int64).clip(0)
@@ -127,7 +127,7 @@ def _same_scene(lead: View, view: View, step: Array, start: Array, band: int) ->
     surface = np.fft.irfft2(spectrum, s=detail[0].shape)
     row, col = np.unravel_index(int(np.argmax(surface)), surface.shape)
     off = max(min(row, surface.shape[0] - row), min(col, surface.shape[1] - col))
-    return bool(off <= _OFF and surface.max() - surface.mean() > _PEAK * surface.std())
+    return bool(off <= _MAX_SHIFT and surface.max() - surface.mean() > _LEAST_PEAK * surface.std())
 
 
 def _edges(picture: Array) -> Array:

@@ -261,7 +261,7 @@ def _passes(progress: Progress | None) -> Iterator[None]:
         progress("adjustment", last, last)
 
 
-def agreeing(run: GrowingRun, options: AdjustOptions) -> BoolArray | None:
+def agreeing_observations(run: GrowingRun, options: AdjustOptions) -> BoolArray | None:
     """Return the observations (K,) of a check without those that an adjustment would cut; None for all of them.
 
     Where it would cut many of an image these are no wrong matches: the cameras disagree.

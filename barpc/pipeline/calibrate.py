@@ -39,11 +39,11 @@ _FEWEST_WHOLE = 3  # images of the longest line, by which shorter ones find thei
 _PLACED_TO = 20.0  # px: a curve of 0.3 px over 3000 columns changes by 0.002 px over it
 _FEWEST_RUNS = 3  # of two, held out in turn, each is judged by the other alone
 _MUST_KNOW = 0.5  # of a curve's size: known no better than that, it is taken off by guess
-_FLAT = 30.0  # deg: rows that run within so much of each other are of one direction
+_SAME_DIRECTION = 30.0  # deg: rows that run within so much of each other are of one direction
 
 
 @dataclass(frozen=True, eq=False)
-class _FinishedRun:
+class _CalibratedRun:
     """A finished run's information on a sensor, the directions of its images' rows, clockwise from north [deg], the
     images and their places on the line; `seen`: those of them with tie points.
     """
@@ -93,14 +93,14 @@ def calibrate(
     refuse_existing(out, chosen.overwrite)
     if len(runs) < _FEWEST_RUNS:
         raise InputError(f"{len(runs)} runs given: at least {_FEWEST_RUNS} finished runs are needed, to hold some out")
-    opened, tell = list[_OpenedRun](), progress or (lambda *_: None)
+    opened, tell = list[_RunImages](), progress or (lambda *_: None)
     for number, folder in enumerate(runs, start=1):
         opened.append(_images_of(Path(folder)))
         tell("open", number, len(runs))
     _refuse_shared_images(runs, opened)
     name = _one_sensor([[one.sensor for one in sources] for *_, sources in opened], chosen.sensor)
-    found = list[_FinishedRun]()
-    for folder, run, on_line in zip(runs, opened, _one_line(runs, opened, name), strict=True):
+    found = list[_CalibratedRun]()
+    for folder, run, on_line in zip(runs, opened, _on_one_line(runs, opened, name), strict=True):
         found.append(_finished_run(Path(folder), run, on_line))
         tell("read", len(found), len(opened))
     roots = _one_root_each(found)
@@ -112,10 +112,10 @@ def calibrate(
     return content
 
 
-_OpenedRun = tuple[Earlier, list[View], Sequence[SensorModel], Sequence[Camera]]
+_RunImages = tuple[Earlier, list[View], Sequence[SensorModel], Sequence[Camera]]
 
 
-def _images_of(folder: Path) -> _OpenedRun:
+def _images_of(folder: Path) -> _RunImages:
     """Return a run, its images with their corrected cameras, and the cameras as delivered."""
     earlier = Earlier.open(folder)
     names = {view.name for view in earlier.run.summary.views}
@@ -126,7 +126,7 @@ def _images_of(folder: Path) -> _OpenedRun:
     return earlier, views, sensors, sources
 
 
-def _refuse_shared_images(runs: Sequence[PathLike], opened: Sequence[_OpenedRun]) -> None:
+def _refuse_shared_images(runs: Sequence[PathLike], opened: Sequence[_RunImages]) -> None:
     """Raise InputError where two runs have an image in common, which would count twice."""
     seen: dict[str, PathLike] = {}
     for folder, (earlier, *_) in zip(runs, opened, strict=True):
@@ -162,7 +162,7 @@ class _OnLine:
     columns: Array
 
 
-def _one_line(runs: Sequence[PathLike], opened: Sequence[_OpenedRun], name: str) -> list[_OnLine]:
+def _on_one_line(runs: Sequence[PathLike], opened: Sequence[_RunImages], name: str) -> list[_OnLine]:
     """Return where the images of each run lie on the line of a sensor.
 
     The line is the longest of all. A product of fewer columns lies somewhere within it: in its middle, to a standard
@@ -201,7 +201,7 @@ def _on_line(places: Sequence[tuple[int, LinePlace]], width: int) -> _OnLine:
     return _OnLine([i for i, _ in places], Line(width, start, loose), columns)
 
 
-def _finished_run(folder: Path, opened: _OpenedRun, on_line: _OnLine) -> _FinishedRun:
+def _finished_run(folder: Path, opened: _RunImages, on_line: _OnLine) -> _CalibratedRun:
     earlier, views, sensors, _ = opened
     tables, used = earlier.run.tables(), on_line.index
     number = {views[i].name: k for k, i in enumerate(used)}
@@ -218,7 +218,9 @@ def _finished_run(folder: Path, opened: _OpenedRun, on_line: _OnLine) -> _Finish
     ties = SensorTies.of(str(folder), chosen, tracks, behind, tables.points[:, :3], on_line.line)
     directions = np.array([_row_direction(v, s) for v, s in zip(chosen, behind, strict=True)])
     seen = np.unique(tracks.view)
-    return _FinishedRun(folder, earlier.run.sealed.root, ties, directions, tuple(v.path for v in chosen), on_line, seen)
+    return _CalibratedRun(
+        folder, earlier.run.sealed.root, ties, directions, tuple(v.path for v in chosen), on_line, seen
+    )
 
 
 def _row_direction(view: View, sensor: SensorModel) -> float:
@@ -229,7 +231,7 @@ def _row_direction(view: View, sensor: SensorModel) -> float:
     return float(np.degrees(np.arctan2(east, north)) % 360.0)
 
 
-def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
+def _one_root_each(found: Sequence[_CalibratedRun]) -> list[str]:
     roots = [one.root for one in found]
     twice = [one.folder for one, root in zip(found, roots, strict=True) if roots.count(root) > 1]
     if twice:
@@ -237,7 +239,7 @@ def _one_root_each(found: Sequence[_FinishedRun]) -> list[str]:
     return roots
 
 
-def _starts(learnt: Learnt, found: Sequence[_FinishedRun]) -> dict[int, float]:
+def _starts(learnt: Learnt, found: Sequence[_CalibratedRun]) -> dict[int, float]:
     """Return the column of the line at which shorter products begin, by their columns; InputError where one is not
     found, or two of one length disagree.
     """
@@ -258,7 +260,7 @@ def _starts(learnt: Learnt, found: Sequence[_FinishedRun]) -> dict[int, float]:
     return {columns: float(np.mean(places)) for columns, places in sorted(begun.items())}
 
 
-def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> None:
+def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_CalibratedRun]) -> None:
     """Raise InputError where the curve is none of the sensor's in all of its images."""
     at, nats = learnt.change
     if nats > SURE:
@@ -269,7 +271,7 @@ def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> 
     if sigma > _MUST_KNOW * size and sigma > learnt.noise_px / np.sqrt(len(found)):
         double = np.exp(2j * np.radians(np.concatenate([one.directions for one in found])))
         mean = float(np.degrees(np.angle(double.mean())) / 2 % 180.0)
-        flat = abs(double.mean()) > np.cos(np.radians(_FLAT))
+        flat = abs(double.mean()) > np.cos(np.radians(_SAME_DIRECTION))
         more = (
             f"whose rows run across those of these, near {(mean + 90) % 180:.0f} degrees of north" if flat else "more"
         )
@@ -282,7 +284,7 @@ def _refuse_unsure(name: str, learnt: Learnt, found: Sequence[_FinishedRun]) -> 
 
 
 def _content(
-    name: str, learnt: Learnt, found: Sequence[_FinishedRun], roots: Sequence[str], starts: Mapping[int, float]
+    name: str, learnt: Learnt, found: Sequence[_CalibratedRun], roots: Sequence[str], starts: Mapping[int, float]
 ) -> dict[str, Any]:
     spline = learnt.spline
     rows = np.tril_indices(len(learnt.unknowns))

@@ -34,7 +34,7 @@ SUFFIX = ".cal"
 KNOWN_TO = 5.0  # px: a curve changes by less than 0.001 px over it
 _ABSURD = 1e3  # px: no curve is larger
 _MOST_EDGES = 64  # focal planes have up to some thirty detectors, and 40 steps are learnt
-_ROUNDING = 1e-4  # of the largest variance: what five digits a number leave of eigenvalues that are zero
+_ZERO_VARIANCE = 1e-4  # of the largest variance: what five digits a number leave of eigenvalues that are zero
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -51,7 +51,7 @@ def read_calibration(path: str | Path) -> Calibration:
         raise InputError(f"{path}: damaged ({plain(error)}); make it again (barpc calibrate)") from error
 
 
-_Pixels = Annotated[float, msgspec.Meta(gt=-_ABSURD, lt=_ABSURD)]
+_PixelCount = Annotated[float, msgspec.Meta(gt=-_ABSURD, lt=_ABSURD)]
 
 
 class _CalibrationFile(Record):
@@ -59,11 +59,11 @@ class _CalibrationFile(Record):
 
     sensor: str = column("Sensor", min_length=1, max_length=200)
     columns: int = column("Columns of its line", ge=2, le=1 << 24)
-    coefficients_px: tuple[tuple[_Pixels, _Pixels], ...] = column(
+    coefficients_px: tuple[tuple[_PixelCount, _PixelCount], ...] = column(
         "Spline coefficients", min_length=LINE_SPLINES, max_length=LINE_SPLINES
     )
     edges: tuple[float, ...] = column("Columns at which another detector begins", max_length=_MOST_EDGES)
-    steps_px: tuple[tuple[_Pixels, _Pixels], ...] = column("What is added from each on", max_length=_MOST_EDGES)
+    steps_px: tuple[tuple[_PixelCount, _PixelCount], ...] = column("What is added from each on", max_length=_MOST_EDGES)
     covariance_px2: tuple[float, ...] = column("Lower triangle of the covariance of the coefficients and steps")
     starts_px: Mapping[str, float] | None = column(
         "Columns of the line at which products of fewer columns begin, by their columns", default=None
@@ -93,7 +93,7 @@ def _may_be_covariance(matrix: Array) -> bool:
     if not (np.isfinite(matrix).all() and (variance > 0.0).all() and (variance < _ABSURD**2).all()):
         return False
     try:
-        np.linalg.cholesky(matrix + _ROUNDING * variance.max() * np.eye(len(matrix)))
+        np.linalg.cholesky(matrix + _ZERO_VARIANCE * variance.max() * np.eye(len(matrix)))
     except np.linalg.LinAlgError:
         return False
     return True

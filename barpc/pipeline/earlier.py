@@ -217,11 +217,11 @@ def _parse_known(row: Mapping[str, Any], sealed: Sealed) -> Known:
         raise ValueError(f"{known.name}: no size")
     choices = known.choices
     if choices is not None and "camera" in choices:
-        choices = {**choices, "camera": _located(choices["camera"], sealed)}
-    return replace(known, path=_located(known.path, sealed), choices=choices)
+        choices = {**choices, "camera": _found_at(choices["camera"], sealed)}
+    return replace(known, path=_found_at(known.path, sealed), choices=choices)
 
 
-def _located(path: str, sealed: Sealed) -> str:
+def _found_at(path: str, sealed: Sealed) -> str:
     return path if not path or is_url(path) else str(sealed.located(path))
 
 

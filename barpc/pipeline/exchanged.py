@@ -20,15 +20,15 @@ from barpc.scene import Tracks, View
 from barpc.sensor.geometry import Several, convergence_angle
 from barpc.sensor.triangulation import epipolar_offset
 
-_SCATTER = 0.1  # px across epipolar lines: less does not matter
+_NEGLIGIBLE_SCATTER = 0.1  # px across epipolar lines: less does not matter
 FEWER = 5.0
 """Times less scatter otherwise than as given that tell a mistake: cameras exchanged 10 to 360 of three public sets,
 right ones 1."""
-_MATCHES = 100  # of a pair
+_PER_PAIR = 100  # of a pair
 _LEAST_ANGLE = 0.5  # deg between rays: along nearer ones no epipolar line is told
 _MOST_LEFT = 1.0  # px of scatter with the cameras exchanged
 _MOST_TRIED = 20  # images, those that scatter most, that are tried in pairs
-_FEW = 4  # images of which every order is tried
+_FULLY_PERMUTED = 4  # images of which every order is tried
 
 
 @dataclass(frozen=True)
@@ -57,24 +57,24 @@ def exchanged_cameras(views: Sequence[View], tracks: Tracks) -> Exchange | None:
     measured = zip(pairs, _scatters(views, tracks, pairs, [ties.views for ties in pairs]), strict=True)
     known = [(ties, scatter) for ties, scatter in measured if np.isfinite(scatter)]  # others have too few matches
     pairs, as_given = [ties for ties, _ in known], [scatter for _, scatter in known]
-    worst = sorted((k for k in range(len(pairs)) if as_given[k] > _SCATTER), key=lambda k: -as_given[k])
+    worst = sorted((k for k in range(len(pairs)) if as_given[k] > _NEGLIGIBLE_SCATTER), key=lambda k: -as_given[k])
     suspects = sorted([*dict.fromkeys(view for k in worst for view in pairs[k].views)][:_MOST_TRIED])
     orders = [[*both][::-1] for both in combinations(suspects, 2)]
     tried = [dict(zip(sorted(order), order, strict=True)) for order in orders]
-    if 2 < len(suspects) <= _FEW:
+    if 2 < len(suspects) <= _FULLY_PERMUTED:
         tried += [dict(zip(suspects, order, strict=True)) for order in permutations(suspects)]
     best: Exchange | None = None
     for cameras in tried:
         moved = {view: camera for view, camera in cameras.items() if view != camera}
         met = [k for k, ties in enumerate(pairs) if moved.keys() & set(ties.views)]
         before = [as_given[k] for k in met]
-        if not moved or not met or max(before) <= _SCATTER:
+        if not moved or not met or max(before) <= _NEGLIGIBLE_SCATTER:
             continue
         after = []
         for k in met:  # the first pair that gains nothing ends most trials
             i, j = pairs[k].views
             after += _scatters(views, tracks, [pairs[k]], [(moved.get(i, i), moved.get(j, j))])
-            if not FEWER * after[-1] < min(max(as_given[k], _SCATTER), FEWER * _MOST_LEFT):
+            if not FEWER * after[-1] < min(max(as_given[k], _NEGLIGIBLE_SCATTER), FEWER * _MOST_LEFT):
                 break
         else:
             found = Exchange(tuple(moved), tuple(moved.values()), float(np.median(before)), float(np.median(after)))
@@ -101,9 +101,9 @@ def _scatters(
     Infinite where too few matches have a line.
     """
     sensors, found = [view.sensor for view in views], list[float]()
-    for first in range(0, len(pairs), CHUNK // _MATCHES):
-        some = slice(first, first + CHUNK // _MATCHES)
-        rows = [np.unique(np.linspace(0, len(t.a) - 1, min(len(t.a), _MATCHES)).astype(np.int64)) for t in pairs[some]]
+    for first in range(0, len(pairs), CHUNK // _PER_PAIR):
+        some = slice(first, first + CHUNK // _PER_PAIR)
+        rows = [np.unique(np.linspace(0, len(t.a) - 1, min(len(t.a), _PER_PAIR)).astype(np.int64)) for t in pairs[some]]
         a, b = (
             np.concatenate([getattr(ties, of)[row] for ties, row in zip(pairs[some], rows, strict=True)])
             for of in ("a", "b")
@@ -114,6 +114,6 @@ def _scatters(
         offset, _ = epipolar_offset(Several(sensors, left), Several(sensors, right), tracks.xy[a], tracks.xy[b], height)
         for one in np.split(offset, np.cumsum(counts)[:-1]):
             one = one[np.isfinite(one)]
-            many = len(one) >= _MATCHES // 10
+            many = len(one) >= _PER_PAIR // 10
             found.append(float(robust_spread(one - np.median(one))) if many else np.inf)
     return found

@@ -291,7 +291,7 @@ def _load_control(
         if not options.keep_going:
             raise
         return replace(GroundPoints.none(), left_out=(f"{error}; the file is left out",))
-    points, said = _with_altitudes(_with_height_above_dem(dem, points, options), views, options, dem)
+    points, said = _gcps_with_altitudes(_with_height_above_dem(dem, points, options), views, options, dem)
     out, keep = [], np.ones(len(points.names), dtype=bool)
     search = np.array([reach_of(view, options.tie.search) for view in views])[points.view]
     for wrong, what in _implausible(points, views, search):
@@ -308,7 +308,7 @@ def _load_control(
     return replace(points.select(keep), left_out=lines)
 
 
-def _with_altitudes(
+def _gcps_with_altitudes(
     points: GroundPoints, views: Sequence[View], options: RunOptions, dem: Dem | None
 ) -> tuple[GroundPoints, list[str]]:
     """Return the points with altitudes of a DEM where theirs are 0, which tools write for unknown ones; and remarks on
@@ -363,7 +363,7 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
     far = _any(points, away > reach) | (np.abs(points.lonlatalt[:, 1]) > 90.0)
     beyond = _beyond(points, views, points.xy)
     if beyond.any():
-        beyond &= ~_beyond(points, views, _projected(points, views))
+        beyond &= ~_beyond(points, views, _gcp_pixels(points, views))
     outside = _any(points, beyond)
     for what, (columns, *signs) in _MISTAKES.items():
         near = [_distance(points, shown, columns, sign) <= reach for sign in signs]
@@ -389,7 +389,7 @@ def _beyond(points: GroundPoints, views: Sequence[View], xy: Array) -> BoolArray
     return np.asarray(((xy < -_IMAGE_MARGIN) | (xy > size - 1 + _IMAGE_MARGIN)).any(axis=1))
 
 
-def _projected(points: GroundPoints, views: Sequence[View]) -> Array:
+def _gcp_pixels(points: GroundPoints, views: Sequence[View]) -> Array:
     """Return where the cameras of the observations show their points (M, 2) [px], altitudes within their ranges."""
     ground, xy = points.lonlatalt[points.point].copy(), np.empty_like(points.xy)
     for v in np.unique(points.view):

@@ -24,7 +24,7 @@ from barpc.base.identity import Stamp, also_seen, recorded
 from barpc.base.remote import PathOrUrl, here, located
 from barpc.base.safe_io import IMAGE, plain_path, versioned
 from barpc.base.tasks import Progress
-from barpc.cameras import checked, open_split, split_spec
+from barpc.cameras import checked_camera, open_split, split_spec
 from barpc.pipeline.executor import GROUP, by_groups
 from barpc.pointio.names import unique_names
 from barpc.rasters.raster import open_raster
@@ -152,7 +152,7 @@ def _open_image(
             raise ImageError(f"{file}: has {dataset.count} band(s), no band {band}")
         tags = dataset.tags()
         if isinstance(image, View):
-            camera = checked(Camera(image.sensor, file, "given", image.size, image.alt_range), dataset)
+            camera = checked_camera(Camera(image.sensor, file, "given", image.size, image.alt_range), dataset)
             if image.size != size:
                 raise InputError(f"{file}: is {size} px large, but its view says {image.size}")
         else:

@@ -40,12 +40,12 @@ GCP_FILE = f"{FOLDER}/gcps.geojson"  # of a reference
 MAP_FILE = "map.gpkg"
 
 
-Fitted = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
+FittedView = tuple[View, RpcFit, SensorModel]  # a view, its refitted RPC and P_BA
 
 
 def write_views(
     run: Workspace,
-    fitted: Sequence[Fitted],
+    fitted: Sequence[FittedView],
     images: str,
     formats: Sequence[str],
     executor: Executor | None = None,

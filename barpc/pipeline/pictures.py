@@ -28,10 +28,10 @@ from barpc.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
-_SIDE = 480  # px of a thumbnail: a third of a page that fills a desk's screen
+_THUMBNAIL_SIDE = 480  # px of a thumbnail: a third of a page that fills a desk's screen
 _MOST_BYTES = 60_000  # of a picture
 _ALL_BYTES = 1_500_000  # of all thumbnails: two of the six MB that a page of many images may have
-_TILES, _TILE = 6, 120  # places of a strip, and pixels of their sides
+_TILES, _TILE_SIDE = 6, 120  # places of a strip, and pixels of their sides
 _HALF_PX = 12.0, 80.0  # of the image, from a tile's middle to its edge: at least, at most
 _PER_OFFSET = 5.0  # times the offset: it moves what is seen by a tenth of a tile
 _HEIGHT_STEP = 10.0  # m: two ends of a piece of an epipolar line
@@ -63,7 +63,7 @@ def thumbnails(group: Sequence[View], band: int, most: int) -> list[dict[str, An
     found = list[dict[str, Any]]()
     for view in group:
         try:
-            grey = None if is_url(view.path) else thumbnail(view.path, view.size, _SIDE, band)
+            grey = None if is_url(view.path) else thumbnail(view.path, view.size, _THUMBNAIL_SIDE, band)
         except (BarpcError, OSError) as error:
             found.append({"image": view.name, "error": str(error)})
             continue
@@ -150,7 +150,7 @@ def _along_lines(
     with np.errstate(invalid="ignore"):
         along *= np.where(along[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(along, axis=1, keepdims=True)  # to the right
     across = np.column_stack([-along[:, 1], along[:, 0]])
-    side = half * (2.0 * ticks(_TILE) / (_TILE - 1) - 1.0)
+    side = half * (2.0 * ticks(_TILE_SIDE) / (_TILE_SIDE - 1) - 1.0)
     grid = np.stack(np.meshgrid(side, side), axis=-1)
     offsets = np.einsum("ijk,nkl->nijl", grid, np.stack([along, across], axis=1))
     return here[:, None, None] + offsets, foot[:, None, None] + np.einsum("nlm,nijm->nijl", linear, offsets)
@@ -158,7 +158,7 @@ def _along_lines(
 
 def _tile(view: View, band: int, nodes: Array) -> npt.NDArray[np.uint8]:
     """Return an image at the nodes (m, m, 2) [px] of a tile, in 8 bits, black where it is unknown."""
-    grey, known = picture(view.path, (band,), view.size, nodes, (_TILE, _TILE))
+    grey, known = picture(view.path, (band,), view.size, nodes, (_TILE_SIDE, _TILE_SIDE))
     stretch = Stretch.of(grey[known])
     return (
         np.zeros(grey.shape, np.uint8)

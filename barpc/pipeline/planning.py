@@ -17,7 +17,7 @@ from barpc.scene import GroundPoints
 from barpc.tie.matchers import features
 from barpc.tie.pairing.overlaps import Pair
 
-_START, _VIEW, _MEGAPIXEL, _PAIR, _PAIR_MEGAPIXEL = 1.5, 0.15, 0.9, 0.1, 0.4
+_START_SECONDS, _VIEW_SECONDS, _MEGAPIXEL_SECONDS, _PAIR_SECONDS, _PAIR_MEGAPIXEL_SECONDS = 1.5, 0.15, 0.9, 0.1, 0.4
 """CPU seconds on a slow core: of a run; a view; a megapixel of it (keypoints); a pair; a megapixel of its smaller one.
 
 Measured, and by these: a pair and triplet of 1.0 Mpx 5.0 (4.2) and 5.6 (6.2), a real triplet of 0.54 Mpx 4.2 (4.4), a
@@ -64,9 +64,9 @@ def planned(run: Run, options: RunOptions, dem: Dem | None, pairs: Sequence[Pair
     names, size = [view.name for view in run.views], np.array([view.size for view in run.views])
     area, most = size.prod(axis=1) / 1e6, features.PER_IMAGE / _DENSITY
     matched = sum(float(np.minimum(area[list(pair.views)].min(), most)) for pair in pairs)
-    slow = _START + _VIEW * len(names)
+    slow = _START_SECONDS + _VIEW_SECONDS * len(names)
     if pairs:
-        slow += _MEGAPIXEL * float(area.sum()) + _PAIR * len(pairs) + _PAIR_MEGAPIXEL * matched
+        slow += _MEGAPIXEL_SECONDS * float(area.sum()) + _PAIR_SECONDS * len(pairs) + _PAIR_MEGAPIXEL_SECONDS * matched
     points = [load_gcps(paths, run.views, options, dem) for paths in (options.gcp, options.check_points)]
     return Plan(
         tuple(names),

@@ -28,7 +28,7 @@ from barpc.base.tasks import Progress, Work
 from barpc.fit import RpcFit, fit_rpc
 from barpc.fit.refit import innermost
 from barpc.pipeline.acquisitions import one_each
-from barpc.pipeline.adjusting import agreeing, scope_of, tied_and_adjusted, with_own_cameras, with_ties
+from barpc.pipeline.adjusting import agreeing_observations, scope_of, tied_and_adjusted, with_own_cameras, with_ties
 from barpc.pipeline.calibrations import calibrated, calibrations_of
 from barpc.pipeline.earlier import Earlier, GrowingRun, added, images_table, join_earlier, movers
 from barpc.pipeline.executor import CachingExecutor, by_groups
@@ -132,7 +132,7 @@ def adjust(
                 run = tied_and_adjusted(run, given, workspace, Work(caching, progress))
             if run.adjustment is not None and options.stop_after == "all":
                 with workspace.stage("fit"):
-                    run = _fitted(run, options, Work(caching, progress))
+                    run = _with_refits(run, options, Work(caching, progress))
         with guarded(inputs.values()):  # asked again before outputs appear, and before the last one
             ask()
             if run.fits:
@@ -262,7 +262,7 @@ def check(
     """
     options, work = with_located(options or RunOptions()), Work(executor, progress)
     run = with_own_cameras(with_ties(_with_views("check", images, options, work), work), work)
-    if (found := agreeing(run, options.adjust)) is not None:
+    if (found := agreeing_observations(run, options.adjust)) is not None:
         run = replace(run, agreeing=found)
     return AdjustResult(_as_given(run.views, images, options), run, summarize(run))
 
@@ -367,7 +367,7 @@ def _planned_files(run: Run, options: RunOptions, folder: Path) -> tuple[list[st
     return names, keep
 
 
-def _fitted(run: GrowingRun, options: RunOptions, work: Work) -> GrowingRun:
+def _with_refits(run: GrowingRun, options: RunOptions, work: Work) -> GrowingRun:
     """Refit every P_BA: only when all can be written is any."""
     assert run.adjustment is not None
     number = run.number

@@ -288,7 +288,7 @@ def _orthority(path: Path) -> Projection:
     return lambda ground: np.asarray(camera.world_to_pixel(ground.T).T)
 
 
-def _keywords(path: Path) -> Projection:
+def _keyword_list(path: Path) -> Projection:
     """Return an OSSIM keyword list, read as its readers do: every line split at the first colon, all keys asked for."""
     pairs = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     if pairs["type"].strip() != "ossimRpcModel" or pairs["polynomial_format"].strip() != "B":
@@ -346,7 +346,7 @@ def _gdal_correction(path: Path) -> Projection:
 CONSUMERS: dict[str, Consumer] = {
     "gdal": Consumer("rasterio", _gdal_raster),
     "gdal, beside an image": Consumer("rasterio", _gdal_text),
-    "keywords": Consumer("rasterio", _keywords),
+    "keywords": Consumer("rasterio", _keyword_list),
     "rpcm": Consumer("rpcm", _rpcm),
     "shareloc": Consumer("shareloc", _shareloc),
     "orthority": Consumer("orthority", _orthority),

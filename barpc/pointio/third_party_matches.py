@@ -54,7 +54,7 @@ _CLEAN = "-clean"  # what ASP adds to a name once its own outliers are gone
 _ASP_KEYPOINT_BYTES = 45  # bytes of a keypoint in ASP's binary files, before its descriptor
 _DATABASE = Kind("a file of keypoints and matches", None)  # most of it are descriptors, which are not read
 _CONTENT = Kind("the keypoints and matches of a COLMAP or HDF5 file", TABLE.most)
-_MATCHES = replace(TABLE, empty=True)  # a pair without matches
+_MATCH_TABLE = replace(TABLE, empty=True)  # a pair without matches
 
 
 def index_pairs(matches: npt.NDArray[np.generic], counts: tuple[int, int]) -> IntArray:
@@ -138,7 +138,7 @@ def _images_of_file(path: Path, views: ViewNames) -> tuple[str, str]:
 def _read_asp_text(path: Path) -> tuple[Array, Array]:
     """Read an ASP text file: counts on the first line, then one keypoint a line, col and row first."""
     try:
-        with opened_text(path, _MATCHES) as lines:
+        with opened_text(path, _MATCH_TABLE) as lines:
             left, right = (int(word) for word in next(lines, "0 0").split()[:2])
             points = array("d")
             for words in (line.split(None, 2)[:2] for line in lines):
@@ -155,7 +155,7 @@ def _read_asp_text(path: Path) -> tuple[Array, Array]:
 
 def _asp_binary(path: Path) -> tuple[Array, Array]:
     """Read two counts of 8 bytes, then the records of both images, each with a descriptor of one length."""
-    data = read_bytes(path, _MATCHES)
+    data = read_bytes(path, _MATCH_TABLE)
     if not any(data) and len(data) in (0, 16):  # of a matcher that found nothing
         return np.empty((0, 2)), np.empty((0, 2))
     try:

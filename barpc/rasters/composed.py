@@ -18,7 +18,7 @@ from barpc.base.safe_io import IMAGE, MB, RPC_FILE, Kind, opened, read_bytes, re
 from barpc.rasters.crs import plain_crs
 from barpc.rasters.vrt import INDIRECT, Rect
 
-_HEADER = Kind("an ENVI header", MB, ImageError)
+_ENVI_HEADER = Kind("an ENVI header", MB, ImageError)
 _BYTES = {1: 1, 2: 2, 3: 4, 4: 4, 5: 8, 6: 8, 9: 16, 12: 2, 13: 4, 14: 8, 15: 8}  # ENVI's data type -> of a value
 _SYSTEM = "coordinate system string"
 _SHOWN = {
@@ -35,13 +35,13 @@ def header_beside(path: PathOrUrl) -> Path | None:
         return None
     for file in (path.parent / f"{name}{end}" for name in (path.stem, path.name) for end in (".hdr", ".HDR")):
         with suppress(BarpcError):
-            if file.is_file() and read_head(file, _HEADER, 4) == b"ENVI":
+            if file.is_file() and read_head(file, _ENVI_HEADER, 4) == b"ENVI":
                 return file
     return None
 
 
 def _lines_of(header: Path) -> dict[str, str]:
-    text = read_bytes(header, _HEADER).decode("latin-1").translate({0: " ", 13: "\n"})
+    text = read_bytes(header, _ENVI_HEADER).decode("latin-1").translate({0: " ", 13: "\n"})
     return {" ".join(key.lower().split()): value.strip() for key, value in _LINE.findall(text)}
 
 
@@ -77,7 +77,7 @@ def shown_header(path: Path) -> bytes:
     return text.encode("latin-1")
 
 
-_CHANNEL, _NAME = 1024, 64  # bytes of a channel's header, and of the name of its file
+_CHANNEL_BYTES, _NAME_BYTES = 1024, 64  # bytes of a channel's header, and of the name of its file
 _MOST_CHANNELS = 4096
 
 
@@ -89,8 +89,8 @@ def refuse_foreign_channels(path: PathOrUrl) -> None:
         if not all(re.fullmatch(rb"\d{1,16}", cell) for cell in cells) or int(cells[1]) > _MOST_CHANNELS:
             raise ImageError(f"{path}: cannot be read as PCIDSK: its header does not say where its channels are")
         for index in range(int(cells[1])):
-            file.seek(512 * (int(cells[0]) - 1) + _CHANNEL * index + _NAME)
-            name = file.read(_NAME).strip(b" \0")
+            file.seek(512 * (int(cells[0]) - 1) + _CHANNEL_BYTES * index + _NAME_BYTES)
+            name = file.read(_NAME_BYTES).strip(b" \0")
             if name and not re.fullmatch(rb"/SIS=\d+", name):  # that: of tiles in the file itself
                 raise ImageError(f"{path}: the pixels of its channel {index + 1} are in another file; export it as one")
 

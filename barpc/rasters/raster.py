@@ -201,7 +201,7 @@ def _opened_alone(file: Path, driver: str) -> Iterator[Any]:
             yield dataset
 
 
-_PLAIN = re.compile(r"[\w/.~ ,@:\\()-]+")  # a path that vrt:// takes as it stands
+_PLAIN_PATH = re.compile(r"[\w/.~ ,@:\\()-]+")  # a path that vrt:// takes as it stands
 _SHOWN_DOMAINS = "", "RPC"  # of metadata; others name files
 
 
@@ -225,7 +225,7 @@ def _open_mosaic(file: PathOrUrl, driver: str, name: str) -> Iterator[Any]:
     raw = "ENVI" in drivers.values()  # GDAL finds a header only where it looks beside every file: each is shown alone
     with ExitStack() as stack:
         with rasterio.Env(**{"GDAL_DISABLE_READDIR_ON_OPEN": "TRUE"} if raw else {}):
-            files = {at: _file_of(at, kind, raw, stack) for at, kind in drivers.items()}
+            files = {at: _vrt_source(at, kind, raw, stack) for at, kind in drivers.items()}
             bands = [_placed(band, files, vrt.size, name) for band in vrt.all]
             shown = replace(
                 vrt,
@@ -251,7 +251,7 @@ def _open_sources(dataset: Any, vrt: Vrt) -> None:
                 dataset.read_masks(window=pixel)
 
 
-class _File(NamedTuple):
+class _VrtSource(NamedTuple):
     """A source of a VRT: its name for GDAL, its size and its bands."""
 
     name: str
@@ -262,7 +262,7 @@ class _File(NamedTuple):
     held: bool  # open here as long as the VRT is
 
     @classmethod
-    def of(cls, dataset: Any, driver: str, held: bool = False) -> _File:
+    def of(cls, dataset: Any, driver: str, held: bool = False) -> _VrtSource:
         """Return the record of an opened file."""
         size, name = (dataset.width, dataset.height), f"vrt://{dataset.name}?if={driver}"
         return cls(name, size, dataset.dtypes, dataset.units, tuple(dataset.block_shapes), held)
@@ -276,22 +276,22 @@ class _File(NamedTuple):
         return Named(self.name, properties=dict(zip(PROPERTIES, texts, strict=True)))
 
 
-def _file_of(file: Path, driver: str, alone: bool, stack: ExitStack) -> _File:
+def _vrt_source(file: Path, driver: str, alone: bool, stack: ExitStack) -> _VrtSource:
     """Return a source; one that GDAL has to see alone is opened on the stack."""
     _refuse_what_opens_others(file, driver)
-    if alone or _only_alone(driver) or not _PLAIN.fullmatch(str(file)):
-        return _File.of(stack.enter_context(_opened_alone(file, driver)), driver, held=True)
+    if alone or _only_alone(driver) or not _PLAIN_PATH.fullmatch(str(file)):
+        return _VrtSource.of(stack.enter_context(_opened_alone(file, driver)), driver, held=True)
     found = file.stat()
     return _plain_file(file, driver, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
 @lru_cache(4096)  # a DEM of many tiles is opened for every window
-def _plain_file(file: Path, driver: str, *_version: int) -> _File:
+def _plain_file(file: Path, driver: str, *_version: int) -> _VrtSource:
     with _opened_quietly(file, driver=driver) as dataset:
-        return _File.of(dataset, driver)
+        return _VrtSource.of(dataset, driver)
 
 
-def _placed(band: Band, files: Mapping[Path, _File], size: tuple[int, int], name: str) -> Band:
+def _placed(band: Band, files: Mapping[Path, _VrtSource], size: tuple[int, int], name: str) -> Band:
     """Return a band with all rectangles of its sources, and, where it states none, the unit of the first one."""
     sources = []
     for source in band.sources:

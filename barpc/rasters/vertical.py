@@ -106,10 +106,10 @@ def _of_crs(wkt: str) -> Vertical:
 
 # --- geoids by name ---------------------------------------------------------------------------------------
 
-_OWN = {"egm96": Path(__file__).with_name("egm96_15.tif")}
+_GEOID_GRIDS = {"egm96": Path(__file__).with_name("egm96_15.tif")}
 """15 arc minutes, rounded to 1/128 m: of the US National Geospatial-Intelligence Agency, in the public domain."""
 _IN_PROJ = {"egm2008": ("us_nga_egm08_25.tif", "egm08_25.gtx")}
-GEOIDS = (*_OWN, *_IN_PROJ)
+GEOIDS = (*_GEOID_GRIDS, *_IN_PROJ)
 WORDS = (NO_GEOID, ELLIPSOIDAL, FLAT, *GEOIDS)
 
 
@@ -127,8 +127,8 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
         return name
     if name not in GEOIDS or Path(text).exists():
         return text
-    if name in _OWN:
-        return str(_OWN[name])
+    if name in _GEOID_GRIDS:
+        return str(_GEOID_GRIDS[name])
     folders = proj_folders()
     for folder in folders:
         for file in _IN_PROJ[name]:
@@ -143,7 +143,7 @@ def geoid_file(given: str | os.PathLike[str]) -> str:
 
 def geoid_places() -> Iterator[Path]:
     """Yield the folders in which geoids are that are given by their names."""
-    yield from (path.parent for path in _OWN.values())
+    yield from (path.parent for path in _GEOID_GRIDS.values())
     yield from proj_folders()
 
 

@@ -157,13 +157,13 @@ def read_vrt(path: Path, *, name: str | None = None) -> Vrt:
     """
     name = name or str(path)
     try:
-        return _parsed(read_bytes(path, replace(XML, most=MB)), path.resolve().parent, name)
+        return _parsed_vrt(read_bytes(path, replace(XML, most=MB)), path.resolve().parent, name)
     except RpcFormatError as error:
         raise ImageError(str(error)) from error
 
 
 @lru_cache(maxsize=1)  # a file that was written is read twice in a row
-def _parsed(data: bytes, folder: Path, name: str) -> Vrt:
+def _parsed_vrt(data: bytes, folder: Path, name: str) -> Vrt:
     return vrt_from_xml(parse_xml(data, name=name, max_bytes=MB), folder, name)
 
 
@@ -335,7 +335,7 @@ def _add_band(parent: Element, band: Band, named: Callable[[Source], Named], att
     element = SubElement(parent, "VRTRasterBand", {"dataType": GDAL_TYPES[band.dtype], **attributes})
     hidden = band.nodata is None
     texts = {
-        "NoDataValue": _number(band.fill) if band.fill or not hidden else "",
+        "NoDataValue": _shortest(band.fill) if band.fill or not hidden else "",
         "HideNoDataValue": "1" if band.fill and hidden else "",
         "ColorInterp": band.color.capitalize(),
         "UnitType": band.unit or "",
@@ -360,11 +360,11 @@ def _add_source(parent: Element, source: Source, file: Named) -> None:
         for tag, rect in (("SrcRect", source.src or (0, 0, *source.dst[2:])), ("DstRect", source.dst)):
             SubElement(element, tag, dict(zip(_RECT, map(str, rect), strict=True)))
     if source.nodata is not None:
-        SubElement(element, "NODATA").text = _number(source.nodata)
+        SubElement(element, "NODATA").text = _shortest(source.nodata)
     if not source.plain:
         SubElement(element, "ScaleOffset").text = repr(source.scale[1])
         SubElement(element, "ScaleRatio").text = repr(source.scale[0])
 
 
-def _number(value: float) -> str:
+def _shortest(value: float) -> str:
     return str(int(value)) if value.is_integer() else repr(value)  # GDAL reads 1e+17 of a whole type as 1

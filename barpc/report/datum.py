@@ -41,7 +41,7 @@ def datum_reasons(datums: Iterable[HeightDatum], adjustment: Adjustment, lean: f
         taken, other = (float((((offset + more) / sigma) ** 2).sum()) for more in (0.0, one.otherwise))
         fits = SURELY**2 * len(offset)
         if other <= fits < taken and taken - other > 2.0 * SURE:
-            yield _contradicted(one, offset[np.argmin(sigma)])
+            yield _contradiction(one, offset[np.argmin(sigma)])
         elif one.source == "gcps" and _is_undulation(one, adjustment, share):
             yield (
                 f"{one.name} move the scene by {abs(one.otherwise):.0f} m in height, which is the height of the geoid "
@@ -81,7 +81,7 @@ def _shifts(one: HeightDatum, adjustment: Adjustment, share: float, lean: float)
     return " and ".join(words + [f"up to {metres(aside)} off horizontally"] * bool(aside > np.hypot(*sigma[:_UP])))
 
 
-def _contradicted(one: HeightDatum, offset: float) -> str:
+def _contradiction(one: HeightDatum, offset: float) -> str:
     geoid = f"{metres(abs(one.otherwise))} {'above' if (one.otherwise > 0) != one.converted else 'below'}"
     seems = "ellipsoidal" if one.converted else "above sea level"
     return (

@@ -25,7 +25,7 @@ def decisions(summary: Summary) -> list[str]:
     if scene is not None:
         if scene.model:
             found.append(f"Each camera is corrected by {scene.model.replace('+', ' and ')}.")
-        found += [*_drift(scene, options.get("adjust.drift")), *_added(scene, views)]
+        found += [*_drift(scene, options.get("adjust.drift")), *_added_images(scene, views)]
         found += [*_jitter(scene, views), *_priors(scene, views), *_rejected(scene, views)]
     if (test := summary.control_test) is not None:
         found.append(
@@ -61,7 +61,7 @@ def _corrections(views: Sequence[ViewEntry]) -> list[CorrectionEntry]:
     return [view.correction for view in views if view.correction is not None]
 
 
-def _added(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
+def _added_images(scene: SceneEntry, views: Sequence[ViewEntry]) -> Iterator[str]:
     """Yield why no parameters were added to the model."""
     if scene.explanations or scene.held_out_places is None:  # None: of an earlier release
         return

@@ -20,7 +20,7 @@ _WGS84 = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
     'UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]'
 )
-_SCHEMA = """
+_EMPTY_GEOPACKAGE = """
 PRAGMA application_id = 0x47504B47;
 PRAGMA user_version = 10300;
 CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
@@ -87,7 +87,7 @@ STYLES = {
 
 
 @dataclass(frozen=True)
-class Layer:
+class MapLayer:
     """Geometries in lon, lat [deg], points with altitude [m above the ellipsoid], and columns with their SQL types."""
 
     name: str
@@ -101,18 +101,18 @@ def point_shapes(lonlatalt: Array) -> npt.NDArray[np.object_]:
     return np.asarray(shapely.points(lonlatalt))
 
 
-def geopackage(layers: Sequence[Layer]) -> bytes:
+def geopackage(layers: Sequence[MapLayer]) -> bytes:
     """Return the bytes of a GeoPackage; layers without geometries are left out.
 
     Examples
     --------
     >>> import numpy as np
-    >>> layer = Layer("ties", point_shapes(np.array([[5.4, 43.3, 120.0]])), ["track INTEGER"], [(7,)])
+    >>> layer = MapLayer("ties", point_shapes(np.array([[5.4, 43.3, 120.0]])), ["track INTEGER"], [(7,)])
     >>> geopackage([layer])[:15]
     b'SQLite format 3'
     """
     with closing(sqlite3.connect(":memory:")) as data:
-        data.executescript(_SCHEMA)
+        data.executescript(_EMPTY_GEOPACKAGE)
         data.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", _SYSTEMS)
         for layer in layers:
             if not len(layer.shapes):

@@ -91,7 +91,7 @@ def round_ticks(low: float, high: float, most: int) -> list[float]:
     return [round(k * step, 12) + 0.0 for k in range(first, last + 1)]
 
 
-def evenly(rows: Any, most: int) -> Any:
+def thin(rows: Any, most: int) -> Any:
     """Return all rows, or a number of them at even steps."""
     return rows[:: max(1, -(-len(rows) // most))]
 
@@ -134,8 +134,8 @@ def ground_map(files: RunFiles) -> str:
     summary = files.summary
     rings = [ring for outline in files.outlines for ring in outline]
     points: list[tuple[str, int, GcpEntry | CheckPointEntry]]
-    points = [*(("gcps", 1, point) for point in evenly(summary.gcps, MAX_SHOWN))]
-    points += [("check_points", -1, point) for point in evenly(summary.check_points, MAX_SHOWN)]
+    points = [*(("gcps", 1, point) for point in thin(summary.gcps, MAX_SHOWN))]
+    points += [("check_points", -1, point) for point in thin(summary.check_points, MAX_SHOWN)]
     placed = np.array([(point.lon, point.lat) for *_, point in points], dtype=np.float64).reshape(-1, 2)
     plane = _plane_of(np.concatenate([*rings, files.points[:, :2], placed]))
     lines, words, bar, taken = _graticule(plane)
@@ -158,7 +158,7 @@ def ground_map(files: RunFiles) -> str:
         lines=lines,
         words=words,
         bar=bar,
-        dots=plane(evenly(files.points, MAX_MARKS)[:, :2]).tolist(),
+        dots=plane(thin(files.points, MAX_MARKS)[:, :2]).tolist(),
         groups=[(sentence, *plane(ends).ravel()[[0, 3, 2, 1]].tolist()) for sentence, ends in groups],
         outlines=[(k, view, [plane(ring[:-1]).tolist() for ring in outline]) for k, view, outline in drawn],
         gaps=[(view, plane(np.array(view.gap)[:, :2]).tolist()) for _, view, _ in drawn if view.gap],
@@ -189,7 +189,7 @@ def largest_miss(points: Sequence[GcpEntry]) -> float:
 def _misses(points: Sequence[GcpEntry], plane: Plane) -> list[tuple[list[Array], list[Array]]]:
     """Return arrows of the residuals of GCPs in plan, from the points that are drawn; the longest has one length."""
     scale, found = 2 * _ARROW_LENGTH / (largest_miss(points) or 1.0), []
-    for point, vector in zip(evenly(points, MAX_SHOWN), _misses_in_plan(evenly(points, MAX_SHOWN)), strict=True):
+    for point, vector in zip(thin(points, MAX_SHOWN), _misses_in_plan(thin(points, MAX_SHOWN)), strict=True):
         if np.isfinite(vector).all() and vector.any():
             shaft = vector * [scale, -scale]
             found.append(_arrow(plane(np.array([point.lon, point.lat])) + shaft / 2, shaft))
@@ -220,7 +220,7 @@ def _drawn(files: RunFiles) -> list[tuple[int, ViewEntry, Sequence[Array]]]:
     bad = flagged(files.summary.views)[:MAX_SHOWN]
     good = [row for name, row in whole.items() if name not in {view.name for view in bad}]
     room = MAX_SHOWN - len(bad)
-    return [*(evenly(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
+    return [*(thin(good, room) if room else ()), *(whole[view.name] for view in bad[::-1])]
 
 
 OccupiedAreas = list[tuple[float, float, float]]  # places that words have on the map: x, y, half their width
@@ -359,7 +359,7 @@ def residual_panels(
     if len(views) > TABLE_ROWS_SHOWN:
         rest.sort(key=lambda k: -shares[k])
     for k in [*first, *rest][:MAX_PICTURES]:
-        rows = evenly(rows_of[k], most)
+        rows = thin(rows_of[k], most)
         svg = _panel(when, k, views[k], grids[k], np.hstack([observations.xy[rows], residuals[rows]]), longest)
         charts.append((svg, f"{views[k].name}: {_panel_note(grids[k])}"))
     some = "those that need review, then " * bool(first) + "those with the largest systematic part"

@@ -44,7 +44,7 @@ def next_steps(summary: Summary, added: Added | None = None) -> tuple[StepEntry,
 
     `added` is the effect of its images on those of an earlier run, where they were added to one.
     """
-    use = _use if summary.adjusted else _adjust
+    use = _use if summary.adjusted else _adjustment_step
     if added is not None and added.contradicted is not None:
         use = partial(_update, added)
     return (*use(summary), *_improve(summary), *_review(summary))
@@ -78,7 +78,7 @@ def _update(added: Added, summary: Summary) -> Iterator[StepEntry]:
         yield StepEntry("use", f"Run again with --update: cameras of {added.run} and new ones do not agree.")
 
 
-def _adjust(summary: Summary) -> Iterator[StepEntry]:
+def _adjustment_step(summary: Summary) -> Iterator[StepEntry]:
     """Yield the adjustment of cameras that disagree, or with the tie points of a match."""
     if any(view.cause == "disagrees" for view in summary.views):
         yield StepEntry("use", "The cameras disagree: adjust them.", ("barpc adjust IMAGE... -o adjusted",))

@@ -14,36 +14,36 @@ from barpc.report.records import json_form
 from barpc.report.summary.words import median
 
 NO_RUN = "none"  # in place of the status
-_AXES = "east", "north", "up"
-COLUMNS = (
+_ENU = "east", "north", "up"
+RUN_COLUMNS = (
     "run", "status", "passed", "kind", "images", "left_out", "tie_points", "rmse_before_px", "rmse_after_px",
-    *(f"moved_{axis}_m" for axis in _AXES), *(f"sigma_{axis}_m" for axis in _AXES), "gcps", "check_points",
+    *(f"moved_{axis}_m" for axis in _ENU), *(f"sigma_{axis}_m" for axis in _ENU), "gcps", "check_points",
     "headline", "reasons",
 )  # fmt: skip
 
 
 def overview(folders: Sequence[PathLike]) -> list[dict[str, Any]]:
-    """Return a row of `COLUMNS` for each folder; of one without a finished run the reason, its `status` is "none"."""
-    rows: list[dict[str, Any]] = json_form([_row(os.fspath(folder)) for folder in folders])
+    """Return a row of `RUN_COLUMNS` for each folder; without a finished run the reason, `status` is "none"."""
+    rows: list[dict[str, Any]] = json_form([_run_row(os.fspath(folder)) for folder in folders])
     return rows
 
 
-def _row(folder: str) -> dict[str, Any]:
+def _run_row(folder: str) -> dict[str, Any]:
     try:
         run = FinishedRun.open(folder).summary
     except InputError as error:
-        return {**dict.fromkeys(COLUMNS), "run": folder, "status": NO_RUN, "passed": False, "reasons": str(error)}
+        return {**dict.fromkeys(RUN_COLUMNS), "run": folder, "status": NO_RUN, "passed": False, "reasons": str(error)}
     rmse = (median(getattr(view, key) for view in run.views) for key in ("rmse_before", "rmse_after"))
     moved, sigma = ((None,) * 3,) * 2 if run.scene is None else (run.scene.shift_enu_m, run.scene.sigma_enu_m)
     counts = len(run.views), len(run.left_out), run.tracks.num_tracks
     said = len(run.gcps), len(run.check_points), run.headline, " ".join(run.reasons)
     figures = run.status, run.passed, run.kind, *counts, *rmse, *moved, *sigma, *said
-    return dict(zip(COLUMNS, (folder, *figures), strict=True))
+    return dict(zip(RUN_COLUMNS, (folder, *figures), strict=True))
 
 
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Return rows as CSV with a header; what is not known is empty."""
-    return "\n".join([",".join(COLUMNS), *(",".join(map(_text, row.values())) for row in rows)])
+    return "\n".join([",".join(RUN_COLUMNS), *(",".join(map(_text, row.values())) for row in rows)])
 
 
 def _text(value: Any) -> str:

@@ -43,8 +43,8 @@ from barpc.scene import connected_groups
 
 _OPEN = "images", "map", "random", "accuracy"  # sections that many images leave open
 MAX_LENGTHS_SAID = 4  # numbers of a sentence; more are a chart
-_ROUNDING = 1e-6  # px
-_SIGNIFICANT = 1e-4  # probability of the F test below which residuals are systematic: `SmoothTest.found`
+_ZERO_PX = 1e-6  # px
+_SYSTEMATIC = 1e-4  # probability of the F test below which residuals are systematic: `SmoothTest.found`
 _FOOTER = (
     "Altitudes are above the WGS84 ellipsoid. Pixel (0, 0) is the centre of the first pixel. The numbers of this page "
     "are in summary.json and in the folder tables/: residuals.csv, observations.csv, pairs.csv, footprints.geojson."
@@ -224,7 +224,7 @@ _LEGEND = (
 
 def _randomness(views: Sequence[ViewEntry], marked: Sequence[str]) -> str:
     """Return whether residuals are random; `marked`: images in most of whose cells they have a significant mean."""
-    systematic = [(view.systematic_px or 0.0, view.name) for view in views if known(view.systematic_p) < _SIGNIFICANT]
+    systematic = [(view.systematic_px or 0.0, view.name) for view in views if known(view.systematic_p) < _SYSTEMATIC]
     correlated = [(size, view.name) for view in views if (size := view.neighbour_correlated_px)]
     tests = ("systematic residuals (F test: p < 1e-4)", systematic), ("correlated neighbouring residuals", correlated)
     found = [
@@ -352,7 +352,7 @@ def _files_section(files: RunFiles) -> Section | None:
     worst = largest([value for view in views for value in (view.fit.max_px if view.fit else (None,))])
     if not tables:
         return None
-    exact = "Not known for every image" if worst is None else f"Yes, to within {two_digits(max(worst, _ROUNDING))} px"
+    exact = "Not known for every image" if worst is None else f"Yes, to within {two_digits(max(worst, _ZERO_PX))} px"
     answer = f"{exact}. The original images still carry the delivered RPC."
     return Section("files", "Do the new RPC files reproduce the corrected cameras?", answer, tables=tables)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from barpc.base.geodesy import Array
-from barpc.report.maps import WIDTH, evenly, panel_box, round_ticks, template
+from barpc.report.maps import WIDTH, panel_box, round_ticks, template, thin
 from barpc.report.ranking import TABLE_ROWS_SHOWN, worst_first
 from barpc.report.records import MAX_SHOWN
 from barpc.report.runfiles import RunFiles
@@ -28,7 +28,7 @@ def image_panels(files: RunFiles) -> list[tuple[str, str]]:
         k = number[view.name]
         box, own = panel_box(view), seen.view == k
         kept, cut = (
-            evenly((seen.xy[rows] + 0.5) * (box / view.size), MAX_SHOWN) for rows in (own & seen.used, own & ~seen.used)
+            thin((seen.xy[rows] + 0.5) * (box / view.size), MAX_SHOWN) for rows in (own & seen.used, own & ~seen.used)
         )
         boxes = [(words, *_clipped(place, view.size, box)) for words, place in parts.get(view.name, ())]
         text = template("drawings.svg.j2").module.thumbnail(
@@ -53,7 +53,7 @@ def _flagged_parts(files: RunFiles) -> dict[str, list[tuple[str, Limits]]]:
     """Return rows, columns and cells of images that a table names, by the image: a sentence and limits each."""
     found: dict[str, list[tuple[str, Limits]]] = {}
     for one in _named_lines(files):
-        for ends in _ends(one):
+        for ends in _interval_ends(one):
             words = one.place if isinstance(one, LeftEntry) else one.sentence
             limits: Limits = (ends, None) if one.axis == AXES[0] else (None, ends)
             found.setdefault(str(one.image), []).append((words, limits))
@@ -73,7 +73,7 @@ def _named_lines(files: RunFiles) -> list[ExplanationEntry | LeftEntry]:
     return [one for one in found if one.image in files.number]
 
 
-def _ends(one: ExplanationEntry | LeftEntry) -> list[tuple[float, float]]:
+def _interval_ends(one: ExplanationEntry | LeftEntry) -> list[tuple[float, float]]:
     """Return the first and last row or column, where there are some."""
     known = one.axis is not None and one.first is not None and one.last is not None
     return [(float(one.first or 0.0), float(one.last or 0.0))] if known else []
@@ -99,7 +99,7 @@ def pair_strips(files: RunFiles) -> list[tuple[str, str]]:
 
 # --- residuals along rows or columns ----------------------------------------------------------------------------
 
-_BINS = 48  # parts of an image's rows or columns, of which a line of residuals takes the medians
+_PROFILE_PARTS = 48  # parts of an image's rows or columns, of which a line of residuals takes the medians
 _MIN_IN_BIN = 3
 _PROFILE = 420.0, 230.0  # units
 _PROFILE_LEFT, _PROFILE_RIGHT = 46.0, 412.0
@@ -109,21 +109,21 @@ def profile_charts(files: RunFiles) -> list[tuple[str, str]]:
     """Draw residuals along the rows or columns that an explanation or an inconsistent region names, with captions."""
     named: dict[tuple[str, int], list[tuple[float, float]]] = {}
     for one in _named_lines(files):
-        named.setdefault((str(one.image), AXES.index(one.axis or AXES[1])), []).extend(_ends(one))
-    charts = (_profile(files, image, axis, bands) for (image, axis), bands in named.items())
+        named.setdefault((str(one.image), AXES.index(one.axis or AXES[1])), []).extend(_interval_ends(one))
+    charts = (_chart(files, image, axis, bands) for (image, axis), bands in named.items())
     return [chart for chart in charts if chart is not None][:TABLE_ROWS_SHOWN]
 
 
-def _profile(files: RunFiles, image: str, axis: int, bands: Sequence[tuple[float, float]]) -> tuple[str, str] | None:
+def _chart(files: RunFiles, image: str, axis: int, bands: Sequence[tuple[float, float]]) -> tuple[str, str] | None:
     number, seen = files.number[image], files.observations
     length = files.summary.views[number].size[axis]
     own = seen.view == number
-    bins = np.clip((seen.xy[own, axis] + 0.5) * (_BINS / length), 0, _BINS - 1).astype(np.int64)
-    middles = (np.arange(_BINS) + 0.5) * (length / _BINS)
-    known = np.bincount(bins, minlength=_BINS) >= _MIN_IN_BIN
+    bins = np.clip((seen.xy[own, axis] + 0.5) * (_PROFILE_PARTS / length), 0, _PROFILE_PARTS - 1).astype(np.int64)
+    middles = (np.arange(_PROFILE_PARTS) + 0.5) * (length / _PROFILE_PARTS)
+    known = np.bincount(bins, minlength=_PROFILE_PARTS) >= _MIN_IN_BIN
     lines = {}
     for kind, residuals in (("before", seen.before[own]), ("after", seen.after[own])):
-        found = np.stack([medians(column, bins, _BINS) for column in residuals.T])
+        found = np.stack([medians(column, bins, _PROFILE_PARTS) for column in residuals.T])
         use = known & np.isfinite(found).all(axis=0)
         if kind == "before" and use.sum() > 2:
             found = np.stack([row - np.polyval(np.polyfit(middles[use], row[use], 1), middles) for row in found])
@@ -146,7 +146,7 @@ def _profile(files: RunFiles, image: str, axis: int, bands: Sequence[tuple[float
     text = template("drawings.svg.j2").module.profile(
         key=f"profile-{number}-{axis}",
         title=f"Residuals of {image} along its {AXES[axis]}",
-        described=f"Medians in {_BINS} parts; {counted(int(own.sum()), 'observation')}.",
+        described=f"Medians in {_PROFILE_PARTS} parts; {counted(int(own.sum()), 'observation')}.",
         width=_PROFILE[0],
         height=_PROFILE[1],
         bands=[tuple(_PROFILE_LEFT + np.clip(band, 0, length) * wide) for band in bands],

@@ -32,7 +32,7 @@ WORST_LEFT = 0.15  # px: a larger misfit of one RPC anywhere needs review
 NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher states: more needs review
 
 _PARALLEL = 0.05  # sine of the angle between lines and axis under which a part across tells nothing of that along
-_WHOLE = 0.9  # share of the rows or columns that is the whole image
+_WHOLE_IMAGE = 0.9  # share of the rows or columns that is the whole image
 _CONTROL_WORDS = {
     "rejected": ("{} rejected, as the others contradict {}", "Check coordinates, axes and image positions"),
     "contradicts": ("{} used, with residuals above 4 standard deviations", "Check coordinates and stated accuracies"),
@@ -190,7 +190,7 @@ def _most_in(view: ViewEntry, adjustment: Adjustment) -> str:
     """Return the region with most of a view's rejected tie points in words; empty without one."""
     for one in left_entries(adjustment):
         if one.image == view.name and one.rejected > MANY_REJECTED and not one.moving:
-            whole = one.last - one.first > _WHOLE * view.size[AXES.index(one.axis)]
+            whole = one.last - one.first > _WHOLE_IMAGE * view.size[AXES.index(one.axis)]
             far = f"typically by {two_digits(one.rejected_median_px)} px"
             return f", {far}" if whole else f"; most in {one.place} ({100 * one.rejected:.0f} %, {far})"
     return ""

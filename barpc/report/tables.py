@@ -19,7 +19,7 @@ import shapely
 from barpc.base.geodesy import CHUNK, Array, feature_collection, geojson_feature
 from barpc.pointio.matches import matches_npz
 from barpc.pointio.names import cell
-from barpc.report.geopackage import Layer, point_shapes
+from barpc.report.geopackage import MapLayer, point_shapes
 from barpc.report.outcome import Run
 from barpc.report.records import value_of
 from barpc.report.runfiles import MATCHES, OBSERVATION_COLUMNS, RESIDUALS
@@ -52,7 +52,7 @@ def _csv(header: Sequence[str], lines: Iterable[str]) -> Iterator[bytes]:
         yield "\n".join([*part, ""]).encode()
 
 
-def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+def _cells_by_row(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of columns as Python's values."""
     for start in range(0, len(columns[0]), CHUNK):
         yield from zip(*(column[start : start + CHUNK].tolist() for column in columns), strict=True)
@@ -61,7 +61,7 @@ def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
 def _residuals_csv(run: Run, _: Summary) -> Iterable[bytes]:
     rows = (
         f"{lon:.9f},{lat:.9f},{alt:.4f},{mean:.4f},{count:.0f},{_rounded(before, 4)},{track:.0f}"
-        for lon, lat, alt, mean, count, before, track in _rows(*_per_track(run).T)
+        for lon, lat, alt, mean, count, before, track in _cells_by_row(*_per_track(run).T)
     )
     return _csv(RESIDUALS, rows)
 
@@ -74,7 +74,7 @@ def _observation_lines(run: Run) -> Iterator[str]:
         after = np.full_like(before, np.nan) if run.ties_after is None else run.ties_after.residuals[part]
         numbers = np.column_stack([tracks.xy[part], before, after])
         whole = np.asarray(np.isfinite(numbers).all(axis=1))
-        for view, track, row, used, full in _rows(
+        for view, track, row, used, full in _cells_by_row(
             tracks.view[part], tracks.point[part], numbers, run.keep[part], whole
         ):
             text = _RESIDUAL_CELLS(*row) if full else ",".join(_rounded(value, 4) for value in row)
@@ -112,21 +112,21 @@ def outline_features(run: Run, summary: Summary) -> list[dict[str, Any]]:
     ]
 
 
-def map_layers(run: Run, summary: Summary) -> list[Layer]:
+def map_layers(run: Run, summary: Summary) -> list[MapLayer]:
     """Return the layers of a run for a GIS: footprints, tie points, GCPs and check points, with their residuals."""
     outlines, ties = [one for one in outline_features(run, summary) if one["geometry"]], _per_track(run)
     kinds = ("TEXT", "TEXT", "TEXT", "INTEGER", "DOUBLE", "DOUBLE", "DOUBLE", "DOUBLE")
     columns = [f"{name} {kind}" for name, kind in zip((*ViewEntry.FOOTPRINT.split(), "altitude_m"), kinds, strict=True)]
     shapes = [shapely.geometry.shape(one["geometry"]) for one in outlines]
-    layers = [Layer("footprints", shapes, columns, [tuple(one["properties"].values()) for one in outlines])]
+    layers = [MapLayer("footprints", shapes, columns, [tuple(one["properties"].values()) for one in outlines])]
     words = ["residual_px DOUBLE", "observations INTEGER", "residual_before_px DOUBLE", "track INTEGER"]
     rows = ((mean, int(count), before, int(track)) for mean, count, before, track in ties[:, 3:].tolist())
-    layers.append(Layer("tie_points", point_shapes(ties[:, :3]), words, rows))
+    layers.append(MapLayer("tie_points", point_shapes(ties[:, :3]), words, rows))
     words = ["name TEXT", "status TEXT", "east_m DOUBLE", "north_m DOUBLE", "up_m DOUBLE"]
     for name, entries in (("gcps", summary.gcps), ("check_points", summary.check_points)):
         places = np.array([(one.lon, one.lat, one.alt_m) for one in entries]).reshape(-1, 3)
         table = [(one.name, getattr(one, "status", "check"), *one.residual_enu_m) for one in entries]
-        layers.append(Layer(name, point_shapes(places), words, table))
+        layers.append(MapLayer(name, point_shapes(places), words, table))
     return layers
 
 

@@ -64,7 +64,7 @@ def read_acquisition(
             if name not in words and (stated := next(keyed.matches(text), None)):
                 words[name] = stated[1].decode()
         time = time or _time(text)
-        if not (words and time) and (strip := next(_STRIP.matches(text), None)):
+        if not (words and time) and (strip := next(_STRIP_NAME.matches(text), None)):
             words.setdefault("satellite", strip[1].decode())
             time = time or _of_digits(strip[2].decode(), strip[3].decode())
     name, number, band = (words.get(word, "") for word in _SENSOR)
@@ -132,12 +132,12 @@ class _Keyed:
                 yield found
 
 
-_NUMBER = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
+_NUMBER_TEXT = rb"([+-]?\d{1,3}(?:\.\d{1,20})?(?:e[+-]?\d{1,2})?)"
 _SUN = _Keyed(
     (b"sun",),
     re.compile(
         rb"(?<![a-z])(?:mean_?)?sun_?(?:(el(?:ev(?:ation)?)?)|az(?:im(?:uth)?)?)\"?(?:\s?unit=\"\w{1,9}\")?\s{0,9}[>=:]"
-        rb"\s{0,9}" + _NUMBER,
+        rb"\s{0,9}" + _NUMBER_TEXT,
         re.IGNORECASE,
     ),
 )
@@ -166,7 +166,7 @@ _WHEN = _Keyed(
         re.IGNORECASE,
     ),
 )  # fmt: skip
-_STRIP = _Keyed(
+_STRIP_NAME = _Keyed(
     (b"ds_",), re.compile(rb"(?<![A-Za-z0-9])DS_(PHR1[AB]|SPOT[67]|PNEO[3-6])_(\d{8})(\d{6})\d?_")
 )  # the acquisition by which Airbus names what it delivers: sensor, day, time
 _IMAGING_TIME = re.compile(rb"<IMAGING_TIME>" + _CLOCK)

@@ -20,7 +20,7 @@ LEAST_LINE = 2000
 """Columns: the shortest lines and frames of sensors with RPCs have 2560 (SkySat, PlanetScope); parts are often less."""
 STATED_TO = 2.0  # px: vendors count from 0 or from 1, and round a half
 _PADDED = 0.03  # of a line: RPCs of whole products reach beyond their images by up to 1 %
-_GROUND = 0.9, 3.0  # columns of the ground that an RPC states over its own: 1.0 to 2.9, as ground is a box in lon, lat
+_GROUND_SPAN = 0.9, 3.0  # columns of an RPC's ground over its own: 1.0 to 2.9, as ground is a box in lon, lat
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def line_place(camera: Camera, size: tuple[int, int]) -> LinePlace:
     corners = np.array([(a, b, 0.0) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     of_ground = float(np.ptp(model.project(model.ground_offset + corners * model.ground_scale)[:, 0])) / columns
     inside = first - STATED_TO <= 0.0 and width <= first + columns + STATED_TO
-    if not (inside and _GROUND[0] <= of_ground <= _GROUND[1]):
+    if not (inside and _GROUND_SPAN[0] <= of_ground <= _GROUND_SPAN[1]):
         raise InputError(
             f"its RPC states columns {first:.0f} to {first + columns - 1:.0f} for an image of {width}, and the ground "
             f"of {of_ground * columns:.0f} columns: these are not the columns of a whole product"

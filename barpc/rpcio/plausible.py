@@ -28,7 +28,7 @@ _MAP_SHAPE = 0.005, 0.05  # of the longer side: a map on its axes is exact, a tu
 _MAP_SHIFT = 0.1, 0.5  # of the longer side: by the pointing that somebody corrected in one of both
 _LEAST_SHAPE = 4.0  # px
 _OFF_CORNERS = 30.0  # m: seven public SPOT scenes 2.7 at most; corners rounded to seconds are 22 off
-_LEVELS = 33  # altitudes of the RPC at which its image may lie on the map
+_TRIED_ALTITUDES = 33  # altitudes of the RPC at which its image may lie on the map
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def corners_off(model: SensorModel, corners: Array) -> tuple[str, tuple[Doubt, .
     return said, (Doubt(f"the corners that its producer states lie {off:.0f} m from the camera's"),) * doubtful
 
 
-def reach(rpc: RPC, size: tuple[int, int]) -> float:
+def reach_of_corners(rpc: RPC, size: tuple[int, int]) -> float:
     """Return how far the corners of an image lie from the middle of its RPC's ground, in half widths of that ground.
 
     At the middle of the RPC's altitudes; NaN where a corner has no ground there.
@@ -74,12 +74,12 @@ def made_for(rpc: RPC) -> tuple[float, float] | None:
     return (width, height) if begins.all() else None
 
 
-def _corners(size: tuple[int, int]) -> Array:
+def _pixel_corners(size: tuple[int, int]) -> Array:
     return np.array([(col, row) for col in (0.0, size[0] - 1.0) for row in (0.0, size[1] - 1.0)])
 
 
 def _corners_on_ground(rpc: RPC, size: tuple[int, int]) -> Array:
-    ground = rpc.localize(_corners(size), np.full(4, rpc.ground_offset[2]))
+    ground = rpc.localize(_pixel_corners(size), np.full(4, rpc.ground_offset[2]))
     ground[:, 0] = wrap_longitude(ground[:, 0], rpc.ground_offset[0])
     return ground
 
@@ -98,7 +98,7 @@ def _another_size(rpc: RPC, size: tuple[int, int]) -> Doubt | None:
 
 
 def _another_ground(rpc: RPC, size: tuple[int, int]) -> Doubt | None:
-    found = reach(rpc, size)
+    found = reach_of_corners(rpc, size)
     if not found > BEYOND:
         return None
     return Doubt(
@@ -116,14 +116,14 @@ def _another_map(rpc: RPC, size: tuple[int, int], frame: RasterFrame | None) -> 
     """
     if frame is None or frame.crs is None:
         return None
-    corners, side = _corners(size), float(max(size))
+    corners, side = _pixel_corners(size), float(max(size))
     a, b, c, d, e, f = frame.transform[:6]
     col, row = corners.T + 0.5
     try:
         lon, lat = warp_points(frame.crs, CRS.from_epsg(4326), a * col + b * row + c, d * col + e * row + f)
     except RasterioError:
         return None  # a reference system of no place on Earth
-    levels = rpc.ground_offset[2] + np.linspace(-1.0, 1.0, _LEVELS) * rpc.ground_scale[2]
+    levels = rpc.ground_offset[2] + np.linspace(-1.0, 1.0, _TRIED_ALTITUDES) * rpc.ground_scale[2]
     ground = np.stack(np.broadcast_arrays(np.array(lon), np.array(lat), levels[:, None]), axis=-1)
     off = rpc.project(ground) - corners
     shift = off.mean(axis=1, keepdims=True)

@@ -90,7 +90,7 @@ def scene_beside(image: Path) -> Path | None:
     return None
 
 
-def described(path: PathOrUrl) -> tuple[tuple[int, int] | None, bool]:
+def stated_in_xml(path: PathOrUrl) -> tuple[tuple[int, int] | None, bool]:
     """Return the width and height [px] that a vendor's XML states, if so, and whether it holds a physical model."""
     text = decode_text(read_bytes(path, RPC_FILE))
     found = [
@@ -157,7 +157,7 @@ def shadows(image: Path | str) -> list[Sidecar]:
     given. GDAL's own ``.aux.xml`` counts where the image has no RPC.
     """
     image = location(image)
-    driver = _driver_of(image)
+    driver = _image_driver(image)
     vrt = driver == "VRT"
     own = vrt or _own_rpc(image, driver) is not None
     found = (s for s in sidecars(image) if s.kind != "strip")  # which no tool reads for one tile
@@ -224,7 +224,7 @@ def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None =
     path = location(path)
     options = ReadOptions(first_pixel, band)
     head = read_head(path, IMAGE, 64)
-    driver = _driver_of(path)
+    driver = _image_driver(path)
     text = encoding_of(head)[:6] == "utf-16" or b"\0" not in head  # no other text holds a zero byte near its start
     if not text or driver not in (None, *MOSAICS):
         return _image_source(path, driver, options)
@@ -242,7 +242,7 @@ def read_rpc_source(path: str | os.PathLike[str], *, first_pixel: float | None =
     return RpcSource(rpc, name, path)
 
 
-def _driver_of(path: PathOrUrl) -> str | None:
+def _image_driver(path: PathOrUrl) -> str | None:
     """Return the driver of an image; a VRT may begin with a byte order mark or blanks."""
     return driver_at(path, read_head(path, IMAGE, 64).removeprefix(b"\xef\xbb\xbf").lstrip())
 
@@ -258,8 +258,8 @@ def _image_source(path: PathOrUrl, driver: str | None, options: ReadOptions) -> 
             raise
     if first is None and own is None and found:
         first = found[0]
-    shown = driver not in (None, *MOSAICS) and own is None and (first is None or driver not in _OWN)
-    domain = _domain(path, options, alone=first is None) if shown else None
+    shown = driver not in (None, *MOSAICS) and own is None and (first is None or driver not in _RPC_READERS)
+    domain = _stated_domain(path, options, alone=first is None) if shown else None
     ignored = [s.path.name for s in found if s is not first]
     if first is not None:
         source = _sidecar_source(path, first, options)
@@ -284,14 +284,14 @@ def _with_gcps(path: PathOrUrl) -> str:
     return ""
 
 
-_OWN = {"GTiff": read_tag, "NITF": read_nitf}  # in these GDAL's order puts it before some files beside the image
+_RPC_READERS = {"GTiff": read_tag, "NITF": read_nitf}  # GDAL takes these before some files beside the image
 
 
 def _own_rpc(path: PathOrUrl, driver: str | None) -> RPC | None:
-    return _OWN[driver](path) if driver in _OWN else None
+    return _RPC_READERS[driver](path) if driver in _RPC_READERS else None
 
 
-def _domain(path: PathOrUrl, options: ReadOptions, alone: bool) -> RPC | None:
+def _stated_domain(path: PathOrUrl, options: ReadOptions, alone: bool) -> RPC | None:
     """Return the RPC that GDAL shows of an image; errors are those of the image where no other file has one."""
     if alone:
         return read_domain(path, options)
@@ -345,12 +345,12 @@ def _tile_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
 
 # --- tiles ------------------------------------------------------------------------------------------------
 
-_TILE = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[-_]|$)", re.IGNORECASE)
+_TILE_NAME = re.compile(r"_R(\d{1,4})C(\d{1,4})(?=[-_]|$)", re.IGNORECASE)
 
 
 def _strip_name(stem: str) -> str:
     """Return the name of the strip of a tile, ``X`` of ``X_R1C2``; empty for other names."""
-    found = _TILE.search(stem)
+    found = _TILE_NAME.search(stem)
     return stem[: found.start()] + stem[found.end() :] if found else ""
 
 
@@ -363,7 +363,7 @@ def _file_beside(file: PathOrUrl, name: str) -> PathOrUrl | None:
 
 def _strip_origin(image: PathOrUrl, path: PathOrUrl) -> _RpcWindow:
     """Return the origin of a tile in the strip whose RPC `path` is: by the ``.TIL`` beside either."""
-    name, place = f"{_strip_name(image.stem)}.TIL", _TILE.search(image.stem)
+    name, place = f"{_strip_name(image.stem)}.TIL", _TILE_NAME.search(image.stem)
     til = _file_beside(image, name) or _file_beside(path, name)
     if til is None:
         if place and [int(index) for index in place.groups()] == [1, 1]:

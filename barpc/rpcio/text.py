@@ -471,13 +471,13 @@ def write_json(rpc: RPC) -> str:
     return json.dumps({"rpc": rpc.to_rpcm_dict()}, indent=1) + "\n"
 
 
-_PAIR = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULTILINE)
+_KEY_AND_VALUE = re.compile(r"^[ \t-]*+(\w++):[ \t]*+(\[[^\[\]]*+\]|[^\n\[{]*+)", re.MULTILINE)
 
 
 def read_yaml(text: str, name: str, options: ReadOptions) -> RPC:
     """Read a parameter file of orthority with one image: names as rasterio's, lists in brackets or as dashes."""
     text = re.sub(r"\n[ \t]*+-[ \t]++(?=[+-.\d])", ", ", text)  # a block list into one line
-    return _read_words(_PAIR.findall(text), _LOWER_KEYS, name, options)
+    return _read_words(_KEY_AND_VALUE.findall(text), _LOWER_KEYS, name, options)
 
 
 # --- columns of fixed width -------------------------------------------------------------------------------

@@ -307,7 +307,7 @@ class RpcStack:
         lost = np.zeros(len(self.sensors), dtype=bool)
 
         def stacked(views: slice, within: IntArray, image: Array, alt: Array) -> list[Array]:
-            ground, found = _newton(self, image.T, alt, views, within)
+            ground, found = _invert(self, image.T, alt, views, within)
             lost[views] = np.bincount(np.repeat(np.arange(len(within) - 1), np.diff(within)), ~found) > 0
             return [ground]
 
@@ -394,7 +394,7 @@ def _blank(found: Array) -> Array:
     return found
 
 
-def _newton(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray) -> tuple[Array, BoolArray]:
+def _invert(stack: RpcStack, image: Array, alt: Array, views: slice, bounds: IntArray) -> tuple[Array, BoolArray]:
     """Return ground points (3, n) by Newton from RPCs' centres; which (n,) are certain: in the box, steps fall."""
     count = np.diff(bounds)
     offset, scale = (np.repeat(rows[views].T, count, axis=1) for rows in (stack.ground_offset, stack.ground_scale))

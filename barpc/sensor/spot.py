@@ -27,19 +27,19 @@ from barpc.sensor.samples import ATTITUDE_STEP, Detector, Linescan, Samples, cam
 SCENE = "Dataset_Sources/Source_Information/Scene_Source"
 """Where DIMAP 1 says what took an image; DIMAP 2 has no such part."""
 
-_LEVEL = re.compile(r"(?<!\d)(1A|1B|2A|2B|3|ORTHO)(?![0-9A-Z])")
+_PRODUCT_LEVEL = re.compile(r"(?<!\d)(1A|1B|2A|2B|3|ORTHO)(?![0-9A-Z])")
 _LEVEL_PLACES = (
     "Data_Processing/PROCESSING_LEVEL",
     "Metadata_Id/METADATA_PROFILE",
     "Data_Processing/GEOMETRIC_PROCESSING",
 )
-_POINTS = 8  # of the ephemeris
+_EPHEMERIS_POINTS = 8  # of the ephemeris
 _LONGEST_PERIOD = 0.1  # s; 0.0004 to 0.003 are usual
-_LARGEST = 0.5  # rad: of an attitude; 0.07 are usual (yaw steering)
+_LARGEST_ATTITUDE = 0.5  # rad: of an attitude; 0.07 are usual (yaw steering)
 _LOOK_DEGREES, _LOOK_MISFIT = range(1, 9), 1e-4  # px: the lowest degree of the tangents that is truer is taken
 _LEAST_PIXEL = 1e-7  # rad; 3e-6 is the least of SPOT 5
 _LOOK_STEP = 2.0  # px: look angles farther from a polynomial are no line of detectors
-_SIGMAS = {True: (30 / 8.3e5, 1.0), False: (350 / 8.3e5, 10.0)}  # rad, m: location without GCPs of SPOT 5, of 1 to 4
+_LOCATION = {True: (30 / 8.3e5, 1.0), False: (350 / 8.3e5, 10.0)}  # rad, m: sigma without GCPs of SPOT 5, of 1 to 4
 _NAVIGATION_FROM_CAMERA = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -65,20 +65,20 @@ def camera_of_scene(root: XmlFields, band: str | None = None, attitudes: str | N
     first = stamp.time("SCENE_CENTER_TIME") - np.timedelta64(before, "ns")
     last = period * (size[1] - 1)
     ticks = np.arange(-EXTRAPOLATION, last + EXTRAPOLATION + ATTITUDE_STEP, ATTITUDE_STEP)
-    states = _states(strip, first, last, ticks)
+    states = _ephemeris(strip, first, last, ticks)
     angles = np.zeros((len(ticks), 3))
     if five or attitudes:
         times, sampled = (_corrected if five else _raw)(strip.one("Satellite_Attitudes"), first)
         inside = np.clip((0.0, last), times[0], times[-1]) if len(times) else np.zeros(2)  # real lists begin late
         held = np.abs(inside - (0.0, last)).max() <= EXTRAPOLATION  # the first and the last are held so long
         check_times(times, (inside[0], inside[1]) if held else (0.0, last), "attitudes", root.name)
-        if not (np.abs(sampled) < _LARGEST).all():
+        if not (np.abs(sampled) < _LARGEST_ATTITUDE).all():
             raise RpcFormatError(f"{root.name}: an attitude of {np.abs(sampled).max():.3g} rad; are these radians?")
         angles = np.stack([np.interp(ticks, times, one) for one in sampled.T], axis=1)
     quaternions = _ecef_from_camera(states, angles)
     samples = Samples(root.name, ticks, states[:, :3], states[:, 3:], ticks, quaternions)
     detector = Detector(_look(strip, band, size[0]), (size[0] - 1) / 2, period, size)
-    found = camera_of_samples(samples, detector, _SIGMAS[five])
+    found = camera_of_samples(samples, detector, _LOCATION[five])
     stated = table_of(root.all("Dataset_Frame/Vertex"), ("FRAME_LON", "FRAME_LAT", "FRAME_COL", "FRAME_ROW"))
     return found if attitudes or not len(stated) else replace(found, corners=stated - [0.0, 0.0, 1.0, 1.0])
 
@@ -89,25 +89,25 @@ def _is_spot_5(root: XmlFields) -> bool:
     mission = re.fullmatch(r"SPOT[ -]*([1-5])( \1)?", name, re.IGNORECASE)
     if mission is None:
         raise RpcFormatError(f"{root.name}: a scene of {name or 'no MISSION'}; of DIMAP 1 only SPOT 1 to 5 are read")
-    stated = (_LEVEL.search(root.element.findtext(where, "").upper()) for where in _LEVEL_PLACES)
+    stated = (_PRODUCT_LEVEL.search(root.element.findtext(where, "").upper()) for where in _LEVEL_PLACES)
     level = next((found[1] for found in stated if found), "1A")
     if level != "1A":
         raise RpcFormatError(f"{root.name}: a scene of level {level}, resampled: only 1A has a physical model")
     return mission[1] == "5"
 
 
-def _states(strip: XmlFields, first: np.datetime64, last: float, ticks: Array) -> Array:
+def _ephemeris(strip: XmlFields, first: np.datetime64, last: float, ticks: Array) -> Array:
     """Return positions and velocities (N, 6) [m, m/s], ECEF, at times (N,) [s from row 0]."""
     tags = [f"{what}/{axis}" for what in ("Location", "Velocity") for axis in "XYZ"]
-    times, points = _listed(strip, "Ephemeris/Points/Point", tags, first)
+    times, points = _listed_values(strip, "Ephemeris/Points/Point", tags, first)
     check_times(times, (0.0, last), "positions", strip.name)
-    near = np.sort(np.abs(times - last / 2).argsort(kind="stable")[:_POINTS])
+    near = np.sort(np.abs(times - last / 2).argsort(kind="stable")[:_EPHEMERIS_POINTS])
     middle, half = times[near].mean(), np.ptp(times[near]) / 2
     coeffs = polyfit((times[near] - middle) / half, points[near], len(near) - 1)
     return np.asarray(polyval((ticks - middle) / half, coeffs)).T
 
 
-def _listed(part: XmlFields, path: str, tags: list[str], first: np.datetime64) -> tuple[Array, Array]:
+def _listed_values(part: XmlFields, path: str, tags: list[str], first: np.datetime64) -> tuple[Array, Array]:
     """Return the times (N,) [s from row 0], ascending, and numbers (N, K) of the samples that are in range."""
     usable = [one for one in part.all(path) if one.element.findtext("OUT_OF_RANGE", "").strip().upper() != "Y"]
     times = np.array([seconds(one.time("TIME"), first) for one in usable])
@@ -120,14 +120,14 @@ _ANGLES = ["YAW", "PITCH", "ROLL"]
 
 def _corrected(attitudes: XmlFields, first: np.datetime64) -> tuple[Array, Array]:
     """Return the times and angles (N, 3) of SPOT 5 [rad]."""
-    return _listed(attitudes.one("Corrected_Attitudes"), ".//Angles", _ANGLES, first)
+    return _listed_values(attitudes.one("Corrected_Attitudes"), ".//Angles", _ANGLES, first)
 
 
 def _raw(attitudes: XmlFields, first: np.datetime64) -> tuple[Array, Array]:
     """Return the times and angles (N, 3) of SPOT 1 to 4 [rad]: the first angles, and speeds integrated from there."""
     aocs = attitudes.one("Raw_Attitudes/Aocs_Attitude")
-    at, angles = _listed(aocs, "Angles_List/Angles", _ANGLES, first)
-    times, speeds = _listed(aocs, "Angular_Speeds_List/Angular_Speeds", _ANGLES, first)
+    at, angles = _listed_values(aocs, "Angles_List/Angles", _ANGLES, first)
+    times, speeds = _listed_values(aocs, "Angular_Speeds_List/Angular_Speeds", _ANGLES, first)
     if not (len(at) and len(times)):
         raise RpcFormatError(f"{attitudes.name}: Aocs_Attitude without Angles, or without Angular_Speeds, in range")
     steps = (speeds[1:] + speeds[:-1]) / 2 * np.diff(times)[:, None]

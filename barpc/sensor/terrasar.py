@@ -63,10 +63,10 @@ def open_terrasar(path: str | Path) -> RangeDoppler:
             BarpcWarning,
             stacklevel=2,
         )
-        return _model(root, (0.0, 0.0))
+        return _range_doppler(root, (0.0, 0.0))
     georef = XmlFields(parse_xml(path, strip_namespaces=True), str(path))
     late = (_delay_sum(georef, "rangeDelay", root), _delay_sum(georef, "azimuthShift", root))
-    return _checked_by_grid(_model(root, late), georef, late)
+    return _checked_by_grid(_range_doppler(root, late), georef, late)
 
 
 def _refuse_other_geometry(root: XmlFields) -> None:
@@ -87,7 +87,7 @@ def _refuse_other_geometry(root: XmlFields) -> None:
             raise InputError(f"{root.name}: {tag} is {image.text(tag)[:40]}, only {known} is read")
 
 
-def _model(root: XmlFields, late: tuple[float, float]) -> RangeDoppler:
+def _range_doppler(root: XmlFields, late: tuple[float, float]) -> RangeDoppler:
     """Return the model whose times of range and azimuth are later [s] than geometry has them."""
     scene, raster = root.one("productInfo/sceneInfo"), root.one("productInfo/imageDataInfo/imageRaster")
     size = raster.size("numberOfColumns", "numberOfRows")

@@ -14,7 +14,7 @@ from rasterio.enums import MaskFlags
 from rasterio.windows import Window
 
 from barpc.base.errors import ImageError
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, Box, ByteImage
 from barpc.rasters.raster import open_raster
 from barpc.rasters.vrt import BLOCK_SIZE
 from barpc.scene import BoolArray
@@ -22,9 +22,6 @@ from barpc.scene import BoolArray
 FloatImage = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 """float32 where it holds every number of the file's type (integers of up to 16 bits), else float64."""
-ByteImage = npt.NDArray[np.uint8]
-Box = tuple[int, int, int, int]
-"""col, row of the first pixel, width, height [px]."""
 
 CELL = 64
 """Side of the cells that each hold a quota of keypoints [px]; tiles are whole cells."""

@@ -28,9 +28,9 @@ from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import grouped, linear_map
 from barpc.tie.pairing.overlaps import (
     COMPARED,
-    EVERYWHERE,
     GIVEN_PAIR,
     TRIES,
+    WHOLE_SCOPE,
     Pair,
     Scope,
     best_pairs,
@@ -68,7 +68,7 @@ class TieResult:
 def find_tracks(
     views: Sequence[View],
     options: TieOptions = TIE_DEFAULTS,
-    scope: Scope = EVERYWHERE,
+    scope: Scope = WHOLE_SCOPE,
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,

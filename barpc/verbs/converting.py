@@ -15,7 +15,7 @@ import shapely
 
 from barpc.base.declarations import with_values
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
-from barpc.base.geodesy import wrap_longitude
+from barpc.base.geodesy import Box, wrap_longitude
 from barpc.base.safe_io import plain_path
 from barpc.base.tasks import Progress
 from barpc.base.verb_options import ConvertOptions
@@ -58,7 +58,6 @@ if TYPE_CHECKING:
 
     from barpc.base.keywords import ConvertKeywords, PathLike
 
-Window = tuple[int, int, int, int]
 GroundBox = tuple[float, float, float, float]
 _READ_BACK = "barpc"  # the reader of a single file
 
@@ -76,7 +75,7 @@ class Converted:
     images: int = 1
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    window: Window | None = None
+    window: Box | None = None
     source: Camera | None = None
 
     @property
@@ -249,7 +248,7 @@ def check_target(target: str | Path, sources: Sequence[str | Path], overwrite: b
 # --- windows -----------------------------------------------------------------------------------------------
 
 
-def _window_chooser(choices: ConvertOptions) -> Callable[[Camera, Path], Window]:
+def _window_chooser(choices: ConvertOptions) -> Callable[[Camera, Path], Box]:
     """Return a function from an image to its window: the one given, or that of a box or area on the ground."""
     if sum(one is not None for one in (choices.window, choices.bbox, choices.aoi)) != 1:
         raise UsageError("give one of --window, --bbox and --aoi")
@@ -269,7 +268,7 @@ def box_of(path: str | Path) -> GroundBox:
     return west, south, float(wrap_longitude(east)), north
 
 
-def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, dem: Dem | None) -> Window:
+def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, dem: Dem | None) -> Box:
     """Return the pixels that a box on the ground covers, cut to the image; a usage error where it does not meet it."""
     west, south, east, north = bbox
     east += 360.0 * (east < west)  # a box across the antimeridian
@@ -290,8 +289,8 @@ def window_of(camera: Camera, path: Path, bbox: GroundBox, alt: float | None, de
 
 
 def windows_of(
-    images: Sequence[tuple[Path, Camera]], window: Callable[[Camera, Path], Window]
-) -> list[tuple[Path, Camera, Window]]:
+    images: Sequence[tuple[Path, Camera]], window: Callable[[Camera, Path], Box]
+) -> list[tuple[Path, Camera, Box]]:
     """Return the images that cover the requested window or area, and their windows.
 
     Others are named in a remark; a usage error where none covers it.
@@ -322,7 +321,7 @@ def _cameras(files: Sequence[Path], rpcs: Path) -> list[Camera]:
 
 
 def _hand_off(
-    images: Sequence[tuple[Path, Camera, Window | None]],
+    images: Sequence[tuple[Path, Camera, Box | None]],
     workspace: Workspace,
     ends: Sequence[str],
     progress: Progress | None,

@@ -143,10 +143,10 @@ def _fit_source(
     camera.require_usable(place_of(source))
     if spec and split_spec(spec)[1].get("swath", "").lower() == "mosaic" and options.grid == FitOptions().grid:
         options = replace(options, grid=_MOSAIC_GRID)
-    return _fit_camera(camera, options, choices), camera.size, camera.doubts
+    return _refit_camera(camera, options, choices), camera.size, camera.doubts
 
 
-def _fit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> RpcFit:
+def _refit_camera(camera: Camera, options: FitOptions, choices: RefitOptions) -> RpcFit:
     """Return the fit of a camera over the altitudes given, of a DEM, of all ground on Earth, or its own."""
     low, high = camera.alt_range
     if choices.alt_range is not None:

@@ -36,7 +36,7 @@ def moved(cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str 
     met still meet, where the motion takes the point. FitError where no RPC holds a moved camera, InputError for a
     motion that leaves the Earth's surface or is a position.
     """
-    corners = [_corners(camera) for camera in cameras]
+    corners = [_border_ground(camera) for camera in cameras]
     middle = np.mean([ecef_from_ground(ground).mean(axis=0) for ground in corners], axis=0)
     at = ground_from_ecef(middle)
     if transform is not None:
@@ -58,7 +58,7 @@ def moved(cameras: Sequence[Camera], move: npt.ArrayLike | None, transform: str 
     return out
 
 
-def _corners(camera: Camera) -> Array:
+def _border_ground(camera: Camera) -> Array:
     """Return ground (n, 3) along the border of a camera's image, at its lowest and highest altitude."""
     edge = image_border(camera.extent, 4)
     levels = (np.full(len(edge), alt) for alt in camera.alt_range)

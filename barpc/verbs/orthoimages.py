@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     from barpc.base.keywords import OrthoKeywords, PathLike
 
 _SIDE = 2 * BLOCK_SIZE  # px of the map warped at once
-_FINEST, _COARSEST = 10.0, 64.0  # of a map's pixel to an image's: its pixels a hundred times, blocks of 16 px a side
+_MOST_FINER, _MOST_COARSER = 10.0, 64.0  # times an image's pixel: a hundred pixels of one, blocks of 16 px a side
 _STRETCH = 100.0  # of lengths by a map: Mercator's is 57 at a latitude of 89 degrees
 _MARGIN = 8  # px around the pixels that a block shows: of the kernel, and of the ground between the nodes
-_RELIEF = 50.0  # m around a DEM's heights at sampled places
+_HEIGHT_MARGIN = 50.0  # m around a DEM's heights at sampled places
 _NODES = 17
 _SPHERE = 6378137.0  # m: radius of a map on which degrees are lengths
 _COG = {"COMPRESS": "DEFLATE", "PREDICTOR": "YES", "BLOCKSIZE": str(BLOCK_SIZE), "BIGTIFF": "IF_SAFER"}
@@ -119,7 +119,7 @@ def ortho(
         scene = read_scene(run)
         files = tuple(Path(shot.file) for shot in scene.shots)
         cameras = tuple(Camera(shot.rpc, Path(shot.file), "run", shot.size, scene.alt_range) for shot in scene.shots)
-        terrain = _terrain_of(scene.run) if terrain is None and alt is None else terrain
+        terrain = _terrain_of_run(scene.run) if terrain is None and alt is None else terrain
         alt = scene.summary.altitude_m if alt is None else alt
     for camera, file in zip(cameras, files, strict=True):
         camera.require_usable(file)
@@ -138,7 +138,7 @@ def ortho(
     return done
 
 
-def _terrain_of(run: FinishedRun) -> Dem | None:
+def _terrain_of_run(run: FinishedRun) -> Dem | None:
     """Return the terrain that a run was made with; InputError where a DEM or geoid of it is not what it was."""
     given: Any = run.summary.options or {}
     dems = [given["dem"]] if isinstance(given.get("dem"), str) else given.get("dem") or ()
@@ -179,7 +179,7 @@ class _Warp:
             levels, words = (level, level), f"all ground at {level:.5g} m"
             heights: dict[str, Any] = {"RPC_HEIGHT": level}
         else:
-            low, high = terrain_range(model, camera.extent, camera.alt_range, terrain.covering, _RELIEF)
+            low, high = terrain_range(model, camera.extent, camera.alt_range, terrain.covering, _HEIGHT_MARGIN)
             levels, words = (low, high), f"heights of {terrain.description}"
             heights = {"RPC_DEM": str(_write_terrain(room / "terrain.tif", camera, terrain, levels))}
             at = image_grid(camera.extent, (0.0, 0.0), (_NODES, 1))[0]
@@ -191,9 +191,9 @@ class _Warp:
         pixel = float(ground_sample_distance(model, np.append(rings[0], levels[0]))[1])
         if not (np.isfinite(rings).all() and np.isfinite(pixel)):
             raise InputError(f"{file}: shows no ground at {levels[0]:.5g} m")
-        if not 1.0 / _FINEST <= gsd / pixel <= _COARSEST:
-            raise InputError(f"--gsd {gsd:g}: an image pixel of {pixel:.2g} m: give {pixel / _FINEST:.2g} m to "
-                             f"{pixel * _COARSEST:.2g} m")  # fmt: skip
+        if not 1.0 / _MOST_FINER <= gsd / pixel <= _MOST_COARSER:
+            raise InputError(f"--gsd {gsd:g}: an image pixel of {pixel:.2g} m: give {pixel / _MOST_FINER:.2g} m to "
+                             f"{pixel * _MOST_COARSER:.2g} m")  # fmt: skip
         east, north = transform(_WGS84, crs, *rings.T)
         west, south, east, north = np.array([min(east), min(north), max(east), max(north)]) / gsd
         if not max(east - west, north - south) * gsd < _STRETCH * pixel * np.hypot(*camera.extent):

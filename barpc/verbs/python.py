@@ -18,7 +18,7 @@ from barpc.verbs.options import FLAG_NAMES
 
 def of_python(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a public function, or verb, that takes open datasets as their files, and whose errors name keywords."""
-    target = next((name for name in inspect.signature(function).parameters if name in _TARGETS), _TARGETS[0])
+    target = next((name for name in inspect.signature(function).parameters if name in _OUTPUT_NAMES), _OUTPUT_NAMES[0])
 
     @wraps(function)
     def called(*args: Any, **keywords: Any) -> Any:
@@ -44,12 +44,12 @@ def _file(value: Any) -> Any:
     return file_of(value)
 
 
-_TARGETS = "out_dir", "out", "output"
+_OUTPUT_NAMES = "out_dir", "out", "output"
 """Keywords for -o."""
 
 
 @cache
-def _keywords() -> dict[str, str]:
+def _verb_keywords() -> dict[str, str]:
     """Return the flags that set options, and the keywords that do, as a sentence has them."""
     records = [one for module in (options, verb_options) for one in vars(module).values() if inspect.isclass(one)]
     fields = [declared(one).items() for one in records if issubclass(one, Options) and one is not Options]
@@ -59,7 +59,7 @@ def _keywords() -> dict[str, str]:
     return flags | {"--csv": "csv=True", "--images": "images", "--options": "options", "-j": "jobs"}
 
 
-def in_keywords(sentence: str, target: str = _TARGETS[0]) -> str:
+def in_keywords(sentence: str, target: str = _OUTPUT_NAMES[0]) -> str:
     """Return a sentence with the keywords of Python in place of flags; `target`: that of -o. Commands stay.
 
     Examples
@@ -69,6 +69,6 @@ def in_keywords(sentence: str, target: str = _TARGETS[0]) -> str:
     """
 
     def keyword(found: re.Match[str]) -> str:
-        return found[0] if found[0].startswith("'") else {**_keywords(), "-o": target}.get(found[0], found[0])
+        return found[0] if found[0].startswith("'") else {**_verb_keywords(), "-o": target}.get(found[0], found[0])
 
     return re.sub(r"'barpc [^']*'|(?<![\w/.-])(?:--[a-z][a-z-]*|-[oj])\b", keyword, sentence)

@@ -12,7 +12,7 @@ import pytest
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.select import champion, models
-from barpc.ba.select.champion import Bands, compared, is_closer
+from barpc.ba.select.champion import OffsetBands, compared, is_closer
 from barpc.base.statistics import BANDS
 from barpc.scene import Tracks
 from barpc.sensor.triangulation import epipolar_offset
@@ -39,7 +39,7 @@ def delivered(made: Any, xy: np.ndarray | None = None, noise: float = 1.0, param
 def test_offsets_are_those_of_the_epipolar_lines(block: Any) -> None:
     """Against rays intersected by the sensors themselves: in the second image, of every pair, with its sign or not."""
     found, ties = delivered(block)
-    bands = Bands.of(ties)
+    bands = OffsetBands.of(ties)
     offsets = bands.offsets(found).reshape(5, -1)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         rows = (ties.view[bands.first] == i) & (ties.view[bands.second] == j)
@@ -55,7 +55,7 @@ def test_offsets_are_those_of_the_epipolar_lines(block: Any) -> None:
 
 def test_every_pair_has_its_median_and_eight_bands_of_both_images_each_way(block: Any) -> None:
     found, ties = delivered(block)
-    bands = Bands.of(ties)
+    bands = OffsetBands.of(ties)
     assert len(bands.count) == 3 * (4 * BANDS + 1)
     assert bands.count.sum() == 5 * len(bands.first)
     offsets = bands.offsets(found)

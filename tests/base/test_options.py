@@ -26,7 +26,7 @@ from barpc.base.options import PAPER, AdjustOptions, FitOptions, RunOptions, Tie
 from barpc.base.safe_io import MB
 from barpc.base.verb_options import ConvertOptions, DsmOptions, OrthoOptions, RefitOptions, VerifyOptions
 from barpc.cli import cli
-from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, run_options
+from barpc.cli.flags import ADJUSTMENT, RUN, TIE, flag, flag_name, options_of_flags
 
 TABLES: dict[str, type[Options]] = {
     "": RunOptions, "tie": TieOptions, "adjust": AdjustOptions, "fit": FitOptions
@@ -190,7 +190,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     path = tmp_path / "o.toml"
     path.write_text('add_to = "earlier"\n[tie]\nband = 2\nsearch = 9\n[adjust]\nfixed = ["a"]\n')
     flags = {"flag_tie_band": 3, "flag_adjust_fixed": ("b", "c"), "flag_matches": (), "flag_gcp": ()}
-    found = run_options(flags, str(path))
+    found = options_of_flags(flags, str(path))
     assert (found.tie.band, found.tie.search, found.adjust.fixed) == (3, 9.0, ("b", "c"))
     assert (found.add_to, found.matches, found.gcp) == ("earlier", (), ())
 

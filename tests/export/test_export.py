@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError, OutputError
 from barpc.base.verb_options import ExportOptions
 from barpc.cli import main
-from barpc.export.colmap import _Pixels
+from barpc.export.colmap import _ShotPixels
 from barpc.export.light import sun_angles
 from barpc.export.shots import read_scene
 from barpc.export.targets import TARGETS, _link_image, export_run
@@ -460,7 +460,7 @@ def test_a_picture_has_the_colours_of_its_image(southern, tmp_path):
         file.write(bands)
         file.colorinterp = [getattr(ColorInterp, name) for name in ("blue", "green", "red", "undefined")]
     (shot, *_) = read_scene(southern).shots
-    pixels = _Pixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
+    pixels = _ShotPixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
     shown, valid = pixels.read((5, 4, 30, 20))
     assert shown.shape == (20, 30, 3)
     for k, band in enumerate((2, 1, 0)):

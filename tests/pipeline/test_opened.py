@@ -21,7 +21,7 @@ from barpc.base.errors import BarpcWarning, InputError, ReservationError
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult
 from barpc.report import summarize
-from barpc.report.overview import COLUMNS
+from barpc.report.overview import RUN_COLUMNS
 from barpc.report.runfiles import OBSERVATION_COLUMNS
 from tests.report.conftest import run_of_block, written
 
@@ -146,7 +146,7 @@ def test_runs_are_listed_a_line_each_and_what_is_none_has_its_reason(done, tmp_p
     said = CliRunner().invoke(cli, ["report", "--csv", *words], standalone_mode=False)
     assert said.return_value == 3
     rows = list(csv.DictReader(io.StringIO(said.stdout)))
-    assert tuple(rows[0]) == COLUMNS
+    assert tuple(rows[0]) == RUN_COLUMNS
     assert [row["status"] for row in rows] == [done[0].record.status] * 2 + ["none"] * 2
     assert [row["run"].removeprefix("'") for row in rows] == words
     assert "SHA256SUMS: missing" in rows[2]["reasons"]

@@ -327,7 +327,7 @@ def test_what_a_fit_warns_of_comes_back_from_its_worker_and_is_said_with_the_vie
     block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array([3.0, 4.0, 99.0])), sensors=[rpc])
     run = replace(Run("adjust", views(1), (), NONE), adjustment=block)  # type: ignore[arg-type]
     with pytest.warns(BarpcWarning, match="^v0: odd$"):
-        found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
+        found = stages._with_refits(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), HERE)
     assert found.fits[0].rpc.err_bias == pytest.approx(np.sqrt(12.5))  # of the place, east and north
 
 
@@ -346,14 +346,16 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
     block = SimpleNamespace(gauge=SimpleNamespace(sigma=np.array(sigma)), sensors=[rpc] * 9)
     told: list[tuple[str, int, int]] = []
     run = replace(Run("adjust", given, (), NONE), adjustment=block)  # type: ignore[arg-type]
-    found = stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), Work(None, lambda *now: told.append(now)))
+    found = stages._with_refits(
+        run, RunOptions(fit=FitOptions(grid=(5, 5, 4))), Work(None, lambda *now: told.append(now))
+    )
     assert len(found.fits) == 9
     for fit in found.fits:
         assert fit.rpc.err_bias == (None if stated is None else pytest.approx(stated))
         assert fit.rpc.err_rand == 0.7
     assert told[-2:] == [("fit", 8, 9), ("fit", 9, 9)]
     with pytest.raises(FitError, match="v0: "):
-        stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), HERE)
+        stages._with_refits(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), HERE)
 
 
 def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:

@@ -24,7 +24,7 @@ from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.pointio.gcp_tables import GCP_NAMES as NAMES_OF
 from barpc.pointio.gcps import ControlReference, read_gcps
 from barpc.pointio.tables import COLUMNS, degrees, guessed
-from barpc.report.geopackage import Layer, geopackage, point_shapes
+from barpc.report.geopackage import MapLayer, geopackage, point_shapes
 from barpc.scene import GroundPoints
 from tests.geotiffs import write_image
 
@@ -406,7 +406,7 @@ def is_the_point(found) -> None:
 
 def geopackage_of(rows=(("p", COL, ROW),), shapes=None) -> bytes:
     shapes = point_shapes(np.array([[LON, LAT, ALT]] * len(rows))) if shapes is None else shapes
-    return geopackage([Layer("control", shapes, ["name TEXT", "pixel REAL", "line REAL"], rows)])
+    return geopackage([MapLayer("control", shapes, ["name TEXT", "pixel REAL", "line REAL"], rows)])
 
 
 UTM_PRJ = pyproj.CRS("EPSG:32631").to_wkt("WKT1_ESRI")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from barpc.report import maps
-from barpc.report.maps import coordinate, evenly, round_ticks
+from barpc.report.maps import coordinate, round_ticks, thin
 
 # --- pieces -----------------------------------------------------------------------------------------------
 
@@ -39,10 +39,10 @@ def test_round_ticks_are_multiples_of_a_one_a_two_or_a_five(low, high, most, tic
 
 
 def test_of_many_rows_some_are_shown_evenly():
-    assert list(evenly(range(4), 4)) == [0, 1, 2, 3]
-    assert list(evenly(range(5), 4)) == [0, 2, 4]
-    assert list(evenly(range(9), 4)) == [0, 3, 6]
-    assert list(evenly([], 4)) == []
+    assert list(thin(range(4), 4)) == [0, 1, 2, 3]
+    assert list(thin(range(5), 4)) == [0, 2, 4]
+    assert list(thin(range(9), 4)) == [0, 3, 6]
+    assert list(thin([], 4)) == []
 
 
 def test_how_much_is_shown_at_most():

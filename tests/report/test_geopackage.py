@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import shapely
 
-from barpc.report.geopackage import STYLES, Layer, geopackage, point_shapes
+from barpc.report.geopackage import STYLES, MapLayer, geopackage, point_shapes
 from barpc.report.runfiles import read_tables
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.words import STATUS_WORDS
@@ -123,7 +123,7 @@ def test_ties_are_small_and_check_points_are_gcps_upside_down():
 
 
 def test_numbers_that_are_not_known_are_null():
-    found = geopackage([Layer("a", point_shapes(np.array([[1.0, 2.0, 3.0]])), ["x DOUBLE"], [(float("nan"),)])])
+    found = geopackage([MapLayer("a", point_shapes(np.array([[1.0, 2.0, 3.0]])), ["x DOUBLE"], [(float("nan"),)])])
     with closing(sqlite3.connect(":memory:")) as data:
         data.deserialize(found)
         assert data.execute("SELECT x FROM a").fetchall() == [(None,)]

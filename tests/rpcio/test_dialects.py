@@ -14,7 +14,7 @@ import rasterio
 from barpc.base.errors import Remark, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
 from barpc.rpcio.formats import parse_rpc
-from barpc.rpcio.sources import described
+from barpc.rpcio.sources import stated_in_xml
 from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
 from tests.rpcio.conftest import grid, make_rpc, rpc_domain, write_image
 from tests.rpcio.test_orders import A_ORDER
@@ -307,7 +307,7 @@ def test_maxar_xml_states_the_size_of_the_image_where_it_is_known(rpc, tmp_path)
     write_rpc(rpc, tmp_path / "scene.XML", size=(60, 40))
     root = ElementTree.parse(tmp_path / "scene.XML").getroot()
     assert (root.findtext("IMD/NUMROWS"), root.findtext("IMD/NUMCOLUMNS")) == ("40", "60")
-    assert described(tmp_path / "scene.XML") == ((60, 40), False)
+    assert stated_in_xml(tmp_path / "scene.XML") == ((60, 40), False)
     assert read_rpc(tmp_path / "scene.XML") == read_rpc(image) == rpc
     with rasterio.open(image) as dataset:
         assert dataset.rpcs.line_off == rpc.image_offset[1]

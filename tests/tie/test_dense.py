@@ -108,7 +108,7 @@ def test_rows_are_refined_alike_however_many_are_worked_on_together(monkeypatch)
     good, disparity = rng.random(left.shape) < 0.8, rng.normal(5.0, 0.3, left.shape).astype(np.float32)
     found = []
     for rows in (70, 64, 8):
-        monkeypatch.setattr(dense, "_STRIP", rows)
+        monkeypatch.setattr(dense, "_STRIP_ROWS", rows)
         found.append(refined_disparity(left, np.roll(left, -5, axis=1), disparity, good))
     assert found[0].shape == (2, 70, 46)
     for other in found[1:]:

@@ -132,7 +132,7 @@ def join(
     Views `held` are those with the prior of an earlier block, which connects them: they need no tie points.
     """
     names = [view.name for view in views]
-    _check_names(names, options)
+    _check_fixed_names(names, options)
     gcps = GroundPoints.none() if gcps is None else gcps
     known = [gcps] if reference is None else [gcps, reference.points]
     starts = tracks.num_points + np.cumsum([0, *(len(points.names) for points in known)])
@@ -177,7 +177,7 @@ def join(
     )
 
 
-def _check_names(names: Sequence[str], options: AdjustOptions) -> None:
+def _check_fixed_names(names: Sequence[str], options: AdjustOptions) -> None:
     if len(set(names)) < len(names):
         raise InputError("two views have the same name")
     if unknown := set(options.fixed) - set(names):

@@ -180,7 +180,7 @@ class BlockPrior:
             and bool((diagonal > 0).all())
             and self._layout.is_whole(n, q)
             and (self.written is None or (self.written.shape == (n, q) and bool(np.isfinite(self.written).all())))
-            and (self.scene is None or _is_scene(self.scene, n * q))
+            and (self.scene is None or _is_whole_scene(self.scene, n * q))
             and (self.told is None or (self.told.shape == (n,) and _is_nonnegative(self.told)))
             and (self.shown is None or (self.shown.shape == (4 + self.drift, 2) and _is_nonnegative(self.shown)))
             and (self.less is None or (self.less.shape[1:] == (n * q,) and _is_bounded(self.less)))
@@ -309,7 +309,7 @@ def _extended(whole: BlockPrior, more: Array, place: IntArray, new: int) -> Bloc
     return Blocks(diagonal, pairs, np.column_stack([keys // count, keys % count]))
 
 
-def _is_scene(scene: EarlierScene, size: int) -> bool:
+def _is_whole_scene(scene: EarlierScene, size: int) -> bool:
     """Return whether the arrays of a scene are valid for `size` unknowns."""
     arrays, count = (scene.by_unknown, scene.own), len(MOTIONS)
     return (

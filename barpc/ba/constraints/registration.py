@@ -33,7 +33,7 @@ from barpc.scene import BoolArray, IntArray
 
 PATCH_POINTS = 15  # tie points of a patch: six unknowns, nine redundant
 _MIN_RELIEF = 0.01  # m: least scatter about a patch; also, a smaller change of the motion ends the iteration
-_SIDE = 25  # trial shifts along each axis of the search
+_TRIALS_PER_AXIS = 25  # trial shifts along each axis of the search
 _MIN_SLOPE_SHARE = 0.2  # least share of the information on a motion that is not due to errors of slopes
 
 
@@ -59,7 +59,7 @@ class TieSurface:
         distance, near = (np.asarray(part) for part in tree.query(points[:, :2], k=PATCH_POINTS))
         reach = np.maximum(distance[:, -1], 1e-3)
         delta = points[near] - points[:, None]
-        design = _monomials(delta[..., :2] / reach[:, None, None])
+        design = _quadratic_terms(delta[..., :2] / reach[:, None, None])
         normal, terms = np.swapaxes(design, 1, 2) @ design, design.shape[-1]
         freedom = PATCH_POINTS - terms
         inverse = np.linalg.inv(normal + RIDGE * np.eye(terms))
@@ -81,13 +81,13 @@ class TieSurface:
     def at(self, place: Array) -> tuple[Array, IntArray, BoolArray]:
         """Return heights (n,) at positions (n, 2), the nearest tie points (n,), and if their patches are valid."""
         distance, nearest = (np.asarray(part) for part in self.tree.query(place))
-        design = _monomials(self._relative(place, nearest))
+        design = _quadratic_terms(self._relative(place, nearest))
         near = (distance <= self.reach[nearest]) & self.whole[nearest]
         return (design * self.patch[nearest]).sum(axis=1), nearest, near
 
     def variance(self, place: Array, nearest: IntArray) -> Array:
         """Return the variance (n,) [m^2] of ground heights predicted by patches at positions (n, 2)."""
-        design = _monomials(self._relative(place, nearest))
+        design = _quadratic_terms(self._relative(place, nearest))
         of_patch = np.einsum("ni,nij,nj->n", design, self.covariance[nearest], design)
         return np.asarray(of_patch + self.scatter[nearest] ** 2)
 
@@ -106,7 +106,7 @@ class TieSurface:
         return np.asarray(np.clip(away, -1.0, 1.0))
 
 
-def _monomials(away: Array) -> Array:
+def _quadratic_terms(away: Array) -> Array:
     u, v = away[..., 0], away[..., 1]
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
@@ -275,7 +275,7 @@ def search_shift(surface: TieSurface, given: GivenHeights, before: Array) -> Arr
     steep = float(np.sqrt(((surface.patch[:, 1:3] / surface.reach[:, None]) ** 2).mean()))
     wide = float(np.median(first.sigma))
     reach = CRITICAL * before[:2]
-    step = np.maximum(wide / max(steep, 1e-6), 2.0 * reach / (_SIDE - 1))
+    step = np.maximum(wide / max(steep, 1e-6), 2.0 * reach / (_TRIALS_PER_AXIS - 1))
     sides = [np.arange(-(r // s), r // s + 1) * s for r, s in zip(reach, step, strict=True)]
     half = 2.0 * float(np.hypot(wide, 0.5 * steep * np.hypot(*np.minimum(step, reach))))
     best, found = -1.0, np.zeros(7)

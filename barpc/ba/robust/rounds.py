@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 
 _SMOOTH_SEEN = 0.3  # RMS of smooth parts [sigmas] above which they and the points are estimated alternately
 _MIN_NOISE_RATIO = 0.5  # least noise in the robust steps, observed over stated standard deviation
-_MANY_REJECTED = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
+_TRIANGULATE_AGAIN = 0.01  # share of rejected observations above which tracks without inliers are triangulated again
 _SAMPLED_VIEWS = 10  # least number of views for robust steps on a sample
 
 
@@ -176,7 +176,7 @@ class Rounds:
         The outcome is returned by the last pass only; else None.
         """
         was_in_use = self.use
-        many_rejected = self.use.sum() < (1.0 - _MANY_REJECTED) * self.everything.sum()
+        many_rejected = self.use.sum() < (1.0 - _TRIANGULATE_AGAIN) * self.everything.sum()
         if self.passes and many_rejected:
             weight = self.everything / self.observations.sigma
             self.state, self.residual = retriangulate_rejected(

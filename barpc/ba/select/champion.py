@@ -23,7 +23,7 @@ _MIN_OFFSETS = 12  # offsets of a band: fewer give no reliable median
 
 
 @dataclass(frozen=True, eq=False)
-class Bands:
+class OffsetBands:
     """Pairs of images, and eighths of their rows and columns, with the epipolar offsets of their tie points.
 
     An offset is the distance [px] of an observation from the epipolar line of another one of its track. It does not
@@ -38,7 +38,7 @@ class Bands:
     count: IntArray  # (B,) number of offsets of each band
 
     @classmethod
-    def of(cls, ties: Block) -> Bands:
+    def of(cls, ties: Block) -> OffsetBands:
         """Return the bands of the tie points of a block."""
         structure = ties.own_points[1]
         first, second = structure.first, structure.second
@@ -130,7 +130,7 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
 
     Medians are limited to `OUTLIER` standard deviations of tie points: both models reject matches beyond.
     """
-    bands = None if tried.outcome is plain.outcome else Bands.of(ties)
+    bands = None if tried.outcome is plain.outcome else OffsetBands.of(ties)
     if bands is None or not len(bands.first):
         return Comparison(False, 0.0)
     offsets = [bands.offsets(one) for one in (tried, plain)]
@@ -144,6 +144,6 @@ def compared(tried: Solution, plain: Solution, ties: Block) -> Comparison:
 
 def largest_offset(found: Solution, ties: Block) -> float:
     """Return the largest absolute median epipolar offset of a band [px]; 0 without one. Wrong matches hardly count."""
-    bands = Bands.of(ties)
+    bands = OffsetBands.of(ties)
     middle = bands.medians(bands.offsets(found))[0] if len(bands.first) else np.zeros(0)
     return float(np.nan_to_num(middle).max(initial=0.0))

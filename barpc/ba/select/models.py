@@ -215,7 +215,7 @@ def _at_lower_degree(
     return plain if is_better(plain[0].after, measure(found.problem, found.final.params, outer), outer) else None
 
 
-def _may_move(one: MovingGroup, without: Solution, found: Solution, parts: Parts) -> bool:
+def _is_motion(one: MovingGroup, without: Solution, found: Solution, parts: Parts) -> bool:
     """Return whether the motion of a group is plausible, given the solutions `without` and with (`found`) the group.
 
     Correlated matching errors may be as large as small motions. Within a pass the motion must be at least `MIN_MOTION`.
@@ -269,7 +269,7 @@ def _without_moving_ground(
             break
         tried = solve(less.inner, less.outer, options)
         before = measure(found.problem, found.final.params, less.outer)
-        if is_better(before, tried.after, less.outer) or not _may_move(last.moved, tried, found, parts):
+        if is_better(before, tried.after, less.outer) or not _is_motion(last.moved, tried, found, parts):
             break
         # a motion in each image follows a part of the jitter of many images
         smooth, still = with_splines(found, parts, options), less.without_motion(found, last.moved)

@@ -158,7 +158,7 @@ def reduce_normal(
     gain = float((half**2).sum())
     common = None
     if point_prior is not None and point_prior.common.shape[2]:
-        common = _common_errors(structure, point_prior, lower, half, cross)
+        common = _common_part(structure, point_prior, lower, half, cross)
         full_gradient = full_gradient - common.by_camera.T @ common.half
         gain += float(common.half @ common.half)
         if isinstance(matrix, np.ndarray):
@@ -166,7 +166,7 @@ def reduce_normal(
     return Reduced(structure, matrix, full_gradient, float((residual**2).sum()), gain, lower, half.T, cross, common)
 
 
-def _common_errors(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
+def _common_part(structure: Structure, prior: PointPrior, lower: Array, half: Array, cross: Array) -> Common:
     """Return the common errors of a point prior. They are at their optimum for the given points, so their gradient
     comes only from the elimination of the points.
     """

@@ -25,7 +25,7 @@ from barpc.base.statistics import LEVEL, SURE, TIMES
 from barpc.scene import BoolArray, IntArray
 
 GROUND_CELLS = 6  # cells along each side of the ground
-_STARTS = 8  # regions, those of the best score, from which a fit starts
+_BEST_REGIONS = 8  # regions, those of the best score, from which a fit starts
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def may_move(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Arra
     few, group = linear.thinned(), _uniform_group(linear, ground)
     if not few.tracks:
         return False
-    chance = float(gammainccinv(0.5 * len(group.sigma), 1.0 / len(_REGIONS)))
+    chance = float(gammainccinv(0.5 * len(group.sigma), 1.0 / len(_GROUND_REGIONS)))
     all_of, some = (sum(tracks.rows.size for tracks in one.tracks) for one in (linear, few))
     gain = _region_gains(few, group, base, extra, sigma).max() - chance
     return bool(gain * all_of / some > price_of_group(linear, group.cell) + SURE)
@@ -155,7 +155,7 @@ def _start_shares(linear: Linear, group: Group, base: MixtureFit, extra: Array, 
     if (cut[linear.in_tracks] > 0.5).any():
         yield cut
     gains = _region_gains(linear, group, base, extra, sigma)
-    for region in _distinct(_REGIONS, gains):
+    for region in _distinct_regions(_GROUND_REGIONS, gains):
         yield np.where(region[group.cell], 1.0 - LEVEL, LEVEL)
 
 
@@ -165,13 +165,13 @@ def _region_gains(linear: Linear, group: Group, base: MixtureFit, extra: Array, 
     Cameras and terms are eliminated (Schur complement of the curvature at the fit `base`).
     """
     scores = Mixture(linear, extra, sigma, base).scores(group.by_move, group.cell, GROUND_CELLS**2)
-    regions = _REGIONS.astype(np.float64)
+    regions = _GROUND_REGIONS.astype(np.float64)
     curvature, pull, across = (np.tensordot(regions, one, axes=1) for one in scores)
     curvature = curvature - np.swapaxes(across, 1, 2) @ across + np.diag(1.0 / group.sigma**2)
     return np.asarray(0.5 * (pull * np.linalg.solve(curvature, pull[..., None])[..., 0]).sum(axis=1))
 
 
-def _regions() -> BoolArray:
+def _ground_regions() -> BoolArray:
     """Return regions of the ground (R, GROUND_CELLS^2): rectangles, half-planes and bands in eight directions."""
     row, col = np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS)
     low, high = np.triu_indices(GROUND_CELLS)
@@ -187,16 +187,16 @@ def _regions() -> BoolArray:
     return every[every.any(axis=1) & ~every.all(axis=1)]
 
 
-_REGIONS = _regions()
+_GROUND_REGIONS = _ground_regions()
 
 
-def _distinct(regions: BoolArray, gains: Array) -> list[BoolArray]:
-    """Return the `_STARTS` best regions, none of which shares more than half of their union with a better one."""
+def _distinct_regions(regions: BoolArray, gains: Array) -> list[BoolArray]:
+    """Return the `_BEST_REGIONS` best regions, none of which shares more than half of their union with a better one."""
     found: list[BoolArray] = []
     for n in np.argsort(-gains, kind="stable"):
         one = regions[n]
         same = (2 * (one & other).sum() > (one | other).sum() for other in found)
-        if not any(same) and len(found) < _STARTS:
+        if not any(same) and len(found) < _BEST_REGIONS:
             found.append(one)
     return found
 

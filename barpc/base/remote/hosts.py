@@ -259,7 +259,7 @@ def _store(scheme: str) -> Any:
             f"{scheme}:// needs the extra: pip install 'barpc[remote]' ({_STORE_PACKAGES[scheme]} is missing)"
         ) from error
     except Exception as error:  # no credentials
-        raise _one_line(error) from error
+        raise _store_error(error) from error
 
 
 class _Opened:
@@ -322,9 +322,9 @@ def _store_answer(ask: Any, *args: Any, **given: Any) -> Any:
     except FileNotFoundError as error:
         raise FileNotFoundError("its store has no such object or bucket") from error
     except Exception as error:
-        raise _one_line(error) from error
+        raise _store_error(error) from error
 
 
-def _one_line(error: Exception) -> OSError:
+def _store_error(error: Exception) -> OSError:
     first = next(iter(str(error).strip().splitlines()), "")  # Azure adds the whole answer
     return OSError(f"its store answers {type(error).__name__}: {first[:300]}")

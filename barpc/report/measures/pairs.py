@@ -27,7 +27,7 @@ _PAIR_REPORT_FIELDS = attrgetter("means", "control_share", "spread", "beaten", "
 def measure_pairs(run: Run) -> tuple[PairEntry, ...]:
     """Return the record of every pair of images with common tie points."""
     reports = {report.names: report for report in run.matched}
-    none: _Offsets = [None] * len(run.pairs)
+    none: _OffsetEntries = [None] * len(run.pairs)
     before, _ = _pair_offsets(run, run.before, ground_from_ecef(run.ties_before.points)[:, 2])
     after, kept = (none, none) if run.after is None else _pair_offsets(run, run.after, run.ground[:, 2])
     entries = []
@@ -58,10 +58,10 @@ def _pair_geometry(run: Run) -> list[list[float]]:
     return [list(row) for row in found.tolist()]
 
 
-_Offsets = list[OffsetEntry | None]
+_OffsetEntries = list[OffsetEntry | None]
 
 
-def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple[_Offsets, _Offsets]:
+def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple[_OffsetEntries, _OffsetEntries]:
     """Return the epipolar offsets of each pair's verified matches, and of those of them that are in use.
 
     The altitudes (P,) [m] of the tracks through these cameras are near the closest approach of a pair's rays: two steps
@@ -69,7 +69,7 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple
     """
     of_all = {ties.views: ties for ties in pair_ties(run.tracks)}
     every = [of_all[ties.views] for ties in run.pairs]
-    picks = [_evenly(len(ties.a)) for ties in every]
+    picks = [_shown_tracks(len(ties.a)) for ties in every]
     a, b, pair = _picked_matches(every, picks)
     height = np.where(np.isfinite(alt), alt, run.altitude)[run.tracks.point[a]]
     offset, xy = np.empty(len(a)), run.tracks.xy
@@ -79,11 +79,11 @@ def _pair_offsets(run: Run, sensors: Sequence[SensorModel], alt: Array) -> tuple
     return _offset_entries(offset, pair, num), _offset_entries(offset[used], pair[used], num)
 
 
-def _evenly(count: int) -> slice | IntArray:
+def _shown_tracks(count: int) -> slice | IntArray:
     return slice(count) if count <= MAX_PER_PAIR else np.linspace(0, count - 1, MAX_PER_PAIR).astype(np.int64)
 
 
-def _offset_entries(offset: Array, pair: IntArray, num: int) -> _Offsets:
+def _offset_entries(offset: Array, pair: IntArray, num: int) -> _OffsetEntries:
     """Return the records of offsets (n,) of pairs (n,), of `num` pairs in all."""
     known = np.isfinite(offset)
     offset, pair = offset[known], pair[known]

@@ -13,14 +13,14 @@ import numpy.typing as npt
 
 from barpc.base.fields import field_names, field_values
 from barpc.base.frozen import join_fields
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, Box, ByteImage
 from barpc.base.options import TIE_DEFAULTS, TieOptions
 from barpc.base.statistics import MANY
 from barpc.base.tasks import Store, Work, names_of
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair, shared_tiles
-from barpc.tie.pixels import CELL, Box, ByteImage, Survey, grow, read_picture, survey, tiles
+from barpc.tie.pixels import CELL, Survey, grow, read_picture, survey, tiles
 
 PER_CELL = 40
 """Strongest keypoints kept in a cell."""

@@ -20,12 +20,11 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, TiePointError
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, Box
 from barpc.base.options import TieOptions
 from barpc.scene import BoolArray, IntArray, View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.pairing.epipolar import EpipolarSegments
-from barpc.tie.pixels import Box
 
 DUPLICATE_DISTANCE = 2
 """Places that are no farther apart [px] are the same."""

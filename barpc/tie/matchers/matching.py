@@ -64,7 +64,7 @@ BAND_HALFWIDTH = 3.0
 """Half the width of the band about the corrected epipolar line, at most [px]."""
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
 """Blind passes: half width [px] (the last: `search`), points of A that are tried."""
-_SIGNIFICANT = 6.0  # standard deviations
+_SIGNIFICANT_PEAK = 6.0  # standard deviations
 _NEIGHBOURS_COUNTED, _SPARSE_FACTOR = 3, 2.0
 """A point has no matches near where so many lie so many times as far from it as from another."""
 _NOWHERE = "no common offset"
@@ -441,7 +441,7 @@ class _PairSearch:
         middle = float(np.median(values[start : start + most]))
         chance = (len(values) - most) * window / (2 * width)
         significance = (most - chance) / np.sqrt(chance + 1.0)
-        if significance < _SIGNIFICANT or abs(middle) > width - window:
+        if significance < _SIGNIFICANT_PEAK or abs(middle) > width - window:
             return None
         inside = np.abs(errors[:, 1] - middle) <= window
         across = robust_affine(found.xy[inside, 0], errors[inside, 1])

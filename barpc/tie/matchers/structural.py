@@ -15,7 +15,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from barpc.base.geodesy import Array
+from barpc.base.geodesy import Array, Box
 from barpc.base.options import TieOptions
 from barpc.scene import IntArray, View
 from barpc.tie.matchers.features import Keypoints
@@ -23,7 +23,7 @@ from barpc.tie.matchers.matcher import DUPLICATE_DISTANCE, NO_MATCHES, Matches, 
 from barpc.tie.pairing.epipolar import EpipolarSegments, grouped, linear_map
 from barpc.tie.patches.channels import INVALID_MARGIN
 from barpc.tie.patches.oriented import HALF, MAX_PATCH_SHIFT, PatchTile, Sampling, found_about, resolution
-from barpc.tie.pixels import PIECE, SPAN, Box, FloatImage
+from barpc.tie.pixels import PIECE, SPAN, FloatImage
 
 GRID_POINTS = 200, 500, 1000
 """Points that are looked for: of the cameras' error, in long bands, in short ones."""

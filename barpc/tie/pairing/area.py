@@ -22,7 +22,7 @@ _MALFORMED = (
 )  # fmt: skip
 _MOST_CROSSED = 2000  # times that an outline is untangled: GEOS takes a second, of twice as many ten
 _TOGETHER = 64  # sides of an outline that are looked at together
-_WGS84 = ("CRS84", "4326", "4979")
+_WGS84_NAMES = ("CRS84", "4326", "4979")
 _WRAPPED = {"Feature": "geometry", "FeatureCollection": "features", "GeometryCollection": "geometries"}
 
 
@@ -60,7 +60,7 @@ def read_area(path: str | os.PathLike[str]) -> Area:
     data = read_json(Path(path), GEOJSON)
     try:
         crs = data.get("crs")  # before 2016 GeoJSON could name another reference system
-        if crs is not None and not str(crs["properties"]["name"]).endswith(_WGS84):
+        if crs is not None and not str(crs["properties"]["name"]).endswith(_WGS84_NAMES):
             raise ValueError(f"its coordinates are in {crs['properties']['name']}")
         polygons = [_valid(polygon) for polygon in _polygons(data)]
     except _MALFORMED as error:

@@ -19,14 +19,13 @@ import numpy as np
 import shapely
 
 from barpc.base.errors import DisconnectedError, TiePointError, listed
-from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, Box, metres_per_unit, wrap_longitude
 from barpc.base.options import TieOptions
 from barpc.scene import Terrain as Terrain
 from barpc.scene import View, connected_groups, connected_labels
 from barpc.sensor.geometry import Several, convergence_angle, footprint, ground_sample_distance
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.epipolar import common_range
-from barpc.tie.pixels import Box
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +61,7 @@ class Scope:
     joined: Sequence[int] = ()
 
 
-EVERYWHERE = Scope()
+WHOLE_SCOPE = Scope()
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ def _overlapping_at(prints: Footprints, views: Sequence[View], options: TieOptio
     return [Pair((i, j), share, turn) for i, j, share, turn in zip(*found, strict=True)]
 
 
-def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
+def possible_pairs(views: Sequence[View], options: TieOptions, scope: Scope = WHOLE_SCOPE) -> list[Pair]:
     """Return the pairs of views that can be matched, ascending; those that are given, overlap or not.
 
     Raises

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from barpc.base.geodesy import Array, IntArray, parts
+from barpc.base.geodesy import Array, Box, ByteImage, IntArray, parts
 from barpc.scene import BoolArray
-from barpc.tie.pixels import Box, ByteImage, FloatImage, Stretch, levelled, read_pixels
+from barpc.tie.pixels import FloatImage, Stretch, levelled, read_pixels
 
 ACROSS = 0.02
 """A part in which an affine frame misses the epipolar lines by more [px] is too large for one."""
@@ -33,7 +33,7 @@ SGBM = {
     "disp12MaxDiff": -1,  # asked for here, of a second pass
     "mode": cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # 0.64 m, of five ways 0.62 m at half as much time again
 }
-_STRIP = 64  # rows refined together, which stay in cache
+_STRIP_ROWS = 64  # rows refined together, which stay in cache
 NOISE_VARIANCE, SLOPE_VARIANCE = 0.741, 0.305  # in the frame, of white noise of variance 1 and of its slope
 
 
@@ -150,7 +150,7 @@ def dense_matches(
     low, shape = window
     beside = frame.num // 2  # columns that the right picture begins before the left one: disparities are about zero
     pictures = [
-        _resampled(path, size, np.column_stack([one[:, :2], one[:, 2] - low + [more, 0.0]]), shape, band)
+        _picture_in_frame(path, size, np.column_stack([one[:, :2], one[:, 2] - low + [more, 0.0]]), shape, band)
         for path, size, one, more in zip(images, sizes, frame.maps, (0, beside), strict=True)
     ]
     if any(one is None for one in pictures):
@@ -205,7 +205,7 @@ def _back(one: Array, place: Array) -> Array:
     return (place - one[:, 2]) @ np.linalg.inv(one[:, :2]).T
 
 
-def _resampled(
+def _picture_in_frame(
     path: str, size: tuple[int, int], one: Array, shape: tuple[int, int], band: int
 ) -> tuple[ByteImage, BoolArray] | None:
     """Return an image in the frame, in 8 bits, and where it is known; None without valid pixels there."""
@@ -298,7 +298,7 @@ def refined_disparity(left: ByteImage, right: ByteImage, disparity: FloatImage, 
     what they tell. The step counts by the variance of SGBM's word over the sum of both.
     """
     found, reach = [], WINDOW - 1  # of the windows about pixels that were moved by the means of theirs
-    for part in parts(len(left), _STRIP):
+    for part in parts(len(left), _STRIP_ROWS):
         top = max(part.start - reach, 0)
         near = slice(top, part.stop + reach)
         strip = _least_squares_step(left[near], right[near], disparity[near], good[near])

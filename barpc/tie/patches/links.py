@@ -18,7 +18,7 @@ from barpc.base.statistics import FEW, kd_tree, robust_spread
 from barpc.base.tasks import HERE, Work
 from barpc.scene import BoolArray, IntArray, Tracks, View, row_pairs
 from barpc.tie.pairing.epipolar import LEAST_REACH, LEAST_SIGMA, SIGMA, coherent, epipolar_segments, grouped, linear_map
-from barpc.tie.patches.register import Part, PatchRegistration, register_parts, task_parts
+from barpc.tie.patches.register import PatchRegistration, PatchSearch, register_parts, task_parts
 from barpc.tie.pixels import SPAN
 
 _DISTORTED = 2.0  # times the median sigma about it: the patch lies across a step of the ground
@@ -108,7 +108,7 @@ class _Registrations:
         rounding = (origin - self.tracks.xy[self.reference])[:, :, None]
         start = self.tracks.xy[self.other] + (linear @ rounding)[:, :, 0]
         parts = [part for group in self.groups() for part in task_parts(origin[group], group, tile)]
-        tasks, rows, before = list[list[Part]](), list[list[IntArray]](), -1
+        tasks, rows, before = list[list[PatchSearch]](), list[list[IntArray]](), -1
         for part in parts:
             first, second = self.of(part)
             images = ((first.path, first.size), (second.path, second.size))

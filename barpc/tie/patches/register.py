@@ -159,11 +159,11 @@ def _merge_groups(groups: Sequence[IntArray], most: int) -> list[IntArray]:
     return [np.concatenate(part) for part in parts]
 
 
-Part = tuple[oriented.ImageFiles, Array, Array, Array, bool]
+PatchSearch = tuple[oriented.ImageFiles, Array, Array, Array, bool]
 """Patches of one image to be found in another: both files, reference, start, linear, whether structure is compared."""
 
 
-def register_parts(parts: Sequence[Part], band: int) -> PatchRegistration:
+def register_parts(parts: Sequence[PatchSearch], band: int) -> PatchRegistration:
     """Register patches by their grey values, or by channels of oriented gradients; `ok` where they are alike.
 
     Every file is opened once for all parts.
