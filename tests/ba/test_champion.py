@@ -135,7 +135,7 @@ def moving(made: Any, share: float, by: float, dates: tuple[str, ...] = ("", "",
     return views, Tracks(tracks.view, tracks.point, xy, tracks.sigma), member
 
 
-@pytest.mark.parametrize(("by", "seen"), [(0.3, False), pytest.param(20.0, True, marks=pytest.mark.costs(5))])
+@pytest.mark.parametrize(("by", "seen"), [(0.3, False), pytest.param(20.0, True, marks=pytest.mark.costs(4))])
 def test_ground_that_moves_within_a_pass_moves_by_more_than_matches_err(block: Any, by: float, seen: bool) -> None:
     views, tracks, member = moving(block, 0.35, by)
     found = adjust_tracks(views, tracks)

@@ -204,7 +204,7 @@ def test_images_that_do_not_overlap(crops, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "what", ["nodata", "constant", pytest.param("noise", marks=[pytest.mark.slow, pytest.mark.costs(6)])]
+    "what", ["nodata", "constant", pytest.param("noise", marks=[pytest.mark.slow, pytest.mark.costs(4)])]
 )
 def test_images_that_show_nothing_in_common(crops, tmp_path, what):
     rng = np.random.default_rng(3)
