@@ -35,8 +35,8 @@ from barpc.base.safe_io import plain_path
 from barpc.base.tasks import Progress, one_by_one
 from barpc.base.verb_options import DsmOptions
 from barpc.cameras import open_camera
+from barpc.dsm.consensus import F32
 from barpc.dsm.stereo import (
-    F32,
     MATCHED,
     TILE_NODES,
     Groups,

@@ -17,16 +17,10 @@ from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.tasks import Progress, Work
 from barpc.pipeline.calibrations import common_errors, refuse_strange
+from barpc.pipeline.control import load_altimetry, load_gcps
 from barpc.pipeline.earlier import Earlier, GrowingRun, chosen_pairs, of_new
 from barpc.pipeline.exchanged import exchanged_cameras
-from barpc.pipeline.inputs import (
-    given_matches,
-    given_tracks,
-    load_altimetry,
-    load_gcps,
-    read_pairs,
-    reference_names,
-)
+from barpc.pipeline.inputs import given_matches, given_tracks, read_pairs, reference_names
 from barpc.pipeline.outputs import MATCH_FILES
 from barpc.pointio.matches import asp_text, write_matches
 from barpc.pointio.names import pair_name

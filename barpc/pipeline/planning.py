@@ -10,7 +10,7 @@ import numpy as np
 
 from barpc.base.geodesy import DEFAULT, HeightDatum
 from barpc.base.options import RunOptions
-from barpc.pipeline.inputs import load_altimetry, load_gcps
+from barpc.pipeline.control import load_altimetry, load_gcps
 from barpc.rasters.dem import Dem
 from barpc.report import Run
 from barpc.scene import GroundPoints

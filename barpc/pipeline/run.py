@@ -33,12 +33,7 @@ from barpc.pipeline.calibrations import calibrated, calibrations_of
 from barpc.pipeline.earlier import Earlier, GrowingRun, added, images_table, join_earlier, movers
 from barpc.pipeline.executor import CachingExecutor, by_groups
 from barpc.pipeline.grid_outputs import write_grids
-from barpc.pipeline.inputs import (
-    hash_inputs,
-    input_files,
-    side_inputs,
-    with_located,
-)
+from barpc.pipeline.inputs import hash_inputs, input_files, side_inputs, with_located
 from barpc.pipeline.loading import Image, image_path, load_views
 from barpc.pipeline.outputs import output_names, refuse_shadows, write_tables, write_views
 from barpc.pipeline.pictures import write_pictures

@@ -20,17 +20,10 @@ from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import INFERRED, Array
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import GEOJSON, TABLE, encoding_of, opened_text, parse_xml, read_head, read_json
+from barpc.pointio.columns import guessed
 from barpc.pointio.gcp_tables import ALONE, GCP_NAMES, KNOWN, NAN, SIGMAS, TEXTS, GcpTable, Row, named, of_columns
 from barpc.pointio.layers import GEOPACKAGE, SHAPEFILE, read_layer
-from barpc.pointio.tables import (
-    IMAGE_SIGMA,
-    Texts,
-    degrees,
-    guessed,
-    numbers_of,
-    read_columns,
-    row_of,
-)
+from barpc.pointio.tables import IMAGE_SIGMA, Texts, degrees, numbers_of, read_columns, row_of
 from barpc.rasters.raster import driver_at, driver_of, open_raster
 from barpc.rasters.vertical import ELLIPSOID, Vertical
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -17,143 +17,14 @@ from typing import Any
 import numpy as np
 
 from barpc.base.errors import BarpcError, InputError, plain
-from barpc.base.geodesy import DEFAULT, INFERRED, STATED, Array
-from barpc.base.safe_io import MAX_DIGITS, MAX_NUMBER, OPTIONS, TABLE, opened_text, read_text
+from barpc.base.geodesy import Array
+from barpc.base.safe_io import MAX_DIGITS, TABLE, opened_text
+from barpc.pointio.columns import Names, header_of
 from barpc.pointio.names import from_cell
-from barpc.rasters.vertical import ELLIPSOID, UNKNOWN, Vertical, metres_of
 from barpc.scene import IntArray
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
-
-Names = Mapping[str, Sequence[str]]
-"""Quantity -> what files call it."""
-
-COLUMNS: Names = {
-    "lon": ("lon", "long", "longitude", "lng"),
-    "lat": ("lat", "latitude"),
-    "alt": ("alt", "altitude", "height", "h", "z", "elevation", "elev", "height_above_datum"),
-    "col": ("col", "column", "samp", "sample", "pixel", "px", "pixel_x", "image_x"),
-    "row": ("row", "line", "py", "pixel_y", "image_y"),
-}
-_EITHER = ("lon", "lat"), ("col", "row")
-"""What x and y are: the pair that no other column is named for."""
-
-
-def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
-    """Return the column of each quantity that a header names."""
-    lower = [_normalised_word(word) for word in words]
-    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
-    found = {key: places[0] for key, places in hits.items() if places}
-    left = [pair for pair in _EITHER if set(pair) <= set(names) and not set(pair) <= set(found)]
-    if len(left) == 1:
-        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
-        found = {**either, **found}
-    return found
-
-
-def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[str], Vertical]:
-    """Return the column of each quantity of control points, by the names of `known` and `COLUMNS`, then by likeness;
-    in words, which were guessed so; and what the altitude's name says of it. InputError where two could be that.
-    """
-    if {"X", "Y", "x", "y"} <= set(words):  # where the case alone tells them apart, as scripts for Metashape write it
-        words = [_BY_CASE.get(word, word) for word in words]
-    bare = [_bare(word) for word in words]
-    exact = header_of(bare, {**COLUMNS, **known})
-    found = dict(exact)
-    if {"x", "y"} <= set(bare) and not {"lon", "lat", "col", "row"} & set(found):
-        on_map = all(key in found or _alike(key, words, bare, found.values()) is not None for key in ("east", "north"))
-        pair = ("east", "north") if "alt" in found and not on_map else ("col", "row")
-        found |= {key: bare.index(word) for key, word in zip(pair, "xy", strict=True)}
-    for key in (key for key in _LIKE if key not in found):
-        if (place := _alike(key, words, bare, found.values())) is not None:
-            found[key] = place
-    said = [f"column {words[i]!r} is {key}" for key, i in found.items() if exact.get(key) != i]
-    return found, said, vertical_of_column(words[found["alt"]] if "alt" in found else "")
-
-
-def _alike(key: str, words: Sequence[str], bare: Sequence[str], taken: Collection[int]) -> int | None:
-    """Return the column not `taken` yet with a name like a quantity's; InputError where two could be the altitude."""
-    free = (i for i, word in enumerate(bare) if i not in taken and not _ERRORS.match(word))
-    hits = [i for i in free if _LIKE[key].fullmatch(bare[i])]
-    above = [i for i in hits if "ellips" in bare[i] or "hae" in bare[i]]
-    if key == "alt" and len(hits) > 1 and len(above) != 1:
-        raise InputError(f"columns {' and '.join(repr(words[i]) for i in hits)} could be the altitude; rename one alt")
-    return next(iter(above or hits), None)
-
-
-def vertical_of_column(word: str) -> Vertical:
-    """Return the vertical datum and unit of altitudes from the name of their column."""
-    _, unit, metres = _unit_of(word)
-    none = (UNKNOWN, None, DEFAULT)
-    name, geoid, known = next((of for sign, of in _LEVELS.items() if re.search(sign, word, re.IGNORECASE)), none)
-    return Vertical(name, metres, unit, geoid, known)
-
-
-def like_altitudes(words: Sequence[str]) -> list[str]:
-    """Return the names, as `header_of` compares them, that are like that of an altitude."""
-    return [
-        _normalised_word(word)
-        for word in words
-        if _LIKE["alt"].fullmatch(bare := _bare(word)) and not _ERRORS.match(bare)
-    ]
-
-
-def _normalised_word(word: str) -> str:
-    return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
-
-
-def _unit_of(word: str) -> tuple[str, str, float]:
-    """Return a column's name without its unit of length, the unit (empty: none is said) and its metres."""
-    parts = re.findall(r"[^\s_\[\]()-]+", word)
-    for n in range(min(3, len(parts) - 1), 0, -1):
-        unit = "".join(parts[-n:])
-        if unit.isalpha() and (metres := metres_of(unit)) is not None:
-            return word[: word.rindex(parts[-n])].rstrip(" _[("), " ".join(parts[-n:]), metres
-    return word, "", 1.0
-
-
-_LEVELS = {
-    "ellips|hae|(?<![a-z])ell(?![a-z])": (ELLIPSOID, None, STATED), "egm.?96": ("EGM96 height", "egm96", STATED),
-    "egm.?(20)?08": ("EGM2008 height", "egm2008", STATED),
-    "navd.?88": ("NAVD88 height", "egm96", STATED), "ortho|msl|geoid": ("the sea", "egm96", STATED),
-    # as barpc, GeoJSON, ICESat-2 and GEDI define them
-    r"^alt(?![a-z])|^h_(?:ph|li|te_best_fit|mean)$|lowestmode": (ELLIPSOID, None, INFERRED),
-}  # fmt: skip
-_ERRORS = re.compile(
-    "sigma|std|stdev|acc|err|resid|d[xyz]$|.*_(error|est|sigma|std|accuracy)$|(image|img)_(width|height)"
-)
-_IMAGE_WORDS = "image|img|pixel|pix|px|photo|source|raster|im"
-_MAP = "utm|map|world|ground|geo|coord|point|proj|gk|l93|lambert|lambert93|terrain|gcp|coordinate"
-_LIKE = {
-    key: re.compile(pattern)
-    for key, pattern in {
-        "col": rf"({_IMAGE_WORDS})_?(x|u|col|column|sample)|(x|u|col|column|sample)_?({_IMAGE_WORDS})|u",
-        "row": rf"({_IMAGE_WORDS})_?(y|v|row|line)|(y|v|row|line)_?({_IMAGE_WORDS})|v",
-        "lon": r"(.+_)?(lon|long|longitude|lng)(_.+)?",
-        "lat": r"(.+_)?(lat|latitude)(_.+)?",
-        "east": rf"e|(.+_)?(east|eastings?|rechtswert)(_.+)?|({_MAP})_?(x|e)|x_?({_MAP})",
-        "north": rf"n|(.+_)?(north|northings?|hochwert)(_.+)?|({_MAP})_?(y|n)|y_?({_MAP})",
-        "alt": r"(.+_)?(alt|altitude|height|hgt|ele|elev|elevation|z|h|hae|msl|egm_?(20)?(96|08)|navd_?88)(_.+)?",
-        "image": r"(.+_)?(image|img|photo|picture|camera|file|filename)(_(name|file|id|label|path))?",
-        "id": r"(gcp|point|pt|marker|target|station)_?(id|name|no|nr|num|number|label)?|fid|no|nr|num|number",
-    }.items()
-}
-"""What columns that nobody lists are taken for: the log says so."""
-
-
-_BY_CASE = {"X": "map_X", "Y": "map_Y", "Z": "map_Z", "x": "px_x", "y": "px_y"}
-_PIXELS = re.compile(r"(?i)^\s*([xyuv])\s*[\[(]\s*(px|pix|pixels?)\s*[\])]\s*$")
-
-
-def _bare(word: str) -> str:
-    """Return a column's name in lower case, words joined by lines, without unit; of X/Longitude the latter."""
-    word = _PIXELS.sub(r"px_\1", word)
-    name, _, metres = _unit_of(word)
-    # accuracies are read in metres alone
-    word = re.sub(r"\W", "_", word) if metres != 1.0 and _ERRORS.match(word.lower()) else name
-    word = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", word.strip().rpartition("/")[2])
-    return re.sub(r"[^\w]+", "_", re.sub(r"[\[(].*", "", word).lower()).strip("_")
 
 
 _DEGREES = re.compile(
@@ -466,53 +337,3 @@ def _column_indices(
 def lacking(path: Path, names: Sequence[str], words: Sequence[str]) -> InputError:
     """Return the error of a table without columns that are needed."""
     return InputError(f"{path}: no column {', '.join(names)} among the {len(words)} of its first line")
-
-
-# --- motions ----------------------------------------------------------------------------------------------
-
-_ROUNDED = 2e-6
-"""Largest error of the squares of a rotation's rows where each number has the six decimals of `%f`."""
-_WANTED = "expected three or four lines of four numbers: a rotation (with a scale) and a translation [m], ECEF"
-_BLANKS = str.maketrans(",;[]()", "      ")
-
-
-def read_transform(path: Path | str) -> Array:
-    """Read the matrix (3, 4) of a motion of the ground, ECEF [m]: a rotation times a scale, a translation.
-
-    Lines of four numbers between blanks, commas or semicolons, perhaps in brackets, three of them or, with the last
-    line 0 0 0 1, four: what pc_align of the Ames Stereo Pipeline, CloudCompare and PDAL write. InputError for anything
-    else, one line that says what was found.
-    """
-    lines = [raw.partition("#")[0].translate(_BLANKS).split() for raw in read_text(path, OPTIONS).splitlines()]
-    rows = [words for words in lines if words]
-    for word in (word for words in rows for word in words):
-        value = numbers_of([word])
-        if value is None or not abs(value[0]) <= MAX_NUMBER:
-            raise InputError(f"{path}: {word[:40]!r} is no finite number; {_WANTED}")
-    shape = len(rows), *sorted({len(row) for row in rows})
-    if shape == (4, 3):
-        raise InputError(f"{path}: four lines of three numbers, a transposed matrix? {_WANTED}")
-    if shape not in ((4, 4), (3, 4), (1, 16), (1, 12)):  # or row after row in one line
-        counts = f"{len(rows)} lines of {' or '.join(map(str, shape[1:4])) or 'no'} numbers"
-        raise InputError(f"{path}: {counts}; {_WANTED}")
-    matrix = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    if reason := _no_motion(matrix):
-        raise InputError(f"{path}: {reason}")
-    return matrix[:3]
-
-
-def _no_motion(matrix: Array) -> str:
-    """Return why a matrix moves no ground; empty where it does."""
-    if len(matrix) == 4 and not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        turned = np.array_equal(matrix[:, 3], [0, 0, 0, 1])
-        what = "the matrix is transposed" if turned else "the matrix is no motion"
-        return f"its last line is {' '.join(f'{value:g}' for value in matrix[3])} and not 0 0 0 1: {what}"
-    square = matrix[:3, :3] @ matrix[:3, :3].T
-    scale = float(np.trace(square)) / 3.0
-    off = float(np.abs(square / scale - np.eye(3)).max()) if scale > 0 else np.inf
-    if not off <= _ROUNDED:
-        return (
-            f"its first three columns are no rotation times a scale (deviation {off:.2g}): a matrix of map "
-            "coordinates or of longitudes and latitudes, or one that shears? A motion of ECEF coordinates is needed"
-        )
-    return "its first three columns mirror the ground" if np.linalg.det(matrix[:3, :3]) < 0 else ""

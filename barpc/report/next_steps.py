@@ -14,8 +14,8 @@ from barpc.ba.constraints.ground import KNOWN_BIAS
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
 from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
+from barpc.report.constraints import lengths
 from barpc.report.outcome import Added
-from barpc.report.quality_checks import lengths
 from barpc.report.ranking import flagged, sure_pairs
 from barpc.report.records import value_of
 from barpc.report.summary import ExpectedEntry, StepEntry, Summary

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from barpc.ba import Adjustment
-from barpc.ba.control.snooping import ControlTest
 from barpc.ba.parameters.priors import is_stated
 from barpc.ba.select.foreign_camera import ForeignCamera
 from barpc.base.errors import listed
 from barpc.base.geodesy import Array
-from barpc.base.statistics import SURE, SURELY
+from barpc.base.statistics import SURE
 from barpc.report.measures.block import left_entries, matters, strangeness
 from barpc.report.outcome import LEAST_MOVED, MANY_REJECTED, WHOLE_PIXELS, Run
 from barpc.report.ranking import GOOD_RMSE, SMOOTH_LEFT
 from barpc.report.summary.block import AXES, LeftEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import CAUSES, NAMED, counted, enu, known, metres, two_digits
-from barpc.scene import GroundPoints
+from barpc.report.summary.words import CAUSES, counted, known, metres, two_digits
 from barpc.sensor.geometry import Several
 from barpc.sensor.image_corrections import Splined
 from barpc.sensor.rpc import RPC
-from barpc.tie.reference import FAR_RADIUS, PEAK
 
 MIN_TIE_POINTS = 30  # Of a view, used or rejected: they tell a standard deviation to an eighth, 1 / sqrt(2 n)
 ENOUGH_GCPS = 3  # Control points that constrain a view without any tie point
@@ -33,12 +30,7 @@ NOISE_LIMIT = 2.5  # Scatter of tie points over the accuracy that the matcher st
 
 _PARALLEL = 0.05  # sine of the angle between lines and axis under which a part across tells nothing of that along
 _WHOLE_IMAGE = 0.9  # share of the rows or columns that is the whole image
-_CONTROL_WORDS = {
-    "rejected": ("{} rejected, as the others contradict {}", "Check coordinates, axes and image positions"),
-    "contradicts": ("{} used, with residuals above 4 standard deviations", "Check coordinates and stated accuracies"),
-}
 
-_CHECK_DEM = "Check its heights, their datum, and the cameras."
 
 PASSED_STATUS = {"adjust": "adjusted", "check": "consistent", "match": "tied"}
 """Kind of a run -> the status of a view without reservation."""
@@ -294,187 +286,3 @@ def _metres_a_pixel(run: Run, i: int, along: Array) -> float:
     seen = Several(run.cameras, np.full(len(ground), i))
     rate = np.nanmedian((seen.project(higher) - seen.project(ground)) @ along)
     return float(1.0 / abs(rate)) if abs(rate) > 0.0 else float("nan")
-
-
-# --- constraints of the scene: control, reference, DEM -----------------------------------------------------
-
-
-def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> Iterator[str]:
-    """Yield the effect of ground control; `known`: the uncertainty of the scene's position, as a clause."""
-    is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
-    held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
-    with_points = f"With {counted(held, 'GCP')}" if held else "Without ground control"
-    scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
-    if tested is None or tested.agrees:
-        yield f"{with_points}, {known}."
-    elif not held:
-        yield f"Without consistent ground control, {known}."
-    elif scale > 1.0:
-        yield f"{with_points}, {scale:.0f} times less accurate than stated, {known}."
-    else:
-        yield f"The {counted(held, 'GCP')} in use do not agree: the uncertainty of the scene's position is unknown."
-    # rejected ones have checked them
-    if held == is_seen.sum() > 0 and tested is not None and tested.agrees and not tested.checked:
-        yield f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show."
-    alone = np.unique(gcps.view)
-    if held and len(alone) == 1 and len(views) > 1:
-        yield f"Only {views[alone[0]].name} shows GCPs: they do not constrain the scene along its lines of sight."
-
-
-def reference_lines(run: Run) -> Iterator[str]:
-    """Yield the matches with a reference and the offsets of the delivered cameras."""
-    found = run.reference
-    if found is None or found.control is None:
-        return
-    if matched := [view for view in found.views if view.points]:
-        used, tried = sum(view.points for view in matched), sum(view.tried for view in matched)
-        off = listed([f"{np.hypot(*view.offset):.1f} m ({view.name})" for view in matched], NAMED)
-        pixels = found.step / max(view.gsd for view in matched)
-        yield (
-            f"The reference was matched at {used} of {counted(tried, 'point')} in {counted(len(matched), 'image')}, to "
-            f"{metres(found.step)}" + f" ({pixels:.2g} px)" * bool(np.isfinite(pixels)) + "."
-        )
-        yield f"By the reference, the delivered cameras are off by {off}."
-    if rest := listed([view.name for view in found.views if not view.points]):
-        yield f"No point of the reference was matched in {rest}."
-
-
-def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
-    """Yield the reservations on ground control."""
-    status = [tested.status(g) for g in range(len(names))]
-    for word, (words, cure) in () if tested.torn else _CONTROL_WORDS.items():
-        wrong = [
-            f"{names[g]} ({enu(tested.residual[g])}, w = {tested.w[g]:.1f})"
-            if np.isfinite(tested.w[g])
-            else f"{names[g]} (in too few images to determine its error)"
-            for g in range(len(names))
-            if status[g] == word
-        ]
-        if wrong:
-            alike = word == "rejected" and tested.agreed is not None and tested.agreed.alike
-            datum = " They agree with each other: check their datum and heights, too." * alike
-            start = words.format(counted(len(wrong), "GCP"), "it" if len(wrong) == 1 else "them")
-            sign = ", predicted minus given" * any(", w = " in one for one in wrong)
-            yield f"{start}: {listed(wrong)}{sign}. {cure}.{datum}"
-    if tested.sets:
-        one, other = (listed([names[g] for g in np.flatnonzero(points).tolist()], NAMED) for points in tested.sets)
-        middle = [tested.residual[points & np.isfinite(tested.w)] for points in tested.sets]
-        apart = ""
-        if all(len(residual) for residual in middle):
-            apart = f" (predicted minus given differs by {enu(middle[0].mean(axis=0) - middle[1].mean(axis=0))})"
-        yield (
-            f"GCPs contradict each other, {one} against {other}{apart}, and none was used. Check coordinates, axes, "
-            "datum and image positions, or add a point."
-        )
-    if tested.torn:
-        without, held = tested.torn
-        yield (
-            f"With the GCPs the images would agree less: the RMS of check tie points rises from {without:.3f} to "
-            f"{held:.3f} px. None was used. Check coordinates, image positions and stated accuracies."
-        )
-    if not tested.fits and "contradicts" not in status:
-        yield (
-            f"{counted(int(tested.used.sum()), 'GCP')} scatter {tested.scatter:.1f} times as much as stated. Check "
-            "their coordinates and stated accuracies."
-        )
-
-
-def reference_reasons(run: Run, stated: float) -> Iterator[str]:
-    """Yield reservations on the reference: refused, distorted, or on heights less accurate than `stated` [m]."""
-    found = run.reference
-    if found is None:
-        return
-    if found.control is None:
-        whys = "check the place of the DEM under it, or give a newer or finer one"
-        if all(view.peak < PEAK for view in found.views):
-            whys = f"check its place and that cameras are not more than {FAR_RADIUS / 1e3:g} km off, or give another"
-        yield f"The reference {found.refusal} and was not used: {whys}."
-    used = [view for view in found.views if view.points]
-    if wide := [f"{view.name} ({metres(view.scatter)})" for view in used if view.scatter > found.step]:
-        yield (
-            f"Points of the reference scatter across the lines of sight by more than the resolution of "
-            f"its matches, {metres(found.step)}, in {listed(wide, NAMED)}. Check it for distortions, and the images."
-        )
-    if wrong := [view for view in used if view.shows_heights(stated)]:
-        named = listed([f"{metres(view.along)} in {view.name}" for view in wrong], NAMED)
-        yield (
-            f"The heights of the DEM under the reference are less accurate than stated: points scatter along the "
-            f"lines of sight by {named}, as with height errors of {metres(max(view.heights for view in wrong))} "
-            f"({metres(stated)} stated). Check the DEM: an error common to all heights would shift the scene unseen."
-        )
-
-
-def dem_lines(adjustment: Adjustment) -> Iterator[str]:
-    """Yield the heights that the DEM constrains, their assumed errors and their offset."""
-    terrain, options = adjustment.terrain, adjustment.options
-    if terrain is None or not terrain.shows:
-        return
-    by_reference = bool(adjustment.reference_inlier.any())  # which stands on it: no tie point does
-    if not terrain.total:
-        yield from ["The DEM constrains nothing: there are no tie points."] * (not by_reference)
-        return
-    held = f"DEM heights constrain {terrain.held} of {counted(terrain.total, 'used tie point')}"
-    covers = f"; the DEM covers {100 * terrain.known / terrain.total:.0f} %" if terrain.known < terrain.total else ""
-    if not terrain.held:
-        yield f"{held}: the DEM has no height where one is needed{covers}."
-        return
-    yield f"{held}{covers}."
-    single = metres(terrain.sigma if np.isfinite(terrain.sigma) else options.dem_sigma)
-    measured = ""
-    if terrain.known:
-        lie = f"the tie points lie {metres(abs(terrain.offset))} {'above' if terrain.offset > 0 else 'below'} it"
-        measured = f"; measured: {lie} (median; scatter {metres(terrain.spread)})"
-    yield f"DEM accuracy assumed: {metres(terrain.bias)} shared by all points, {single} each{measured}."
-    if np.isfinite(terrain.sigma) and terrain.alike >= 1.05:
-        yield f"DEM errors are correlated: {terrain.alike:.1f} points count as one."
-
-
-CONTROL_WORDS = {"dem": "the DEM", "gcps": "the GCPs", "reference": "the reference"}
-"""Kind of control -> its words in a sentence."""
-
-
-def deformation_reasons(adjustment: Adjustment) -> Iterator[str]:
-    """Yield the reservation on control that asks for another shape of an image than tie points do."""
-    if (one := adjustment.deformed) is not None:
-        control = listed([CONTROL_WORDS[kind] for kind in one.control])
-        yield (
-            f"To follow {control}, {adjustment.names[one.view]} would be deformed by {one.px:.1f} px at its corners, "
-            f"{one.sigmas:.0f} times the standard deviation of its camera. Tie points do not ask for that, so it was "
-            f"not. Check {control}."
-        )
-
-
-def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
-    """Yield reservations on the DEM: another terrain, or a contradiction to the delivered cameras."""
-    terrain = adjustment.terrain
-    if terrain is None:
-        return
-    if not terrain.shows:
-        yield (
-            f"The DEM was not used: its relief is {terrain.relief:.2g} times that of the tie points. Check its place, "
-            "units and heights, and for camera errors larger than its hills."
-        )
-        return
-    if not terrain.agrees:
-        times = round(terrain.relief, 2) + 0.0
-        yield (
-            f"The DEM has {times:g} times the relief of the adjusted tie points: of another terrain, water, or filled "
-            "or smoothed heights. Leave it out, or give another."
-        )
-    (level, *rises), (off, *tilts) = terrain.beyond, terrain.delivered
-    if level > SURELY:
-        yield (
-            f"The DEM is {abs(off):.1f} m {'below' if off > 0 else 'above'} the tie points of the delivered cameras, "
-            f"{level:.1f} times the standard deviation of that difference. {_CHECK_DEM}"
-        )
-    sides = zip(tilts, rises, ("east", "north"), strict=True)
-    if tilted := [f"{abs(tilt):.1f} m to the {side}" for tilt, times, side in sides if times > SURELY]:
-        yield (
-            f"The DEM is tilted against the tie points of the delivered cameras, by {' and '.join(tilted)} at its "
-            f"edge, more than {SURELY:g} times the standard deviation of that tilt. {_CHECK_DEM}"
-        )
-
-
-def lengths(values: Iterable[float]) -> str:
-    """Return lengths in readable units."""
-    return ", ".join(map(metres, values))

@@ -11,6 +11,7 @@ from barpc.base import used_later
 from barpc.base.options import TieOptions
 
 if TYPE_CHECKING:
+    from barpc.tie.linking import link, thin
     from barpc.tie.matchers.features import Keypoints
     from barpc.tie.matchers.matcher import Matches
     from barpc.tie.matchers.matching import match_pairs
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from barpc.tie.pairing.overlaps import Pair, Scope
     from barpc.tie.patches.links import refine
     from barpc.tie.reference import ReferenceControl
-    from barpc.tie.tracks import TieResult, find_tracks, link, thin
+    from barpc.tie.tracks import TieResult, find_tracks
 
 __all__ = [
     "Area",

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from barpc.base.errors import BarpcWarning, FitError, InputError, Remark
 from barpc.base.geodesy import Array, as_points, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.fit import FitOptions, RpcFit, fit_rpc
-from barpc.pointio.tables import read_transform
+from barpc.pointio.motions import read_transform
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.corrected import Corrected, Correction, correction_of

@@ -16,7 +16,7 @@ from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.constraints.shape import MOST_SIGMAS, shape_change
 from barpc.base.geodesy import Array, metres_per_unit
 from barpc.rasters.dem import localize_on_terrain
-from barpc.report.quality_checks import deformation_reasons, dem_reasons
+from barpc.report.constraints import deformation_reasons, dem_reasons
 from barpc.scene import GroundPoints, Terrain, Tracks, View
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import simulate_block

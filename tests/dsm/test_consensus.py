@@ -11,14 +11,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from barpc.base.verb_options import DsmOptions
 from barpc.dsm import stereo
-from barpc.dsm.stereo import (
-    NEIGHBOUR_RADIUS,
-    SURROUNDED,
-    block_of_images,
-    consensus,
-    finite_median,
-    surface_tile,
-)
+from barpc.dsm.consensus import NEIGHBOUR_RADIUS, SURROUNDED, consensus, finite_median
+from barpc.dsm.stereo import block_of_images, surface_tile
 from barpc.dsm.surface import Grid
 from tests.dsm.conftest import SMALL, Rendered
 from tests.lanes import rest_slow

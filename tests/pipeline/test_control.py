@@ -14,7 +14,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions, TieOptions
 from barpc.pipeline import inputs as control
-from barpc.pipeline.inputs import load_gcps
+from barpc.pipeline.control import load_gcps
 from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
 from barpc.sensor.corrected import Corrected, Correction

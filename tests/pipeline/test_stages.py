@@ -20,6 +20,7 @@ from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
 from barpc.pipeline import adjusting, inputs
 from barpc.pipeline import run as stages
+from barpc.pipeline.control import load_altimetry
 from barpc.pipeline.earlier import of_new
 from barpc.pipeline.inputs import (
     IMAGES,
@@ -27,7 +28,6 @@ from barpc.pipeline.inputs import (
     given_matches,
     given_tracks,
     input_files,
-    load_altimetry,
     read_pairs,
     side_inputs,
     with_located,

@@ -20,10 +20,11 @@ from rasterio.warp import transform
 
 from barpc.base.errors import InputError, plain
 from barpc.base.geodesy import HeightDatum, ecef_from_ground
+from barpc.pointio.columns import COLUMNS, guessed
 from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.pointio.gcp_tables import GCP_NAMES as NAMES_OF
 from barpc.pointio.gcps import ControlReference, read_gcps
-from barpc.pointio.tables import COLUMNS, degrees, guessed
+from barpc.pointio.tables import degrees
 from barpc.report.geopackage import MapLayer, geopackage, point_shapes
 from barpc.scene import GroundPoints
 from tests.geotiffs import write_image

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError
-from barpc.pointio.tables import read_transform
+from barpc.pointio.motions import read_transform
 
 MATRIX = np.eye(4)
 MATRIX[:3, :3] = 1.000003 * Rotation.from_rotvec([1e-4, -2e-4, 5e-5]).as_matrix()

@@ -16,8 +16,8 @@ from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.options import RunOptions
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
+from barpc.report.constraints import control_reasons, held_lines
 from barpc.report.outcome import Added, Run
-from barpc.report.quality_checks import control_reasons, held_lines
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import enu, metres

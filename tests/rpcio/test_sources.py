@@ -13,16 +13,7 @@ import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.base.errors import ImageError, RpcError, RpcFormatError
-from barpc.rpcio import (
-    FORMATS,
-    read_rpc,
-    read_rpc_source,
-    shadows,
-    sidecars,
-    write_rpc,
-    write_rpc_copy,
-    write_rpc_vrt,
-)
+from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, shadows, sidecars, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.rpcio.sources import only_physical, stated_in_xml
 from tests.rpcio.conftest import dimap_v2, grid, rpc_domain, write_image

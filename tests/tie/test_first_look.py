@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.tie import TieOptions, TieResult, find_tracks, tracks
+from barpc.tie import TieOptions, TieResult, find_tracks, linking, tracks
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, worth_a_first_look
 from barpc.tie.matchers.matcher import NO_MATCHES
@@ -143,8 +143,8 @@ def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeyp
     scene = render(views=3, size=(300, 300))
     names = tuple(view.name for view in (scene.views[0], scene.views[2]))
     monkeypatch.setattr(tracks, "ample", lambda report, _: report.names != names)
-    linked, link = [], tracks.link
-    monkeypatch.setattr(tracks, "link", lambda *given: linked.append(given) or link(*given))
+    linked, link = [], linking.link
+    monkeypatch.setattr(linking, "link", lambda *given: linked.append(given) or link(*given))
     found = find_tracks(scene.views, FEW)
     assert looks == [True, False]
     pairs, matches = max(linked, key=lambda given: sum(map(len, given[1])))

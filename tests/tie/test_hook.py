@@ -18,7 +18,7 @@ from barpc.pipeline import RunOptions, adjust
 from barpc.scene import View
 from barpc.tie import Matches, find_tracks
 from barpc.tie.matchers.matcher import Hook, Prediction, hook_files, hooked
-from barpc.tie.matchers.matching import MATCHERS, matcher_named
+from barpc.tie.matchers.pair_search import MATCHERS, matcher_named
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks

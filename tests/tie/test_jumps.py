@@ -15,7 +15,7 @@ from barpc.scene import View
 from barpc.tie import find_tracks
 from barpc.tie.matchers.given import verify_given
 from barpc.tie.matchers.matcher import Matches
-from barpc.tie.matchers.matching import _PairSearch
+from barpc.tie.matchers.pair_search import PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
 from benchmarks.planted import Plant
@@ -118,8 +118,8 @@ def test_of_given_matches_those_behind_a_jump_stay_and_those_anywhere_go(scene: 
 
 
 def test_a_clean_pair_is_not_looked_at_for_offsets_that_it_does_not_have(scene: Rendered, monkeypatch) -> None:
-    peaks, beside = [], _PairSearch._beside
-    monkeypatch.setattr(_PairSearch, "_beside", lambda *args: peaks.append(beside(*args)) or peaks[-1])
+    peaks, beside = [], PairSearch._beside
+    monkeypatch.setattr(PairSearch, "_beside", lambda *args: peaks.append(beside(*args)) or peaks[-1])
     find_tracks(scene.views)
     assert peaks
     assert not any(peaks)

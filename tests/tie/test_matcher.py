@@ -13,7 +13,7 @@ import pytest
 from barpc.base.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, find_tracks
 from barpc.tie.matchers.matcher import Prediction
-from barpc.tie.matchers.matching import MATCHERS
+from barpc.tie.matchers.pair_search import MATCHERS
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pixels import levelled, read_pixels
 from tests.lanes import rest_slow

@@ -14,11 +14,9 @@ from barpc.tie import TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import MATCHERS, _latest, _PairSearch
+from barpc.tie.matchers.pair_search import MATCHERS, PairSearch, _latest
 from barpc.tie.matchers.report import PairReport, better, enough
-from barpc.tie.pairing.epipolar import (
-    EpipolarSegments,
-)
+from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.tie.test_pairs import camera, views
 
 
@@ -75,10 +73,10 @@ class Scripted:
 
 
 @pytest.fixture
-def search(monkeypatch) -> Callable[[Scripted], _PairSearch]:
-    def made(matcher: Scripted) -> _PairSearch:
+def search(monkeypatch) -> Callable[[Scripted], PairSearch]:
+    def made(matcher: Scripted) -> PairSearch:
         monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
-        return _PairSearch(
+        return PairSearch(
             tuple(views(camera(0.0), camera(0.0))),
             (join_keypoints([]), join_keypoints([])),
             TieOptions(matcher="scripted"),
@@ -95,11 +93,11 @@ def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_t
         matching, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
     )
     ends = tuple(views(camera(0.0), camera(0.0)))
-    _PairSearch(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
+    PairSearch(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
     assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
     monkeypatch.setitem(MATCHERS, "scripted", lambda *_: Scripted([]))
     keypoints: Any = SimpleNamespace(xy="of the first"), SimpleNamespace(xy="of the second")
-    _PairSearch(ends, keypoints, TieOptions(matcher="scripted"))
+    PairSearch(ends, keypoints, TieOptions(matcher="scripted"))
     assert asked[1] == "of the first"
 
 

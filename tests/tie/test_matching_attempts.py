@@ -12,13 +12,14 @@ import pytest
 
 from barpc.scene import Tracks, View
 from barpc.tie import Matches, TieOptions
+from barpc.tie.linking import link
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import FALSE_SHARE, GroundAltitudes, match_pair, match_pairs
 from barpc.tie.matchers.report import PairReport
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.tracks import _merge_registered, _unlike, _with_unregistered, link
+from barpc.tie.tracks import _merge_registered, _unlike, _with_unregistered
 
 from .test_pairs import camera, views
 

@@ -21,7 +21,8 @@ from barpc.tie import PairReport, TieOptions, find_tracks
 from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
-from barpc.tie.matchers.matching import _PairSearch, match_pair
+from barpc.tie.matchers.matching import match_pair
+from barpc.tie.matchers.pair_search import PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair, reach_of
 from barpc.tie.patches.oriented import PatchTile
@@ -87,7 +88,7 @@ def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
 
     monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
     two = (*views(camera(0.0), camera(METRE)),)
-    search = _PairSearch(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
+    search = PairSearch(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
     assert search.offset is None
     assert made == passes
 
@@ -156,7 +157,7 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
 def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, sized: Sized, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
-    search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
+    search = PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
     coarse = search.offset
     assert coarse is not None
     whole = structural._GridSearch(*scene.views, 1, coarse).matches()

@@ -11,8 +11,8 @@ import pytest
 from barpc.scene import Tracks
 from barpc.tie import Matches, TieOptions, thin
 from barpc.tie import link as link_pairs
+from barpc.tie.linking import require_tracks
 from barpc.tie.matchers.report import PairReport
-from barpc.tie.tracks import require_tracks
 from tests.everywhere import tied
 from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import METRE, camera, views

@@ -16,7 +16,8 @@ from barpc.base.tasks import Work
 from barpc.scene import View
 from barpc.tie.matchers.features import Keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import Ends, match_pair
+from barpc.tie.matchers.matching import match_pair
+from barpc.tie.matchers.pair_search import Ends
 from barpc.tie.matchers.report import PairReport, better
 from barpc.tie.pairing.epipolar import epipolar_segments, robust_affine
 from barpc.tie.pairing.overlaps import GIVEN_PAIR, Pair
