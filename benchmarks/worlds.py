@@ -51,10 +51,10 @@ from barpc.base.declarations import with_values  # noqa: E402
 from barpc.base.errors import BarpcError  # noqa: E402
 from barpc.base.options import AdjustOptions, RunOptions  # noqa: E402
 from barpc.pointio.matches import write_matches  # noqa: E402
+from barpc.report.results import PRIOR_WIDENED  # noqa: E402
 from barpc.report.summary import Summary  # noqa: E402
 from barpc.report.summary.block import ExplanationEntry  # noqa: E402
 from barpc.report.summary.views import ViewEntry  # noqa: E402
-from barpc.report.verdict import PRIOR_WIDENED  # noqa: E402
 from barpc.rpcio import write_rpc  # noqa: E402
 from barpc.scene import BoolArray  # noqa: E402
 from barpc.sensor import SensorModel  # noqa: E402

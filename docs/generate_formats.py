@@ -10,9 +10,9 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from barpc.pointio.columns import COLUMNS
 from barpc.pointio.gcp_formats import GCP_FORMATS
 from barpc.pointio.gcp_tables import KNOWN
-from barpc.pointio.tables import COLUMNS
 from barpc.rasters.raster import DRIVERS, MOSAICS
 from barpc.rpcio.formats import CARRIERS, FORMATS
 from barpc.rpcio.sources import _RPC_READERS, _sidecar_names

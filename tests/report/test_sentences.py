@@ -14,14 +14,15 @@ from barpc.ba.control.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.base.options import RunOptions
-from barpc.report import quality_checks
+from barpc.report import quality_checks, results
 from barpc.report import verdict as verdicts
 from barpc.report.constraints import control_reasons, held_lines
-from barpc.report.outcome import Added, Run
+from barpc.report.outcome import MANY_REJECTED, Added, Run
+from barpc.report.quality_checks import view_status
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import enu, metres
-from barpc.report.verdict import block_verdict, view_status
+from barpc.report.verdict import block_verdict
 from barpc.scene import Tracks
 from barpc.tie.detail import Gap
 from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
@@ -82,10 +83,10 @@ def test_the_figures_that_decide():
         quality_checks.GOOD_RMSE,
         quality_checks.MIN_TIE_POINTS,
         quality_checks.ENOUGH_GCPS,
-        verdicts.MANY_REJECTED,
+        MANY_REJECTED,
     )
     assert found == (0.5, 30, 3, 0.3)
-    found = (quality_checks.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)
+    found = (quality_checks.SMOOTH_LEFT, results.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)
     assert found == (0.06, 2.0, 2.5, 3.0)
 
 
@@ -820,8 +821,8 @@ def test_many_displaced_detectors_of_an_image_are_one_sentence(monkeypatch, coun
     """Of one image alone; rows, other images and parts that another image may have keep a sentence of their own."""
     parts = [part(f"columns {n}", 100.0 * n, 0.1 * n) for n in range(1, count + 1)]
     others = part("rows", 5.0, axis="rows"), part("of b", 7.0, image="b"), part("or c", 9.0, candidates=("c",))
-    monkeypatch.setattr(verdicts, "explanations", lambda _: (others[0], *parts, *others[1:]))
-    said = list(verdicts._explanation_sentences(None))  # type: ignore[arg-type]
+    monkeypatch.setattr(results, "explanations", lambda _: (others[0], *parts, *others[1:]))
+    said = list(results._explanation_sentences(None))  # type: ignore[arg-type]
     edges = ", ".join(f"{100 * n}" for n in range(1, count + 1))
     whole = (
         f"{count} parts of the columns of a are displaced by up to {0.1 * count:.2f} px, as by detectors with edges at"
