@@ -23,7 +23,7 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "keypoints_per_image": ("barpc.tie.matchers.features.PER_IMAGE",),
         "false_share": ("barpc.tie.matchers.matching.FALSE_SHARE",),
         "contrast": ("barpc.tie.matchers.features.CONTRAST",),
-        "tolerance": ("barpc.tie.matchers.matching.BAND_HALFWIDTH",),
+        "tolerance": ("barpc.tie.matchers.pair_search.BAND_HALFWIDTH",),
         "patch": ("barpc.tie.patches.register.PATCH",),
         "min_correlation": ("barpc.tie.patches.register.MIN_CORRELATION",),
     },

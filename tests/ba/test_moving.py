@@ -186,7 +186,7 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
     group = Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.full(len(cell), 0.5))
     shares = list(moving_ground._start_shares(linear, group, base, none, np.zeros(0)))
-    assert len(shares) == moving_ground._STARTING_REGIONS + cut
+    assert len(shares) == moving_ground._BEST_REGIONS + cut
     assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
     inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]
     assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
@@ -234,7 +234,7 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     assert gains[best[0]] > 20.0
     first, *others = starts = moving_ground._distinct_regions(moving_ground._GROUND_REGIONS, gains)
     assert (first == moving_ground._GROUND_REGIONS[best[0]]).all()
-    assert len(others) == moving_ground._STARTING_REGIONS - 1
+    assert len(others) == moving_ground._BEST_REGIONS - 1
     assert all(2 * (a & b).sum() <= (a | b).sum() for n, a in enumerate(starts) for b in starts[:n])
     for n in best:
         region = moving_ground._GROUND_REGIONS[n]

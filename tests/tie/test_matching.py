@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers import matching
+from barpc.tie.matchers import pair_search
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matchers.pair_search import MATCHERS, PairSearch, _latest
@@ -88,9 +88,9 @@ def search(monkeypatch) -> Callable[[Scripted], PairSearch]:
 def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_that_both_share(monkeypatch) -> None:
     asked: list[Any] = []
     monkeypatch.setitem(MATCHERS, "blind", lambda *_: SimpleNamespace(detects=False))
-    monkeypatch.setattr(matching, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
+    monkeypatch.setattr(pair_search, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
     monkeypatch.setattr(
-        matching, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
+        pair_search, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
     )
     ends = tuple(views(camera(0.0), camera(0.0)))
     PairSearch(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))

@@ -194,7 +194,7 @@ def test_cells_hold_the_first_quota_of_as_many_observations_as_are_kept(monkeypa
         seen.append((cell, cells))
         return np.ones(tracks.num_points, dtype=bool)
 
-    monkeypatch.setattr(sys.modules["barpc.tie.tracks"], "_fill_cells", fill)
+    monkeypatch.setattr(sys.modules["barpc.tie.linking"], "_fill_cells", fill)
     tracks = tracks_of(*[(v, p) for p in range(30) for v in (0, 1)])
     thin(tracks, [(1000, 800), (700, 700)], 20)
     ((cell, count),) = seen
