@@ -13,7 +13,7 @@ from barpc.ba import adjust_tracks
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions, TieOptions
-from barpc.pipeline import inputs as control
+from barpc.pipeline import control
 from barpc.pipeline.control import load_gcps
 from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
 from barpc.scene import GroundPoints, View
