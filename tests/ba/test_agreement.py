@@ -201,9 +201,7 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
 
 @pytest.mark.parametrize(("scale", "motions"), [(1.0, 1.0), (3.0, 2.0)])
 @pytest.mark.parametrize("inside", [2, 7, 15])
-def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(
-    scale, motions, inside, monkeypatch
-) -> None:
+def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(scale, motions, inside, sized) -> None:
     """In one piece, and where the points are many a few at a time; the set of all, too."""
     offsets = drawn(15, 3, any_way(3, 4, 6.0))
     chosen = np.arange(15) >= 15 - inside
@@ -211,7 +209,7 @@ def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(
     score = SetEvidence(offsets, masks, scale, motions).evidence(np.arange(16))
     there = SetEvidence(offsets, chosen[None], scale, motions)
     np.testing.assert_allclose(there.gains(np.arange(15)), score[1:] - score[0], rtol=1e-6, atol=1e-5)
-    monkeypatch.setattr(sets, "_MAX_SET_POINTS", 20)
+    sized(set_points=20)
     np.testing.assert_allclose(there.gains(np.arange(3, 15)), score[4:] - score[0], rtol=1e-6, atol=1e-5)
 
 

@@ -222,11 +222,10 @@ def test_splines_and_detectors_that_are_asked_for_are_taken_and_none_in_a_sound_
         assert found.after.error < 1.02 * one.found.after.error
 
 
-def test_splines_are_solved_once_and_keep_what_else_was_found(monkeypatch) -> None:
+def test_splines_are_solved_once_and_keep_what_else_was_found() -> None:
     """Terms have splines as a rival; where these win, the solution without the terms is asked for them again."""
     one = solved(jitter="2000")
     found, other = one.with_splines(), Finding("step", 0, None, np.zeros(2), 9.0, 1.0, "", np.zeros(2))
-    monkeypatch.setattr(image_terms, "_solve_with", None)
     again = with_splines(replace(one.found, findings=(other,)), one.parts, one.options)
     assert again.outcome is found.outcome
     assert (found.findings, again.findings) == ((), (other,))
