@@ -1,4 +1,4 @@
-"""The sparse factor against dense linear algebra, and the order of elimination against what it is for."""
+"""The sparse factor against dense linear algebra."""
 
 from __future__ import annotations
 
@@ -15,40 +15,22 @@ from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Blocks, factorize_blocks
 from barpc.ba.solving.solve import camera_step
-from barpc.ba.solving.structure import Dissection, dissect
+from barpc.ba.solving.structure import dissect
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.options import AdjustOptions
 from barpc.scene import GroundPoints, Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import INDEPENDENT, centers_of
+from tests.ba.test_dissection import sites_of
 from tests.constants import Sized
 from tests.costs import once
 from tests.lanes import diagonal
-
-
-def _sites(columns: int, rows: int, a_site: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of views tied to those of the eight sites around theirs, and where all stand."""
-    row, column = np.divmod(np.arange(columns * rows * a_site) // a_site, columns)
-    i, j = np.triu_indices(len(row), 1)
-    near = (abs(row[i] - row[j]) <= 1) & (abs(column[i] - column[j]) <= 1)
-    place = np.stack([column, row], axis=1) + np.random.default_rng(0).normal(0, 0.05, (len(row), 2))
-    return np.stack([i[near], j[near]], axis=1), 1e4 * place
 
 
 def _matrix(pairs: np.ndarray, n: int, q: int, seed: int = 0) -> Blocks:
     rng = np.random.default_rng(seed)
     diagonal = rng.normal(size=(n, q, q))
     return Blocks(diagonal + diagonal.swapaxes(1, 2) + 30 * q * np.eye(q), rng.normal(size=(len(pairs), q, q)), pairs)
-
-
-def _numbers(order: Dissection) -> int:
-    """Blocks in the factor."""
-    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) for f in order.fronts)
-
-
-def _work(order: Dissection) -> int:
-    """Products of blocks that it costs."""
-    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** 2 for f in order.fronts)
 
 
 @pytest.mark.few(2)
@@ -59,7 +41,7 @@ def _work(order: Dissection) -> int:
 def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(sized: Sized, sites, leaf, kept) -> None:
     sized(front_views=leaf)
     sized(fronts_in_memory=kept)
-    pairs, place = _sites(*sites)
+    pairs, place = sites_of(*sites)
     n, q = len(place), 3
     matrix, rng = _matrix(pairs, n, q), np.random.default_rng(0)
     use = rng.random(n) < 0.8 if n > 1 else np.ones(1, dtype=bool)
@@ -98,50 +80,11 @@ def test_the_block_of_a_pair_is_found_where_it_is_and_nowhere_else() -> None:
 
 
 def test_a_matrix_that_is_not_positive_definite_is_said() -> None:
-    pairs, place = _sites(6, 6)
+    pairs, place = sites_of(6, 6)
     matrix = _matrix(pairs, len(place), 2)
     matrix.diagonal[50] *= -1.0
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         factorize_blocks(matrix, dissect(pairs, place, np.ones(len(place), dtype=bool)), 0.0)
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.6])
-def test_who_is_parted_is_tied_through_the_border_only(turn) -> None:
-    pairs, place = _sites(12, 9)
-    place = place @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-    use = np.random.default_rng(1).random(len(place)) < 0.95
-    order = dissect(pairs, place, use)
-    every = np.concatenate([front.pivots for front in order.fronts])
-    assert sorted(every) == np.flatnonzero(use).tolist()
-    assert (order.rank[every] == np.arange(len(every))).all()
-    assert (order.rank[~use] == -1).all()
-    for i, j in pairs[use[pairs].all(axis=1)]:
-        early, late = (i, j) if order.rank[i] < order.rank[j] else (j, i)
-        front = order.fronts[order.owner[early]]
-        assert late in front.pivots or late in front.border
-    for number, front in enumerate(order.fronts):
-        if len(front.border):
-            assert front.parent > number
-            above = order.fronts[front.parent]
-            assert set(front.border) <= set(above.pivots) | set(above.border)
-            assert (np.diff(order.rank[front.border]) > 0).all()
-
-
-@pytest.mark.slow
-def test_little_fills_in() -> None:
-    """A line across a square of 24 sites of 3 is 72 views; a strip fills as many blocks a view however long it is."""
-    pairs, place = _sites(24, 24)
-    order = dissect(pairs, place, np.ones(len(place), dtype=bool))
-    assert 60 <= max(len(front.pivots) for front in order.fronts) <= 90
-    banded = len(place) * (3 * (24 + 2)) ** 2
-    assert 0.3 * banded < _work(order) < 0.9 * banded
-    a_view = []
-    for length in (60, 240):
-        pairs, place = _sites(length, 2)
-        a_view.append(_numbers(dissect(pairs, place, np.ones(len(place), dtype=bool))) / len(place))
-    assert 0.8 < a_view[1] / a_view[0] < 1.25
-    order = dissect(pairs, place[np.random.default_rng(0).permutation(len(place))], np.ones(len(place), dtype=bool))
-    assert _numbers(order) < 1.1 * a_view[1] * len(place)  # places that lie cost nothing: ties tell
 
 
 def _weakly_tied(block: SimulatedBlock, few: int) -> Tracks:
