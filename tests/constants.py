@@ -64,6 +64,7 @@ def chosen(record: type[Record], **values: Any) -> Iterator[Record]:
 SIZES = {
     "altimetry_points": ("barpc.base.statistics.SAMPLE",),
     "scene_points": ("barpc.base.statistics.SAMPLE",),
+    "set_points": ("barpc.ba.control.agreement._MAX_SET_POINTS",),
     "tests_kept": ("barpc.ba.control.snooping.KEPT",),
     "heights_measured": ("barpc.ba.result.MANY",),
     "slight_cut": ("barpc.ba.robust.rounds.SLIGHT",),

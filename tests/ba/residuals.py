@@ -4,23 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import Block, first_state, join, make_problem
-from barpc.ba.evidence.linearised import linearise
+from barpc.ba.constraints.ground import PointConstraints
+from barpc.ba.evidence.linearised import Linear, linearise
 from barpc.ba.evidence.mixture import fit_mixture
+from barpc.ba.solving.problem import Problem
+from barpc.ba.solving.solve import State
 from barpc.ba.terms.moving_ground import GroundMotion
 from barpc.ba.terms.term import Residuals
 from barpc.base.geodesy import Array
 from barpc.scene import IntArray
-from barpc.simulate import simulate_block
+from barpc.simulate import SimulatedBlock, simulate_block
 
 Displacement = Callable[[IntArray, Array], Array]
 """Views (K,) and places (2, K), as parts of their images -> displacements (2, K) [px]."""
 DIRECTION = np.array([[0.8], [0.6]])
+
+
+class Started(NamedTuple):
+    """A block at its delivered cameras."""
+
+    block: Block
+    problem: Problem
+    state: State
+    heights: PointConstraints
+
+    def linear(self, span: float = 800.0) -> Linear:
+        """Linearised there, of heights within a span [m]."""
+        return linearise(self.problem, self.state, self.block.use, self.block.sigma, span)
+
+
+def started(made: SimulatedBlock | Block, centers: Array | None = None, **given: Any) -> Started:
+    """A simulated block, or one that is joined already, at its delivered cameras, with such options."""
+    options = AdjustOptions(**given)
+    block = made if isinstance(made, Block) else join(made.views, made.tracks, None, options)
+    problem = make_problem(block, options, centers, None)
+    return Started(block, problem, *first_state(problem, block, options, None))
 
 
 def step(px: float, view: int, start: float, stop: float, axis: int = 1) -> Displacement:
@@ -69,13 +93,11 @@ def residuals_of(
 
 def residuals_at(block: Block, *moved: Displacement, sample: int | None = None) -> Residuals:
     """Residuals of a given block."""
-    options = AdjustOptions()
-    problem = make_problem(block, options, None, None)
-    state, _ = first_state(problem, block, options, None)
-    linear = linearise(problem, state, block.use, block.sigma, 800.0)
+    start = started(block)
+    linear = start.linear()
     size = np.array([view.size for view in block.views], dtype=np.float64).T
     away = sum((one(block.view, block.xy / size[:, block.view]) for one in moved), np.zeros((2, 1)))
     linear = replace(linear, residual=linear.residual - away / block.sigma)
     few, none = linear if sample is None else linear.thinned(sample), np.zeros((2, 0, len(block.view)))
-    ground = GroundMotion.of(problem, state)
+    ground = GroundMotion.of(start.problem, start.state)
     return Residuals(linear, few, ground, block.xy, size, fit_mixture(linear), none, np.zeros(0))

@@ -84,10 +84,7 @@ def test_cameras_farther_off_than_stated_blame_no_point(seeds) -> None:
 @pytest.mark.parametrize(
     ("count", "wrong", "size", "least"),
     rest_slow(
-        starmap(
-            pytest.param,
-            [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)],
-        ),
+        starmap(pytest.param, [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)])
     ),
 )
 def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> None:
@@ -124,17 +121,6 @@ def test_the_larger_set_is_used_and_the_others_are_told_to_agree(count, moved) -
         alike += one.alike
     assert alike >= 0.7 * times
     assert not found(count, 1, any_way(1, moved, 40.0)).alike
-
-
-@pytest.mark.slow
-def test_of_many_points_sets_are_drawn_and_the_same_ones_always() -> None:
-    offsets = drawn(40, 3, any_way(3, 10, 12.0))
-    told = np.ones(40, dtype=bool)
-    one, again = agreement(offsets, told), agreement(offsets, told)
-    assert np.flatnonzero(~one.used).tolist() == list(range(10))
-    assert (one.used == again.used).all()
-    assert one.scale == again.scale
-    assert found(40, 4).used.all()
 
 
 def test_sets_that_are_drawn_find_what_all_of_them_find(monkeypatch) -> None:
@@ -201,9 +187,7 @@ def test_the_evidence_of_a_set_is_the_density_of_what_it_shows(scale) -> None:
 
 @pytest.mark.parametrize(("scale", "motions"), [(1.0, 1.0), (3.0, 2.0)])
 @pytest.mark.parametrize("inside", [2, 7, 15])
-def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(
-    scale, motions, inside, monkeypatch
-) -> None:
+def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(scale, motions, inside, sized) -> None:
     """In one piece, and where the points are many a few at a time; the set of all, too."""
     offsets = drawn(15, 3, any_way(3, 4, 6.0))
     chosen = np.arange(15) >= 15 - inside
@@ -211,7 +195,7 @@ def test_what_a_point_adds_to_a_set_is_the_evidence_with_it_less_that_without(
     score = SetEvidence(offsets, masks, scale, motions).evidence(np.arange(16))
     there = SetEvidence(offsets, chosen[None], scale, motions)
     np.testing.assert_allclose(there.gains(np.arange(15)), score[1:] - score[0], rtol=1e-6, atol=1e-5)
-    monkeypatch.setattr(sets, "_MAX_SET_POINTS", 20)
+    sized(set_points=20)
     np.testing.assert_allclose(there.gains(np.arange(3, 15)), score[4:] - score[0], rtol=1e-6, atol=1e-5)
 
 
@@ -330,28 +314,21 @@ def believing(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("what", ["two of six up", "a wave", "all of them marked beside it in one image"])
+@pytest.mark.parametrize("what", ["two of six up", "a wave"])
 def test_control_that_passes_as_agreeing_and_tears_the_images_is_let_go(what, monkeypatch) -> None:
     block = simulate_block(3, 400, seed=5, num_gcps=6)
-    gcps, xy = block.gcps, block.gcps.xy.copy()
-    lonlatalt = gcps.lonlatalt.copy()
+    gcps, lonlatalt = block.gcps, block.gcps.lonlatalt.copy()
     if what == "two of six up":
         lonlatalt[:2, 2] += 40.0
-    elif what == "a wave":
-        lonlatalt[:, 0] += 3e-4 * np.sin(np.arange(6) * 2.5)
     else:
-        xy[gcps.view == 1] += [4.0, -4.0]
-    wrong = replace(gcps, lonlatalt=lonlatalt, xy=xy)
+        lonlatalt[:, 0] += 3e-4 * np.sin(np.arange(6) * 2.5)
+    wrong = replace(gcps, lonlatalt=lonlatalt)
     believing(monkeypatch)
-    with monkeypatch.context() as patch:
-        patch.setattr("barpc.ba.solution.is_better", lambda *_: False)
-        torn = raised(block, wrong)[1]
     one, rise = raised(block, wrong)
-    assert torn > 0.04
+    without, torn = one.control.torn
+    assert np.sqrt(torn**2 - without**2) > 0.04
     assert rise < 0.03
     assert not one.control.used.any()
-    assert len(one.control.torn) == 2
-    assert one.control.torn[1] > one.control.torn[0]
     assert not one.control.agrees
     assert (one.gauge.sigma > 3.0).all()  # its place is what the delivered cameras tell
     run = Run("adjust", block.views, (), block.tracks, adjustment=one, gcps=wrong, options=RunOptions())
@@ -400,15 +377,12 @@ def test_control_marked_beside_itself_in_one_image_does_not_move_it(pixels) -> N
 
 
 @pytest.mark.slow
-def test_control_that_is_right_is_not_let_go_where_the_images_are_worse_with_it_by_less_than_they_are_asked_to_be(
-    monkeypatch,
-) -> None:
+def test_control_that_is_right_stays_and_the_images_are_worse_with_it_by_less_than_they_are_asked_to_be() -> None:
     block = simulate_block(3, 400, seed=5, num_gcps=6)
-    assert adjust_tracks(block.views, block.tracks, None, block.gcps).control.used.all()
-    monkeypatch.setattr("barpc.ba.solution.is_better", lambda *_: True)  # by however little
-    one = adjust_tracks(block.views, block.tracks, None, block.gcps)
+    one, rise = raised(block, block.gcps)
     assert one.control.used.all()
     assert not one.control.torn
+    assert rise < np.sqrt(one.params.shape[1]) * AdjustOptions().noise_floor
 
 
 def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) -> Any:
@@ -427,7 +401,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("worlds", "most"), [(6, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("worlds", "most"), [(6, 1), (40, 2)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0
     for seed in range(worlds):

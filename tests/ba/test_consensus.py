@@ -73,23 +73,15 @@ def on_one_plane(place: np.ndarray, offset: np.ndarray, spread: np.ndarray) -> n
 def test_groups_without_noise_are_two(share: float, noise: float) -> None:
     z = np.repeat([0.0, 1.0], [round(100 * share), round(100 * (1 - share))])
     found = told(z + noise * np.random.default_rng(0).standard_normal(100))
-    assert found is not None
     assert (found.share, found.apart) == pytest.approx((share, 1.0), abs=1e-6)
 
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("share", "apart"),
-    [
-        (0.9, 1.5),
-        *(pytest.param(*row, marks=pytest.mark.slow) for row in ((0.3, 1.2), (0.5, 1.0), (0.25, 3.0))),
-    ],
-)
+@pytest.mark.parametrize(("share", "apart"), [(0.9, 1.5), (0.3, 1.2), (0.5, 1.0), (0.25, 3.0)])
 def test_a_mixture_is_the_likeliest_one(share: float, apart: float) -> None:
     z = groups(400, share, apart)
     found, expected = told(z), likeliest(z)
-    assert found is not None
     assert found.share == pytest.approx(expected[0], abs=2e-3)
     assert found.apart == pytest.approx(expected[1], rel=2e-3)
     assert (found.share, found.apart) == pytest.approx((min(share, 1 - share), apart), rel=0.05)
@@ -139,10 +131,8 @@ def across(problem: Problem, projected: Any, pair: int) -> tuple[np.ndarray, np.
 def residual_of(problem: Problem, projected: Any, offset: np.ndarray, pair: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (2, K) of which a pair's first ones are across the epipolar lines by so much; the rows in use."""
     first, second, normal = across(problem, projected, pair)
-    residual, use = (
-        np.zeros((2, len(problem.structure.view))),
-        np.zeros(len(problem.structure.view), dtype=bool),
-    )
+    residual = np.zeros((2, len(problem.structure.view)))
+    use = np.zeros(residual.shape[1], dtype=bool)
     for n, value in enumerate(offset):
         residual[:, first[n]] += value / np.sqrt(2) * normal[n, :2]
         residual[:, second[n]] += value / np.sqrt(2) * normal[n, 2:]
@@ -154,7 +144,6 @@ def test_two_groups_are_told_by_their_pair_share_and_distance(seen) -> None:
     for pair, views in enumerate([(0, 1), (0, 2), (1, 2)]):
         offset = groups(300, 0.3, 2.0) + 5.0  # what all have in common is a camera's error
         found = two_groups(seen[0].structure, *_given(seen, offset, pair))
-        assert isinstance(found[0], TwoGroups)
         assert [group.views for group in found] == [views]
         assert found[0].share == pytest.approx(0.3, abs=0.01)
         assert found[0].apart == pytest.approx(2.0, abs=0.02)

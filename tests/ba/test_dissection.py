@@ -1,4 +1,4 @@
-"""The order of elimination of graphs that adversaries would tie: each is cut at once, and where it can be, well."""
+"""The order of elimination, of sites and of graphs that adversaries would tie: cut at once, and if it can be, well."""
 
 from __future__ import annotations
 
@@ -40,9 +40,18 @@ def _pairs(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
     return np.sort(rng.permutation(n)[every[tied]], axis=1)
 
 
-def _work(order: Dissection) -> int:
-    """Products of blocks that a factor costs."""
-    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** 2 for f in order.fronts)
+def sites_of(columns: int, rows: int, a_site: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of views tied to those of the eight sites around theirs, and where all stand."""
+    row, column = np.divmod(np.arange(columns * rows * a_site) // a_site, columns)
+    i, j = np.triu_indices(len(row), 1)
+    near = (abs(row[i] - row[j]) <= 1) & (abs(column[i] - column[j]) <= 1)
+    place = np.stack([column, row], axis=1) + np.random.default_rng(0).normal(0, 0.05, (len(row), 2))
+    return np.stack([i[near], j[near]], axis=1), 1e4 * place
+
+
+def _size(order: Dissection, power: int = 1) -> int:
+    """Blocks in the factor; of power 2 the products of blocks that it costs."""
+    return sum(len(f.pivots) * (len(f.pivots) + len(f.border)) ** power for f in order.fronts)
 
 
 @contextmanager
@@ -61,11 +70,21 @@ def _ends(seconds: int):
         signal.signal(signal.SIGALRM, before)
 
 
-def _parts_nothing_that_is_tied(order: Dissection, pairs: np.ndarray, n: int) -> None:
-    assert sorted(np.concatenate([front.pivots for front in order.fronts])) == list(range(n))
+def _is_sound(order: Dissection, pairs: np.ndarray, use: np.ndarray) -> None:
+    """Views in use are ordered, each once; those parted are tied through borders only, which belong to later fronts."""
+    every = np.concatenate([front.pivots for front in order.fronts])
+    assert sorted(every) == np.flatnonzero(use).tolist()
+    assert (order.rank[every] == np.arange(len(every))).all()
+    assert (order.rank[~use] == -1).all()
+    pairs = pairs[use[pairs].all(axis=1)]
     early, late = np.where(order.rank[pairs[:, 0]] < order.rank[pairs[:, 1]], pairs.T, pairs.T[::-1])
     known = [set(front.pivots) | set(front.border) for front in order.fronts]
     assert all(j in known[order.owner[i]] for i, j in zip(early.tolist(), late.tolist(), strict=True))
+    for number, front in enumerate(order.fronts):
+        if len(front.border):
+            assert front.parent > number
+            assert set(front.border) <= known[front.parent]
+            assert (np.diff(order.rank[front.border]) > 0).all()
 
 
 @pytest.mark.few(4)
@@ -77,7 +96,32 @@ def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
     place = rng.normal(0, 110, (n, 2)) if kind != "star" else np.zeros((n, 2))
     with _ends(60):
         order = dissect(pairs, place, np.ones(n, dtype=bool))
-    _parts_nothing_that_is_tied(order, pairs, n)
+    _is_sound(order, pairs, np.ones(n, dtype=bool))
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_who_is_parted_is_tied_through_the_border_only(turn) -> None:
+    pairs, place = sites_of(12, 9)
+    place = place @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    use = np.random.default_rng(1).random(len(place)) < 0.95
+    _is_sound(dissect(pairs, place, use), pairs, use)
+
+
+@pytest.mark.slow
+def test_little_fills_in() -> None:
+    """A line across a square of 24 sites of 3 is 72 views; a strip fills as many blocks a view however long it is."""
+    pairs, place = sites_of(24, 24)
+    order = dissect(pairs, place, np.ones(len(place), dtype=bool))
+    assert 60 <= max(len(front.pivots) for front in order.fronts) <= 90
+    banded = len(place) * (3 * (24 + 2)) ** 2
+    assert 0.3 * banded < _size(order, 2) < 0.9 * banded
+    a_view = []
+    for length in (60, 240):
+        pairs, place = sites_of(length, 2)
+        a_view.append(_size(dissect(pairs, place, np.ones(len(place), dtype=bool))) / len(place))
+    assert 0.8 < a_view[1] / a_view[0] < 1.25
+    order = dissect(pairs, place[np.random.default_rng(0).permutation(len(place))], np.ones(len(place), dtype=bool))
+    assert _size(order) < 1.1 * a_view[1] * len(place)  # places that lie cost nothing: ties tell
 
 
 @pytest.mark.landing(1)
@@ -104,7 +148,7 @@ def test_views_of_one_place_are_ordered_by_their_ties(spread) -> None:
     pairs = np.stack([first, first + np.tile(np.arange(1, k + 1), n)], axis=1)
     pairs = np.sort(rng.permutation(n)[pairs[pairs[:, 1] < n]], axis=1)
     order = dissect(pairs, rng.normal(0, spread, (n, 2)), np.ones(n, dtype=bool))
-    assert n * k**2 < _work(order) < 3 * n * (2 * k) ** 2
+    assert n * k**2 < _size(order, 2) < 3 * n * (2 * k) ** 2
     assert max(len(front.pivots) + len(front.border) for front in order.fronts) < 6 * k
 
 

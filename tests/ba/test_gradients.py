@@ -112,13 +112,7 @@ def _point_priors():
     index = np.array([0, 2])
     none = np.zeros(0, dtype=int)
     gcps = GroundPoints(
-        ("a", "b"),
-        ground_from_ecef(points[index]),
-        [[0.2, 0.3, 0.5]] * 2,
-        none,
-        none,
-        np.zeros((0, 2)),
-        np.zeros(0),
+        ("a", "b"), ground_from_ecef(points[index]), [[0.2, 0.3, 0.5]] * 2, none, none, np.zeros((0, 2)), np.zeros(0)
     )
     return points, {
         "ground_control": ground_control(gcps, index),
@@ -161,7 +155,6 @@ BLOCKS = [
 def test_priors_on_points_have_the_derivatives_of_central_differences(name):
     points, blocks = _point_priors()
     block = blocks[name]
-    assert isinstance(block, PointPrior)
     for axis in range(3):
         step = np.zeros_like(points)
         step[:, axis] = 1.0
@@ -170,13 +163,6 @@ def test_priors_on_points_have_the_derivatives_of_central_differences(name):
         slope = (block.cost(points + step) - block.cost(points - step)) / 4  # common errors are the best ones
         wanted = (block.jacobian()[..., axis] * block.residual(points)).sum()
         assert slope == pytest.approx(wanted, rel=1e-6, abs=1e-6)
-
-
-def test_a_terrain_prior_measures_the_distance_along_the_vertical():
-    points, blocks = _point_priors()
-    ground = ground_from_ecef(points[[0, 2]])
-    alt = 100.0 + 800.0 * (ground[:, 0] - 5.4) + 300.0 * (ground[:, 1] - 43)
-    np.testing.assert_allclose(blocks["terrain_heights"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6)
 
 
 def test_priors_on_cameras_have_the_derivatives_of_central_differences():

@@ -160,10 +160,7 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
     gcps = GroundPoints(
         ("a",), _ground(points[:1]), [[0.1, 0.2, 0.4]], [0], [0], np.zeros((1, 2)), np.ones(1)
     )  # fmt: skip
-    control, flat = (
-        ground_control(gcps, np.array([0])),
-        flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0),
-    )
+    control, flat = ground_control(gcps, np.array([0])), flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0)
     none = replace(heights(3, dem=None), weak=np.zeros(3, dtype=bool))
     joined = held_by(replace(none, control=(control,), placed=flat), points)
     assert joined.index.tolist() == [0, 1, 2]
@@ -212,12 +209,10 @@ def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation() -> None
     made = replace(heights(dem=hill), weak=np.arange(6) >= 3)
     seen = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
     found = made.test(points, seen)
-    assert found is not None
     assert (found.held, found.known, found.total, found.bias) == (1, 4, 5, 20.0)
     assert found.offset == pytest.approx(5.5, abs=1e-3)  # of 3, 4, 7 and 900
     assert found.spread == pytest.approx(1.4826 * 2.0, abs=2e-3)  # of 2.5, 1.5, 1.5, 894.5
     none = made.test(placed(-2500.0, 0.0, np.full(6, 300.0)), seen)
-    assert none is not None
     assert (none.held, none.known) == (0, 0)
     assert np.isnan([none.offset, none.spread]).all()
     assert replace(made, dem=None).test(points, seen) is None

@@ -1,4 +1,4 @@
-"""Tracks that are kept out: drawn as if at random, always the same, and what they say of the cameras."""
+"""Tracks that are kept out: drawn as if at random, always the same; what they, and known points, say of the cameras."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from barpc.ba.robust.heldout import (
 )
 from barpc.ba.solving.problem import Problem
 from barpc.base.errors import InputError
-from barpc.base.geodesy import ecef_from_ground, enu_basis
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
-from barpc.sensor.triangulation import triangulate
-from barpc.simulate import SimulatedBlock, simulate_block
+from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen
 from tests.distributions import gamma
@@ -119,17 +118,18 @@ def test_a_track_with_an_observation_that_is_not_used_is_never_drawn(made) -> No
     assert (again == out)[block.point != block.point[one]].all()
 
 
-def true_unknowns(made: SimulatedBlock, problem: Problem) -> np.ndarray:
-    """The cameras' unknowns (N, 6) by the truth."""
-    each = zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)
-    return np.array([np.r_[c.rotation * d, c.translation] for c, d in each])
-
-
-def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
-    """With the truth's cameras: white noise of 0.1 px a coordinate."""
+@pytest.fixture(scope="module")
+def flown(made) -> tuple[Block, Problem, np.ndarray]:
+    """A block, its problem, and the cameras' unknowns (N, 6) by the truth."""
     block = block_of(made)
     problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = true_unknowns(made, problem)
+    each = zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)
+    return block, problem, np.array([np.r_[c.rotation * d, c.translation] for c, d in each])
+
+
+def test_what_is_kept_out_is_measured_by_its_own_points(made, flown) -> None:
+    """With the truth's cameras: white noise of 0.1 px a coordinate."""
+    block, problem, exact = flown
     found = measure(problem, exact, block)
     assert found.noise.mean() == pytest.approx(1.0, abs=0.12)  # medians, of two views' tracks and of more
     assert (np.abs(found.noise - 1.0) < 0.3).all()
@@ -151,18 +151,13 @@ def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
 
 
 @pytest.mark.parametrize("off", [0.3, -0.6, 1.2])
-def test_a_point_is_where_reweighted_rays_meet(made, off: float) -> None:
+def test_a_point_is_where_reweighted_rays_meet(made, flown, off: float) -> None:
     """Of a track of three views one off by some sigmas: three rounds by Geman and McClure's weights at four of them."""
-    block = block_of(made)
-    problem = make_problem(block, OPTIONS, centers_of(made), None)
+    block, problem, params = flown
     point = int(np.flatnonzero(np.bincount(block.point) == 3)[0])
     rows = np.flatnonzero(block.point == point)
     xy = block.xy.copy()
     xy[:, rows[1]] += [off, -0.5 * off]
-    params = np.array(
-        [np.r_[c.rotation * d, c.translation]
-         for c, d in zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)]
-    )  # fmt: skip
     found = measure(problem, params, replace(block, xy=xy))
     projected = problem.project_points(params, ecef_from_ground(made.truth.ground))
     matrix = projected.by_point[:, :, rows].transpose(2, 0, 1)  # (3, 2, 3)
@@ -300,38 +295,9 @@ def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
     np.testing.assert_allclose(noise_ratios(squared[order], freedom[order], view[order]), expected, rtol=1e-9)
 
 
-def test_known_points_are_where_they_project_and_where_rays_meet() -> None:
-    """Of a point in three views, one in two and one in one; all seen 2 px and 1 px beside it."""
-    made = simulate_block(3, 4, seed=3)
-    sensors = [Corrected(view.sensor, one) for view, one in zip(made.views, made.truth.corrections, strict=True)]
-    known = made.truth.ground[:3]
-    view, point = np.array([0, 1, 2, 2, 0, 1]), np.array([0, 0, 0, 1, 1, 2])
-    exact = np.array([sensors[v].project(known[p]) for v, p in zip(view, point, strict=True)])
-    points = GroundPoints(("a", "b", "c"), known, np.ones((3, 3)), point, view, exact - [2.0, -1.0], np.ones(6))
-    found = check_residuals(sensors, points)
-    np.testing.assert_allclose(found.image, np.tile([2.0, -1.0], (6, 1)), atol=1e-6)
-    met = triangulate(sensors, view[:5], point[:5], exact[:5] - [2.0, -1.0]).points
-    for p in (0, 1):
-        np.testing.assert_allclose(
-            found.ground[p], enu_basis(known[p]) @ (met[p] - ecef_from_ground(known[p])), atol=1e-6
-        )
-    assert np.isnan(found.ground[2]).all()
-    image, ground = found.rms()
-    np.testing.assert_allclose(image, [2.0, 1.0], atol=1e-6)
-    np.testing.assert_allclose(ground, np.sqrt((found.ground[:2] ** 2).mean(axis=0)))
-    alone = check_residuals(sensors, points.select(np.array([False, False, True])))
-    assert np.isnan(alone.rms()[1]).all()
-    control, checks = split_points(points, ["b"])
-    assert (control.names, checks.names) == (("a", "c"), ("b",))
-    with pytest.raises(InputError, match="named x, y"):
-        split_points(points, ["b", "y", "x"])
-
-
-def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made) -> None:
+def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made, flown) -> None:
     """Residuals and stated deviations twenty times as large scatter as much: degrees of freedom have no unit."""
-    block = block_of(made)
-    problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = true_unknowns(made, problem)
+    block, problem, exact = flown
     true = np.full((2, len(block.view)), np.nan)
     for v, (view, correction) in enumerate(zip(made.views, made.truth.corrections, strict=True)):
         rows = block.view == v
@@ -342,3 +308,56 @@ def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made) -> None:
     ]
     np.testing.assert_allclose(found[1].noise, found[0].noise, rtol=1e-3)
     np.testing.assert_allclose(found[1].rms, 20.0 * found[0].rms, rtol=1e-3)
+
+
+# --- points that are known --------------------------------------------------------------------------------------------
+
+MOVE = np.array([3.0, -2.0, 5.0])  # east, north, up [m]
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Exact cameras, exact image points of five points; the given places lie by `MOVE` beside the true ones."""
+    block = simulate_block(3, 10, seed=1)
+    sensors = [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
+    true = block.truth.check_ground[:5]
+    given = [ground_from_ecef(ecef_from_ground(g) - enu_basis(g).T @ MOVE) for g in true]
+    point = np.array([0, 0, 0, 1, 1, 2, 4, 4])  # the third seen once, the fourth never
+    view = np.array([0, 1, 2, 2, 0, 1, 1, 2])
+    xy = np.array([sensors[v].project(true[p]) for v, p in zip(view, point, strict=True)])
+    order = np.array([3, 0, 7, 5, 1, 6, 2, 4])
+    names = tuple("abcde")
+    points = GroundPoints(names, given, np.ones((5, 3)), point[order], view[order], xy[order], np.full(8, 0.1))
+    return sensors, points
+
+
+def test_points_seen_twice_or_more_have_their_offset_and_others_none(case) -> None:
+    sensors, points = case
+    found = check_residuals(sensors, points)
+    np.testing.assert_allclose(found.ground[[0, 1, 4]], np.tile(MOVE, (3, 1)), atol=1e-3)
+    assert np.isnan(found.ground[[2, 3]]).all()
+    for k in range(8):
+        expected = sensors[points.view[k]].project(points.lonlatalt[points.point[k]]) - points.xy[k]
+        np.testing.assert_allclose(found.image[k], expected, atol=1e-9)
+    image, ground = found.rms()
+    np.testing.assert_allclose(ground, np.abs(MOVE), atol=1e-3)
+    np.testing.assert_allclose(image, np.sqrt((found.image**2).mean(axis=0)))
+    alone = check_residuals(sensors, points.select(np.arange(5) == 2))
+    assert np.isnan(alone.rms()[1]).all()
+
+
+def test_points_are_divided_by_name_with_their_observations(case) -> None:
+    _, points = case
+    control, check = split_points(points, ["b", "e"])
+    assert (control.names, check.names) == (("a", "c", "d"), ("b", "e"))
+    for part in (control, check):
+        for k in range(len(part.view)):
+            name = part.names[part.point[k]]
+            row = (points.view == part.view[k]) & (np.array(points.names)[points.point] == name)
+            np.testing.assert_array_equal(part.xy[k], points.xy[row][0])
+        for name, place in zip(part.names, part.lonlatalt, strict=True):
+            np.testing.assert_array_equal(place, points.lonlatalt[points.names.index(name)])
+    assert len(control.view) == 4
+    assert len(check.view) == 4
+    with pytest.raises(InputError, match="named x, y"):
+        split_points(points, ["b", "y", "x"])

@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
-from barpc.ba.constraints.block import Block as Joined
-from barpc.ba.constraints.block import first_state, join, make_problem
-from barpc.ba.evidence.linearised import linearise
+from barpc.ba.constraints.block import Block, join
 from barpc.ba.evidence.mixture import Group, Mixture, fit_mixture
 from barpc.ba.evidence.mixture import moving as moving_of
 from barpc.ba.select.parts import Parts
-from barpc.ba.solving.problem import Problem
-from barpc.ba.solving.solve import State
 from barpc.ba.terms import MovingObjects, moving_ground
 from barpc.ba.terms.moving_ground import GROUND_CELLS, GroundMotion, group_of, members
+from barpc.ba.terms.term import Residuals
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef, metres_per_unit
 from barpc.base.statistics import LEVEL, SAMPLE
 from barpc.scene import BoolArray, GroundPoints, Tracks
@@ -27,7 +24,7 @@ from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.worlds import DEM_AS_STATED, judge
 from benchmarks.worlds_families import make
-from tests.ba.residuals import residuals_at
+from tests.ba.residuals import residuals_at, started
 from tests.lanes import rest_slow
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
@@ -76,16 +73,21 @@ def drifting(
     return block, replace(ties, xy=xy), moves
 
 
-def started(views: SimulatedBlock, tracks: Tracks) -> tuple[Joined, Problem, State]:
-    """A block at its delivered cameras."""
-    block = join(views.views, tracks, None, AdjustOptions())
-    problem = make_problem(block, AdjustOptions(), None, None)
-    return block, problem, first_state(problem, block, AdjustOptions(), None)[0]
+def seen_of(made: SimulatedBlock, tracks: Tracks) -> tuple[Block, Residuals]:
+    """A block with these ties, and its residuals at the delivered cameras."""
+    block = join(made.views, tracks, None, AdjustOptions())
+    return block, residuals_at(block)
+
+
+def group_in(seen: Residuals, share: Array | float = 0.5) -> Group:
+    """A group of which so much of each observation is likely to move."""
+    by_move, cell = seen.ground.by_moves(seen.linear.view, seen.linear.views), seen.ground.cells(GROUND_CELLS)
+    return Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.broadcast_to(share, cell.shape))
 
 
 def test_a_metre_on_the_ground_moves_images_as_cameras_say() -> None:
     made = simulate_block(3, 60, seed=2)
-    block, problem, state = started(made, made.tracks)
+    block, problem, state, _ = started(made)
     ground = GroundMotion.of(problem, state)
     rows = np.flatnonzero(block.view == 1)
     at = ground_from_ecef(state.points[block.point[rows]])
@@ -104,29 +106,25 @@ def test_a_metre_on_the_ground_moves_images_as_cameras_say() -> None:
 def test_a_group_is_told_from_what_stands_still() -> None:
     """The mixture alone, begun where some of it is known."""
     made, tracks, moves = drifting(3, 300, 0.3, 3.0 * GSD)
-    block, problem, state = started(made, tracks)
-    linear = linearise(problem, state, block.use, block.sigma, 800.0)
-    ground, moves = GroundMotion.of(problem, state), moves[block.order]
-    by_move, none = ground.by_moves(block.view, 3), np.zeros((2, 0, len(block.view)))
-    start = np.where(corner(made, 0.15)[block.point], 0.95, 0.3)
-    group = Group(by_move, np.full(4, 30.0), ground.cells(GROUND_CELLS), start)
-    base, found = fit_mixture(linear), fit_mixture(linear, group=group)
-    assert found.evidence > base.evidence + 200.0
+    block, problem, state, _ = started(replace(made, tracks=tracks))
+    residuals, moves = residuals_at(block), moves[block.order]
+    linear, ground, none = residuals.linear, residuals.ground, residuals.extra
+    group = group_in(residuals, np.where(corner(made, 0.15)[block.point], 0.95, 0.3))
+    found = fit_mixture(linear, group=group)
+    assert found.evidence > residuals.base.evidence + 200.0
     one = group_of(linear, ground, group, found)
     assert (one.member == moves).mean() > 0.98
     assert one.metres == pytest.approx(3.0 * GSD, rel=0.1)
     assert one.between == (0, 2)
-    term, residuals = MovingObjects(-1, none, np.zeros(0), 0.0, group=group), residuals_at(block)
+    term = MovingObjects(-1, none, np.zeros(0), 0.0, group=group)
     assert term.amplitude(residuals, found) == pytest.approx(3.0 * GSD / ground.pixel, rel=0.1)
     up = [ground.by_ground[..., block.view == v].mean(axis=2) for v in range(3)]
     leans = [-np.linalg.solve(one[:, :2], one[:, 2]) for one in up]  # how far east and north a metre of height looks
     higher = np.ravel([lean - leans[0] for lean in leans[1:]])  # two pixels, and nobody can tell
     assert term.amplitude(residuals, replace(found, move=2.0 * higher / np.abs(higher).max())) < 0.02
     coarse = replace(ground, by_ground=ground.by_ground * np.where(block.view == 2, 0.25, 1.0))  # pixels of four in it
-    metres, pixel = (
-        group_of(linear, coarse, group, found).metres,
-        4.0 * ground.pixel_of(np.flatnonzero(block.view == 2)),
-    )
+    metres = group_of(linear, coarse, group, found).metres
+    pixel = 4.0 * ground.pixel_of(np.flatnonzero(block.view == 2))
     assert term.amplitude(replace(residuals, ground=coarse), found) == pytest.approx(metres / pixel)
     assert term.amplitude(residuals, replace(found, moving=np.minimum(found.moving, 0.5))) == np.inf
     assert found.noise == pytest.approx(1.0, abs=0.1)
@@ -149,22 +147,11 @@ def test_a_group_is_told_from_what_stands_still() -> None:
 def test_a_group_is_proposed_where_its_ties_lie() -> None:
     """With every move within what is likely of a start, and no tie sure to move or to stand."""
     made, tracks, moves = drifting(3, 150, 0.3, 3.0 * GSD)
-    block, problem, state = started(made, tracks)
-    linear = linearise(problem, state, block.use, block.sigma, 800.0)
-    nothing = np.zeros((2, 0, len(block.view)))
-    ground = GroundMotion.of(problem, state)
-    seen: Any = SimpleNamespace(
-        linear=linear, ground=ground, base=fit_mixture(linear), extra=nothing, sigma=np.zeros(0)
-    )
+    block, seen = seen_of(made, tracks)
     (one,) = MovingObjects.of(seen)
     group = one.group
-    assert group is not None
-    assert (one.NAME, one.view, one.columns.shape[1], len(one.sigma)) == (
-        "moving_objects",
-        -1,
-        0,
-        0,
-    )  # no unknowns of a camera
+    # no unknowns of a camera
+    assert (one.NAME, one.view, one.columns.shape[1], len(one.sigma)) == ("moving_objects", -1, 0, 0)
     tracks_of = {(cell, point) for cell, point in zip(group.cell.tolist(), block.point.tolist(), strict=True)}
     counts = np.unique([cell for cell, _ in tracks_of], return_counts=True)[1]
     assert one.price == pytest.approx(0.5 * np.log(counts).sum(), rel=0.05)  # but for tracks that take no part
@@ -178,15 +165,11 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
 def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     """Half of the ground behind a line moved: what is proposed holds it; what was cut is proposed, too."""
     made, tracks, moves = drifting(3, 300, 0.5, 2.0)
-    block, problem, state = started(made, tracks)
-    linear = linearise(problem, state, block.use, block.sigma, 800.0)
-    ground, none = GroundMotion.of(problem, state), np.zeros((2, 0, len(block.view)))
-    base = fit_mixture(linear)
-    base = replace(base, right=np.where(moves[block.order] & cut, 0.1, np.maximum(base.right, 0.6)))
-    by_move, cell = ground.by_moves(block.view, len(block.views)), ground.cells(GROUND_CELLS)
-    group = Group(by_move, np.full(by_move.shape[1], 30.0), cell, np.full(len(cell), 0.5))
-    shares = list(moving_ground._start_shares(linear, group, base, none, np.zeros(0)))
-    assert len(shares) == moving_ground._BEST_REGIONS + cut
+    block, seen = seen_of(made, tracks)
+    right = np.where(moves[block.order] & cut, 0.1, np.maximum(seen.base.right, 0.6))
+    base = replace(seen.base, right=right)
+    shares = list(moving_ground._start_shares(seen.linear, group_in(seen), base, seen.extra, seen.sigma))
+    assert len(shares) == moving_ground._STARTS + cut
     assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
     inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]
     assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
@@ -199,45 +182,33 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
 def test_moving_ground_is_looked_for_where_a_region_shows_it(tracks: int, metres: float, shown: bool) -> None:
     """By a sample of the tracks, too, which chance moves."""
     made, ties, _ = drifting(3, tracks, 0.3, metres)
-    block, problem, state = started(made, ties)
-    linear, nothing = linearise(problem, state, block.use, block.sigma, 800.0), np.zeros((2, 0, len(block.view)))
-    assert (linear.thinned(SAMPLE) is linear) == (tracks == 300)
-    seen: Any = SimpleNamespace(
-        linear=linear,
-        ground=GroundMotion.of(problem, state),
-        base=fit_mixture(linear),
-        extra=nothing,
-        sigma=np.zeros(0),
-    )
+    _, seen = seen_of(made, ties)
+    assert (seen.linear.thinned(SAMPLE) is seen.linear) == (tracks == 300)
     assert MovingObjects.may_move(seen) == shown
 
 
 def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     """Of a motion so small that no tie is wrong for it: but for the room of its unknowns, the gain of the evidence."""
     made, tracks, _ = drifting(3, 300, 0.5, 0.2)
-    block, problem, state = started(made, tracks)
-    linear = linearise(problem, state, block.use, block.sigma, 800.0)
-    ground, none = GroundMotion.of(problem, state), np.zeros((2, 0, len(block.view)))
-    base, by_move, cell = fit_mixture(linear), ground.by_moves(block.view, 3), ground.cells(GROUND_CELLS)
-    group = Group(by_move, np.full(4, 30.0), cell, np.full(len(cell), 0.5))
+    _, seen = seen_of(made, tracks)
+    linear, base, none, group = seen.linear, seen.base, seen.extra, group_in(seen)
+    by_move, cell = group.by_move, group.cell
     gains = moving_ground._region_gains(linear, group, base, none, np.zeros(0))
     curvature, _, across = Mixture(linear, none, np.zeros(0), base).scores(by_move, cell, GROUND_CELLS**2)
-    regions, (row, col) = (
-        {one.tobytes() for one in moving_ground._GROUND_REGIONS},
-        np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS),
-    )
+    regions = {one.tobytes() for one in moving_ground._REGIONS}
+    row, col = np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS)
     spans = [(low, high) for high in range(GROUND_CELLS) for low in range(high + 1)]
     rectangles = [(row >= a) & (row <= b) & (col >= c) & (col <= d) for a, b in spans for c, d in spans]
     assert {one.tobytes() for one in rectangles if not one.all()} < regions
-    assert len(regions) == len(moving_ground._GROUND_REGIONS)
+    assert len(regions) == len(moving_ground._REGIONS)
     best = np.argsort(-gains)[[0, 10, 100]]
     assert gains[best[0]] > 20.0
-    first, *others = starts = moving_ground._distinct_regions(moving_ground._GROUND_REGIONS, gains)
-    assert (first == moving_ground._GROUND_REGIONS[best[0]]).all()
-    assert len(others) == moving_ground._BEST_REGIONS - 1
+    first, *others = starts = moving_ground._distinct(moving_ground._REGIONS, gains)
+    assert (first == moving_ground._REGIONS[best[0]]).all()
+    assert len(others) == moving_ground._STARTS - 1
     assert all(2 * (a & b).sum() <= (a | b).sum() for n, a in enumerate(starts) for b in starts[:n])
     for n in best:
-        region = moving_ground._GROUND_REGIONS[n]
+        region = moving_ground._REGIONS[n]
         part = across[region].sum(axis=0)
         room = np.eye(4) + 30.0**2 * (curvature[region].sum(axis=0) - part.T @ part)
         found = fit_mixture(linear, by_move * region[cell], group.sigma, base)
@@ -280,10 +251,10 @@ def test_groups_that_move_are_taken_out_one_by_one(monkeypatch: pytest.MonkeyPat
     block = join(made.views, tracks, None, AdjustOptions())
     parts = Parts(block, block.point % 5 == 0, np.zeros(len(block.view), dtype=np.int64))
     found: Any = SimpleNamespace(problem="problem", final=SimpleNamespace(params="params"))
-    asked: list[Joined] = []
+    asked: list[Block] = []
     for number, share in ((1, 3), (2, 2)):
 
-        def of_share(problem: str, params: str, _one: Any, part: Joined, share: int = share) -> BoolArray:
+        def of_share(problem: str, params: str, _one: Any, part: Block, share: int = share) -> BoolArray:
             assert (problem, params) == ("problem", "params")
             asked.append(part)
             return part.point % share == 0
@@ -317,9 +288,7 @@ def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
     )
     found = adjust_tracks(made.views, tracks, gcps=gcps)
     (one,) = [f for f in found.findings if f.kind == "moving_objects"]
-    assert one.motion is not None
     assert one.motion.gcps == ("P0", "P1", "P2")
-    assert found.control is not None
     assert found.control.used.tolist() == [False] * 3 + [True] * 3
     assert not found.gcp_inlier[gcps.point < 3].any()
     still = ~inside & (np.bincount(tracks.point) > 0)
@@ -343,12 +312,7 @@ def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:
         assert all(one.moves and one.start == 0.0 and one.stop < 0.2 * rows for one in found)
 
 
-CASES = [
-    (2, 0.2, 2.0, 1, 0.02),
-    (3, 0.25, 6.0, 3, 0.1),
-    (3, 0.35, 2.0, 0, 0.02),
-    (4, 0.45, 1.5, 2, 0.05),
-]
+CASES = [(2, 0.2, 2.0, 1, 0.02), (3, 0.25, 6.0, 3, 0.1), (3, 0.35, 2.0, 0, 0.02), (4, 0.45, 1.5, 2, 0.05)]
 
 
 @pytest.mark.landing(1)
@@ -359,7 +323,6 @@ def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float,
     block, tracks, moves = drifting(views, 900, part, metres, seed, outliers=outliers)
     found, without = (adjust_tracks(block.views, ties) for ties in (tracks, tracks.select(~moves)))
     (one,) = [f for f in found.findings if f.kind == "moving_objects"]
-    assert one.motion is not None
     assert one.motion.share == pytest.approx(part, abs=0.03)
     assert one.motion.metres == pytest.approx(metres, rel=0.15)
     assert one.motion.between == (0, views - 1)
@@ -393,7 +356,7 @@ def test_vehicles_are_no_group(seed: int) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("axis", rest_slow([1, 0], mark=pytest.mark.nightly))
+@pytest.mark.parametrize("axis", [1, 0])
 def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
     block = simulate_block(3, 700, seed=7, attitude=10e-6, position=2.0)
     ties, size = block.tracks, block.views[1].size[axis]
@@ -404,28 +367,22 @@ def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
 
 
 @pytest.mark.nightly
-def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() -> None:
-    """A pair of which 42 % moves by 2.6 m: a drift of degree 2 leaves 20 m of the scene's shape, and no group."""
-    world = make("glacier", 22)
-    found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
-    assert [one.kind for one in found.findings] == ["moving_objects"]
-    assert found.cameras.unknowns.drift == 1
-    judged = judge(world, found.sensors)
-    assert judged.left < 0.03
-    assert judged.shape < 0.3
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(("family", "seed"), [("fault", 65), ("fault", 7201), ("glacier", 45)])
-def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("family", "seed", "shape"),
+    [("fault", 65, 0.15), ("fault", 7201, 0.15), ("glacier", 45, 0.15), ("glacier", 22, 0.3)],
+)
+def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int, shape: float) -> None:
     """A fifth of a scene at 2 + 2 dates: beside a fault no row or column stands out (0.22 px were left), or a swing
-    leaves nothing that does (0.22 px), and of a glacier correlated noise alone explains more (0.06 px)."""
+    leaves nothing that does (0.22 px), and of a glacier correlated noise alone explains more (0.06 px). Of a pair 42 %
+    move by 2.6 m: a drift of degree 2 would follow that, leave 20 m of the scene's shape, and no group.
+    """
     world = make(family, seed)
     found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     assert [one.kind for one in found.findings] == ["moving_objects"]
+    assert found.cameras.unknowns.drift == 1 or seed != 22
     judged = judge(world, found.sensors)
     assert judged.left < 0.03
-    assert judged.shape < 0.15
+    assert judged.shape < shape
 
 
 @pytest.mark.landing(1)
@@ -438,7 +395,7 @@ def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.costs(7)
+@pytest.mark.costs(9)
 def test_ground_that_moved_beyond_a_row_of_all_images_is_no_jitter() -> None:
     """A fault of 1.2 m across the scan of four images: splines fit a half of it, and motion all that they had cut."""
     world = make("fault", 4)
