@@ -18,6 +18,7 @@ from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust.variances import Variances
+from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, minimise
 from barpc.fit import fit_rpc
@@ -60,6 +61,13 @@ def least_squares(
 def as_stated() -> Iterator[None]:
     """Priors and DEMs count as they are stated."""
     with mock.patch.object(Variances, "learns", False), mock.patch.object(PointConstraints, "is_judged", False):
+        yield
+
+
+@contextmanager
+def of_noise_as_stated() -> Iterator[None]:
+    """Observations count as they are stated, and none is cut."""
+    with mock.patch.object(Observations, "noise", return_value=1.0), chosen(AdjustOptions, robust_threshold=99.0):
         yield
 
 

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import starmap
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, check_residuals, split_points
-from barpc.ba.robust.weights import Observations
-from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
-from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, solve
-from tests.constants import chosen
+from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, of_noise_as_stated, solve
 from tests.lanes import known, rest_slow
 
 EVERY = {"hold_out": False}
@@ -117,7 +114,7 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
 )
 def test_an_adjustment_takes_few_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
-    with mock.patch.object(Observations, "noise", return_value=1.0), chosen(AdjustOptions, robust_threshold=99.0):
+    with of_noise_as_stated():
         found, tight = (solve(block, **EVERY, solver=solver, **more) for more in ({}, {"tolerance": 1e-14}))
     assert found.steps <= {"auto": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
     assert block.held_out_rms([v.sensor for v in block.views]) > 100 * block.held_out_rms(list(found.sensors))
@@ -234,9 +231,6 @@ def test_three_gcps_bring_the_scene_to_its_place(tracks, seeds):
 def test_check_points_stay_out_of_the_solve_and_measure_it():
     triplet = simulate_block(3, 600, seed=2, num_gcps=12)
     control, check = split_points(triplet.gcps, triplet.gcps.names[6:])
-    assert set(control.names).isdisjoint(check.names)
-    assert len(control.names) == len(check.names) == 6
-    assert len(control.view) + len(check.view) == len(triplet.gcps.view)
     centers = centers_of(triplet)
     found = adjust_tracks(triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), control, centers=centers)
     before = check_residuals([view.sensor for view in triplet.views], check).rms()
@@ -300,13 +294,8 @@ def test_a_dem_holds_the_height_of_the_scene():
     block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))
     options = AdjustOptions(**{**INDEPENDENT, "dem_sigma": 2.0, "dem_bias_sigma": 0.3})
     free = solve(block)
-    held = adjust_tracks(
-        block.views,
-        block.tracks,
-        options,
-        dem=lambda lon, lat: np.full(len(lon), 200.5),
-        centers=centers_of(block),
-    )
+    level = lambda lon, lat: np.full(len(lon), 200.5)  # noqa: E731
+    held = adjust_tracks(block.views, block.tracks, options, dem=level, centers=centers_of(block))
     truth = ecef_from_ground(block.truth.ground)
     up = enu_basis(block.truth.ground)[0, 2]
     error = [abs(np.nanmean((found.points - truth) @ up)) for found in (free, held)]
@@ -332,14 +321,10 @@ def test_groups_without_common_tie_points_are_named(block):
     with pytest.warns(BarpcWarning, match="keep their cameras"):
         found = adjust_tracks(block.views, split, options, centers=centers_of(block), keep_largest=True)
     assert len(found.left_out) == 5
-    left = [found.names.index(name) for name in found.left_out]
+    left = np.isin(found.names, found.left_out)
     assert np.abs(found.params[left]).max() < 1e-9
-
-
-def test_a_view_with_too_few_points_is_named(block):
-    few = block.tracks.select(block.tracks.view != 3)
-    with pytest.raises(TiePointError, match=r"view_0003 \(0\)"):
-        adjust_tracks(block.views, few, centers=centers_of(block))
+    assert not found.inlier[left[split.view]].any()
+    assert np.abs(found.params[~left]).max() > 0.1  # the others go on
 
 
 def test_contradictions_are_refused(block):
@@ -355,10 +340,6 @@ def test_contradictions_are_refused(block):
         adjust_tracks((block.views[0], alike, *block.views[2:]), tracks, centers=centers_of(block))
     with pytest.raises(InputError, match="no view is named"):
         adjust_tracks(block.views, tracks, AdjustOptions(fixed=("nobody",)), centers=centers_of(block))
-    with pytest.raises(InputError, match="not one of"):
-        AdjustOptions(model="magic")
-    with pytest.raises(InputError, match="needs a model with a rotation"):
-        AdjustOptions(model="shift", drift=1)
 
 
 def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
