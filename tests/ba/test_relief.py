@@ -21,7 +21,7 @@ from barpc.ba.constraints.terrain import (
     variance_inflation,
     without_outliers,
 )
-from barpc.base.geodesy import enu_basis, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
 from barpc.simulate import simulate_block
 from benchmarks.worlds import judge
@@ -233,12 +233,18 @@ def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
 
 
 def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
-    def bias(dem: Any, **options: Any) -> float:
-        none = np.zeros(0, dtype=bool)
-        heights = PointConstraints((), none, np.zeros(0, dtype=np.int64), (0.0, 1.0), AdjustOptions(**options), dem)
-        return heights._bias
+    class Level(Dem):
+        def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+            return np.full(len(lon), ALT)
 
-    known, unknown = (Dem(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
+    def bias(dem: Any, **options: Any) -> float:
+        every = np.ones(9, dtype=bool)
+        heights = PointConstraints((), every, np.arange(9), (0.0, 1.0), AdjustOptions(**options), dem)
+        found = heights.test(ecef_from_ground(points(9)), every)
+        assert found is not None
+        return found.bias
+
+    known, unknown = (Level(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
     assert (bias(known), bias(unknown), bias(lambda lon, lat: lon)) == (5.0, 20.0, 20.0)
     assert bias(known, dem_bias_sigma=0.7) == 0.7
 

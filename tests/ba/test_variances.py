@@ -652,15 +652,16 @@ def test_a_small_block_learns_until_its_priors_stand(at_minimum) -> None:
     assert tested.freedom == pytest.approx(known[:, :6].sum(), rel=1e-3)
 
 
-def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minimum, monkeypatch, caplog) -> None:
+def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minimum, sized: Sized, caplog) -> None:
     problem, minimum = at_minimum
+    sized(unknowns_tried=0)
 
     def fails(*_: Any) -> None:
         raise np.linalg.LinAlgError("not positive definite")
 
-    monkeypatch.setattr(Variances, "_known", fails)
-    v = Variances(problem.camera_prior, problem.cameras.unknowns, False)
-    prior, tested = v.learnt(problem, minimum)
+    covariance = SimpleNamespace(free=problem.free, is_large=False, of_views=fails)
+    unsolved: Any = SimpleNamespace(state=minimum.state, covariance=lambda _: covariance)
+    prior, tested = Variances(problem.camera_prior, problem.cameras.unknowns, False).learnt(problem, unsolved)
     assert prior is problem.camera_prior
     assert np.isnan(tested.ratio)
     assert (tested.freedom, tested.drift_sigma) == (0.0, ())
