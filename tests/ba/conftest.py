@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 from unittest import mock
 
 import numpy as np
@@ -22,9 +22,11 @@ from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, minimise
 from barpc.fit import fit_rpc
-from barpc.scene import Terrain
+from barpc.scene import GroundPoints, Terrain, Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.constants import chosen
+
+Observed = TypeVar("Observed", Tracks, GroundPoints)
 
 INDEPENDENT = {"noise_floor": 0.0, "sigma_attitude": 10.4, "sigma_position": 1.0, "min_convergence": 0.01}
 """What simulated blocks are: white noise, 15 urad at 694 km, 1 m."""
@@ -89,6 +91,17 @@ def block() -> SimulatedBlock:
 def adjusted(block: SimulatedBlock) -> Adjustment:
     """`block`, adjusted."""
     return solve(block)
+
+
+def seen(
+    given: Observed, ground: np.ndarray, sensors: Iterable[Any], seed: int | np.random.Generator, noise: float = 0.05
+) -> Observed:
+    """The observations where sensors show ground points (P, 3), with noise [px]."""
+    xy = np.random.default_rng(seed).normal(0.0, noise, given.xy.shape)
+    for v, sensor in enumerate(sensors):
+        rows = given.view == v
+        xy[rows] += sensor.project(ground[given.point[rows]])
+    return replace(given, xy=xy)
 
 
 @dataclass(frozen=True)

@@ -147,14 +147,6 @@ def test_outliers_cost_little(views, bounds, seeds):
 
 
 @pytest.mark.slow
-def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
-    fixed = block.views[4].name
-    found = solve(block, fixed=(fixed,))
-    assert not found.params[4].any()
-    assert block.held_out_rms(list(found.sensors)) < 0.02
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("seeds", rest_slow([(3,), (1, 2, 3)], mark=pytest.mark.nightly))
 def test_drift_is_corrected_as_if_there_were_none(seeds):
     ratio, price = [], []
@@ -174,14 +166,6 @@ def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
     plain = solve(drifting, drift=0)
     assert drifting.held_out_rms(list(plain.sensors)) > 1.0
     assert plain.params.shape[1] == 6
-
-
-@pytest.mark.slow
-def test_a_drift_is_followed_where_the_model_has_one():
-    drifting = simulate_block(4, 300, seed=1, drift=20e-6)
-    plain, found = (solve(drifting, drift=drift, jitter="off", **EVERY) for drift in (0, 1))
-    assert drifting.held_out_rms(list(plain.sensors)) > 1.0
-    assert 0.005 < drifting.held_out_rms(list(found.sensors)) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -349,6 +333,7 @@ def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
     found = adjust_tracks(block.views, mixed, AdjustOptions(**INDEPENDENT), centers=centers_of(block))
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
     np.testing.assert_allclose(found.residuals, adjusted.residuals[order], atol=1e-4)
+    np.testing.assert_array_equal(found.held_out, adjusted.held_out[order])
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -314,36 +315,25 @@ def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> No
 
 def test_heights_between_the_same_posts_are_no_independent_ones() -> None:
     """A DEM of wide posts has as many heights as posts under the points."""
-    rng = np.random.default_rng(0)
-    at = rng.uniform(0.0, 2000.0, (400, 2))
-    ground = np.column_stack([5.0 + at[:, 0] / 80e3, 44.0 + at[:, 1] / 111e3, np.zeros(400)])
-    ground[:, 2] = 300.0 + 40.0 * np.sin(at[:, 0] / 130.0) + 30.0 * np.cos(at[:, 1] / 110.0)
 
+    @dataclass
     class Posts:
-        def __init__(self, step: float) -> None:
-            self.step = step
+        step: float
 
         def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-            east, north = (np.asarray(lon) - 5.0) * 80e3, (np.asarray(lat) - 44.0) * 111e3
-            return 300.0 + 40.0 * np.sin(east / 130.0) + 30.0 * np.cos(north / 110.0)
+            return sum_of(HILLS)(lon, lat)
 
         def posts(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-            col, row = np.floor((lon - 5.0) * 80e3 / self.step), np.floor((lat - 44.0) * 111e3 / self.step)
+            col, row = np.floor((np.stack([lon - LON, lat - LAT]) * UNIT[:, None] + SIDE / 2) / self.step)
             first = row * 1000.0 + col
             return np.stack([first, first + 1, first + 1000, first + 1001], axis=1)
 
-    every = np.arange(400)
-    noisy = ground + rng.normal(0.0, 1.0, (400, 1)) * [0.0, 0.0, 1.0]
-    found = {}
-    for step in (20.0, 400.0, 1000.0):
-        dem = Posts(step)
-        relief = Relief.of(dem, noisy, np.ones(400, dtype=bool), np.full(400, 0.3), 2.0)
-        told = believe(relief, every, noisy, 2.0)
-        assert told is not None
-        found[step] = told.alike
-    assert found[20.0] < 4.0  # some hundred posts
-    assert found[400.0] == pytest.approx(400 / 36, rel=0.15)
-    assert found[1000.0] == pytest.approx(400 / 9, rel=0.15)
+    noisy = points(400)
+    noisy[:, 2] += np.random.default_rng(0).normal(0.0, 1.0, 400)
+    fine, coarse, coarsest = (sure(judged(Posts(SIDE / cells), noisy, 2.0)).alike for cells in (100, 5, 2))
+    assert fine < 4.0  # some hundred posts
+    assert coarse == pytest.approx(400 / 36, rel=0.15)
+    assert coarsest == pytest.approx(400 / 9, rel=0.15)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from barpc.scene import Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import as_stated, centers_of, of_noise_as_stated, solve
+from tests.ba.conftest import as_stated, centers_of, of_noise_as_stated, seen, solve
 from tests.lanes import known
 
 SIGMA_ATTITUDE, SIGMA_POSITION, NOISE = 4.0, 1.0, 0.1
@@ -59,12 +59,7 @@ def run_trials(block: SimulatedBlock, count: int, options: AdjustOptions = OPTIO
     nees, scene = [], []
     for _ in range(count):
         params = rng.normal(0, sigma, (n, len(sigma)))
-        xy = np.empty_like(tracks.xy)
-        for v, sensor in enumerate(unknowns.corrected(params, block.views)):
-            rows = tracks.view == v
-            xy[rows] = sensor.project(block.truth.ground[tracks.point[rows]])
-        xy += rng.normal(0, NOISE, xy.shape)
-        noisy = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
+        noisy = seen(tracks, block.truth.ground, unknowns.corrected(params, block.views), rng, NOISE)
         found = adjust_tracks(block.views, noisy, options, centers=centers)
         error = (found.params - params).ravel()
         nees.append(error @ (found.covariance.reduced.matrix @ error))
