@@ -90,8 +90,7 @@ PLACES = [(5.4, 43.3), (5.0, 0.0), (0.0, 51.0), (90.0, 30.0), (180.0, 10.0), (30
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("views", "tracks", "places"),
-    [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)],
+    ("views", "tracks", "places"), [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)]
 )
 def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, places):
     for lon, lat in places:
@@ -107,10 +106,7 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
 
 @pytest.mark.parametrize(
     ("size", "solver"),
-    [
-        ("small", "auto"),
-        *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse")),
-    ],
+    [("small", "auto"), *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse"))],
 )
 def test_an_adjustment_takes_few_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
@@ -185,8 +181,7 @@ def test_image_models_correct_what_they_can(model, bound):
 @pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("tracks", "seeds"),
-    rest_slow(starmap(pytest.param, [(50, range(3)), (50, range(3, 6)), (600, range(6))])),
+    ("tracks", "seeds"), rest_slow(starmap(pytest.param, [(50, range(3)), (50, range(3, 6)), (600, range(6))]))
 )
 def test_three_gcps_bring_the_scene_to_its_place(tracks, seeds):
     errors, sigmas = [], []

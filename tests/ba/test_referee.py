@@ -170,8 +170,7 @@ def test_a_pair_whose_tie_points_fall_into_two_groups_says_so(seeds):
 @pytest.mark.landing(2)
 @pytest.mark.parametrize("seeds", ONE_OR_ALL)
 @pytest.mark.parametrize(
-    "name",
-    rest_slow(["no drift, 2 views", "no drift", "drift 3", "quadratic 1", "no drift, 10 % outliers"]),
+    "name", rest_slow(["no drift, 2 views", "no drift", "drift 3", "quadratic 1", "no drift, 10 % outliers"])
 )
 def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
     for seed in seeds:
@@ -185,12 +184,7 @@ def test_a_pair_whose_tie_points_are_of_one_kind_says_nothing(name, seeds):
     [
         ("no drift", "good", ""),
         ("drift 3", "good", ""),
-        pytest.param(
-            "jitter 0.5 at 1 Hz",
-            "look",
-            "includes attitude jitter",
-            marks=pytest.mark.nightly,
-        ),
+        pytest.param("jitter 0.5 at 1 Hz", "look", "includes attitude jitter", marks=pytest.mark.nightly),
         ("jitter 0.1 at 5 Hz", "look", "px with a period of 27"),
         pytest.param(
             *("clouds 60 %", "bad", "check for clouds, water and change"),

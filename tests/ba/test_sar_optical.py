@@ -94,9 +94,7 @@ def test_an_exact_radar_view_gives_the_block_its_place(scene: Scene) -> None:
     assert np.nanmedian(off) <= 0.5 * np.nanmedian(alone)
 
 
-def test_held_out_points_are_seen_where_the_exact_cameras_see_them_once_the_place_is_known(
-    scene: Scene,
-) -> None:
+def test_held_out_points_are_seen_where_the_exact_cameras_see_them_once_the_place_is_known(scene: Scene) -> None:
     """Relative to each other: the points that the first view sees, carried over to the second."""
     options = AdjustOptions(fixed=("radar",), noise_floor=1e-9)
     result = adjust_tracks(scene.views, scene.tracks, options, centers=scene.centers)

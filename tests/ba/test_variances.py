@@ -396,10 +396,7 @@ def test_the_problem_under_other_priors_is_the_one_solved_with_them(made, fixed:
         volume = np.linalg.slogdet(matrix)[1] + 2 * np.log(prior.sigma.ravel()[free]).sum()
         found.append((minimum, -0.5 * (minimum.state.cost + volume), np.linalg.inv(matrix)))
     around = QuadraticProblem(problem, found[0][0])
-    (same, unmoved, _), (evidence, params, covariance) = (
-        around.under(problem.camera_prior),
-        around.under(other),
-    )
+    (same, unmoved, _), (evidence, params, covariance) = (around.under(problem.camera_prior), around.under(other))
     assert evidence - same == pytest.approx(found[1][1] - found[0][1], abs=0.02)
     np.testing.assert_array_equal(unmoved, found[0][0].state.params)
     np.testing.assert_allclose(params, found[1][0].state.params, atol=2e-3)
