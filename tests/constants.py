@@ -67,7 +67,6 @@ SIZES = {
     "set_points": ("barpc.ba.control.agreement._MAX_SET_POINTS",),
     "tests_kept": ("barpc.ba.control.snooping.KEPT",),
     "heights_measured": ("barpc.ba.result.MANY",),
-    "slight_cut": ("barpc.ba.robust.rounds.SLIGHT",),
     "terms_kept": ("barpc.ba.robust.systematic_residuals.KEPT",),
     "unknowns_tried": ("barpc.ba.robust.posterior.SMALL",),
     "columns_kept": ("barpc.ba.solving.covariance.KEPT",),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 from unittest import mock
 
 import numpy as np
@@ -18,12 +18,15 @@ from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.constraints.ground import PointConstraints
 from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust.variances import Variances
+from barpc.ba.robust.weights import Observations
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, minimise
 from barpc.fit import fit_rpc
-from barpc.scene import Terrain
+from barpc.scene import GroundPoints, Terrain, Tracks
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.constants import chosen
+
+Observed = TypeVar("Observed", Tracks, GroundPoints)
 
 INDEPENDENT = {"noise_floor": 0.0, "sigma_attitude": 10.4, "sigma_position": 1.0, "min_convergence": 0.01}
 """What simulated blocks are: white noise, 15 urad at 694 km, 1 m."""
@@ -63,6 +66,13 @@ def as_stated() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def of_noise_as_stated() -> Iterator[None]:
+    """Observations count as they are stated, and none is cut."""
+    with mock.patch.object(Observations, "noise", return_value=1.0), chosen(AdjustOptions, robust_threshold=99.0):
+        yield
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _delivered() -> Iterator[None]:
     """The RPC that a simulated camera is delivered with is fitted once, in whichever blocks it flies."""
@@ -81,6 +91,17 @@ def block() -> SimulatedBlock:
 def adjusted(block: SimulatedBlock) -> Adjustment:
     """`block`, adjusted."""
     return solve(block)
+
+
+def seen(
+    given: Observed, ground: np.ndarray, sensors: Iterable[Any], seed: int | np.random.Generator, noise: float = 0.05
+) -> Observed:
+    """The observations where sensors show ground points (P, 3), with noise [px]."""
+    xy = np.random.default_rng(seed).normal(0.0, noise, given.xy.shape)
+    for v, sensor in enumerate(sensors):
+        rows = given.view == v
+        xy[rows] += sensor.project(ground[given.point[rows]])
+    return replace(given, xy=xy)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import MISSING, fields, replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -16,8 +16,7 @@ import scipy.optimize
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.parameters.priors import prior_sigmas, stated_accuracy
-from barpc.ba.select import models
-from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.centers import camera_center
@@ -81,25 +80,10 @@ ROWS = [
     Row("sigma_shift", 0.1, 50.0, rotation, 1, rest={"model": "affine"}),
     Row("noise_floor", 0.0, 0.5, variance, 1),
     Row("robust_threshold", 1.5, 6.0, kept, 1, 1.02),
-    Row(
-        "num_passes",
-        1,
-        6,
-        lambda found: len(found.cost_history),
-        1,
-        rest={"robust_threshold": 1.2, "drift": 0},
-    ),
+    Row("num_passes", 1, 6, lambda found: len(found.cost_history), 1, rest={"robust_threshold": 1.2, "drift": 0}),
     Row("fixed", (), ("view_0000",), lambda found: 1e-9 + np.abs(found.params[0]).max(), -1, 1e6),
     Row("dem_sigma", 0.5, 500.0, off_dem, 1, rest={"dem_bias_sigma": 0.5}, dem=400.0),
-    Row(
-        "dem_bias_sigma",
-        0.5,
-        50.0,
-        lambda found: found.gauge.sigma[2],
-        1,
-        rest={"dem_sigma": 0.5},
-        dem=400.0,
-    ),
+    Row("dem_bias_sigma", 0.5, 50.0, lambda found: found.gauge.sigma[2], 1, rest={"dem_sigma": 0.5}, dem=400.0),
     Row("min_convergence", 0.01, 90.0, lambda found: 1 + found.held.sum(), 1, 10.0),
     Row("tolerance", 1e-14, 1e-2, steps, -1, rest={"solver": "sparse"}),
 ]
@@ -125,24 +109,14 @@ def dirty() -> SimulatedBlock:
     return replace(made, tracks=told)
 
 
-def run(
-    block: SimulatedBlock, dem: float | None = None, keep_largest: bool = False, hold_out: bool = True, **options: Any
-) -> Adjustment:
+def run(block: SimulatedBlock, dem: float | None = None, hold_out: bool = True, **options: Any) -> Adjustment:
     terrain = None if dem is None else lambda lon, lat: np.full(len(lon), dem)
     # among ties of twice the stated noise a foreign RPC is looked for in every run: test_apart.py
     unasked = mock.patch("barpc.ba.select.models.find_foreign_camera", return_value=(None, None))
     with warnings.catch_warnings(), unasked, chosen(AdjustOptions, **{**BASE, **options}) as given:
         warnings.simplefilter("ignore", BarpcWarning)
         centers = centers_of(block)
-        return adjust_tracks(
-            block.views,
-            block.tracks,
-            given,
-            dem=terrain,
-            centers=centers,
-            keep_largest=keep_largest,
-            hold_out=hold_out,
-        )
+        return adjust_tracks(block.views, block.tracks, given, dem=terrain, centers=centers, hold_out=hold_out)
 
 
 @pytest.fixture(scope="module")
@@ -170,40 +144,18 @@ def test_a_tenth_of_the_tracks_takes_no_part():
     every = run(dirty, hold_out=False)
     assert not every.held_out.any()
     assert np.isnan(every.held_out_rms).all()
-    out = found.held_out
+    out, tracks = found.held_out, dirty.tracks
     assert not (out & found.inlier).any()
-    tracks = dirty.tracks
-    several = (np.bincount(tracks.point) >= 2).sum()
-    assert len(np.unique(tracks.point[out])) == pytest.approx(0.1 * several, rel=0.25)
-    assert not np.isin(tracks.point[~out], tracks.point[out]).any()  # a track is out in all of its views
-    share = np.bincount(tracks.view[out]) / np.bincount(tracks.view)
-    assert (np.abs(share - 0.1) < 0.04).all()
+    assert out.mean() == pytest.approx(0.1, rel=0.25)
     # 0.2 px a coordinate where 0.1 px is stated; of the tracks a quarter holds something wrong, by up to 20 px
     assert (found.held_out_noise > 1.6).all()
     assert (found.held_out_noise < 5.0).all()
     assert (found.held_out_rms < 2.5 * found.rmse()).all()
-    # what took no part tells nothing: spoilt, it changes no camera
-    with mock.patch("barpc.ba.adjustment.keep_out", lambda block: out[block.order]):
-        spoilt = run(replace(dirty, tracks=replace(tracks, xy=tracks.xy + 5.0 * out[:, None])))
+    # what took no part tells nothing: spoilt within the quarters of a pixel by which it is drawn, it changes no camera
+    xy = np.where(out[:, None], np.rint(4.0 * tracks.xy) / 4.0, tracks.xy)
+    spoilt = run(replace(dirty, tracks=replace(tracks, xy=xy)))
     np.testing.assert_array_equal(spoilt.params, found.params)
     assert (spoilt.held_out_noise != found.held_out_noise).all()
-    # nor does it matter who is called what, or stands where
-    order = np.random.default_rng(0).permutation(len(tracks))
-    views = np.array([2, 0, 3, 1])
-    other = Tracks(views[tracks.view[order]], tracks.point[order], tracks.xy[order], tracks.sigma[order])
-    again = run(replace(dirty, views=tuple(dirty.views[i] for i in np.argsort(views)), tracks=other))
-    np.testing.assert_array_equal(again.held_out, out[order])
-
-
-@pytest.mark.slow
-def test_a_view_with_few_observations_gives_none_away(dirty):
-    tracks = dirty.tracks
-    first = np.flatnonzero(tracks.view == 0)
-    few = tracks.select(~np.isin(np.arange(len(tracks)), first[60:]))
-    found = run(replace(dirty, tracks=few))
-    assert found.held_out.any()
-    assert not found.held_out[few.view == 0].any()
-    assert np.isnan(found.held_out_noise).all()  # of a few nothing is said
 
 
 def test_every_option_has_a_row():
@@ -216,14 +168,8 @@ def test_every_option_has_a_row():
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     "row",
-    [
-        pytest.param(
-            row,
-            marks=pytest.mark.nightly if row.field in ELSEWHERE_TOO else (),
-            id=f"{row.field}: {row.low} to {row.high}",
-        )
-        for row in ROWS
-    ],
+    [pytest.param(row, marks=pytest.mark.nightly if row.field in ELSEWHERE_TOO else ()) for row in ROWS],
+    ids=[f"{row.field}: {row.low} to {row.high}" for row in ROWS],
 )
 def test_an_option_changes_the_result_in_its_direction(dirty, ended, row):
     few, many = (row.observable(ended(dirty, row.dem, {**row.rest, row.field: value})) for value in (row.low, row.high))
@@ -239,21 +185,6 @@ def test_a_view_needs_as_many_observations_as_asked_for(dirty):
         run(dirty, min_observations=least + 1)
 
 
-def test_the_largest_group_goes_on_alone_where_asked(dirty):
-    tracks = dirty.tracks
-    # no track of the fourth view is seen by another: its observations become tracks of their own
-    alone = tracks.view == 3
-    point = np.where(alone, 150 + np.arange(len(tracks)), tracks.point)
-    _, point = np.unique(point, return_inverse=True)
-    apart = replace(dirty, tracks=Tracks(tracks.view, point, tracks.xy, tracks.sigma))
-    with pytest.raises(DisconnectedError):
-        run(apart)
-    found = run(apart, keep_largest=True)
-    assert found.left_out == ("view_0003",)
-    assert not found.inlier[alone].any()
-    assert np.abs(found.params[:3]).max() > 0.1
-
-
 @pytest.mark.slow
 def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
     for asked, runs in (("sparse", ["sparse"]), ("auto", ["scipy", "sparse"])):
@@ -266,10 +197,7 @@ def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
         assert ("scipy least_squares" in found.status) == (names[-1] == "scipy")
 
 
-@pytest.mark.parametrize(
-    "views", [3, pytest.param(22, marks=pytest.mark.slow), pytest.param(23, marks=pytest.mark.slow)]
-)
-def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(views, monkeypatch):
+def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(monkeypatch):
     entered = []
 
     def counting(*args, **kwargs):
@@ -278,30 +206,10 @@ def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(views, mo
 
     real = scipy.optimize.least_squares
     monkeypatch.setattr(scipy.optimize, "least_squares", counting)
-    block = simulate_block(views, 60 * views, seed=21)
+    block = simulate_block(3, 180, seed=21)
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(min_convergence=0.01))
-    assert bool(entered) == (9 * views <= 200)
-    if entered:
-        assert entered[-1].message.rstrip(".") in found.status
-        assert f"{entered[-1].nfev} evaluations" in found.status
-
-
-@pytest.mark.parametrize("name", ["sigma_attitude", "sigma_position", "dem_sigma", "dem_bias_sigma"])
-def test_a_sigma_must_be_positive(name):
-    AdjustOptions(**{name: 1e-9})
-    for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match=name):
-            AdjustOptions(**{name: wrong})
-
-
-@pytest.mark.parametrize(("name", "wrong"), [("solver", "ceres"), ("drift", 3), ("model", "")])
-def test_a_choice_must_be_one_of_its_list(name, wrong):
-    with pytest.raises(InputError, match=name):
-        AdjustOptions(**{name: wrong})
-
-
-def test_every_option_has_a_default():
-    assert all(f.default is not MISSING or f.default_factory is not MISSING for f in fields(AdjustOptions))
+    assert entered[-1].message.rstrip(".") in found.status
+    assert f"{entered[-1].nfev} evaluations" in found.status
 
 
 def test_prior_sigmas_stand_at_their_unknowns(dirty):
@@ -320,6 +228,9 @@ def test_a_camera_is_as_accurate_as_it_states_in_metres(dirty, stated, taken):
     told = replace(view, sensor=replace(view.sensor, err_bias=stated))
     assert stated_accuracy(told) == taken
     np.testing.assert_array_equal(prior_sigmas((told,), AdjustOptions(), 0, None, 0), np.full((1, 6), taken))
+    # what is asked for counts though it is known to be off by more
+    asked = prior_sigmas((told,), AdjustOptions(sigma_attitude=2.0), 0, np.array([60.0]), 0)
+    np.testing.assert_array_equal(asked, [np.repeat([2.0, 60.0], 3)])
 
 
 def test_views_turn_about_the_centre_that_is_asked_for(dirty):
@@ -335,25 +246,19 @@ def test_views_turn_about_the_centre_that_is_asked_for(dirty):
 
 
 @pytest.mark.slow
-def test_no_terms_is_the_plain_model_and_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_terms_is_the_plain_model_and_needs_no_search(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, logger="barpc.ba.select")
     block = simulate_block(3, 1500, seed=21)
-
-    def searched(*_: Any) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(models, "_search_models", searched)
-    tracks = block.tracks
-    xy = tracks.xy.copy()
-    xy[(tracks.view == 1) & (np.abs(tracks.xy[:, 1] - 9000.0) < 1500.0)] += (1.0, 2.0)
-    jumped = Tracks(tracks.view, tracks.point, xy, tracks.sigma)
-    with pytest.raises(AssertionError):
-        adjust_tracks(block.views, jumped)
+    xy = block.tracks.xy.copy()
+    xy[(block.tracks.view == 1) & (np.abs(xy[:, 1] - 9000.0) < 1500.0)] += (1.0, 2.0)
+    jumped = replace(block.tracks, xy=xy)
     found = adjust_tracks(block.views, jumped, AdjustOptions(terms="none"))
     assert found.cameras.unknowns.drift == 1
     assert found.cameras.unknowns.waves is None
     assert (found.findings, found.changed) == ((), 0.0)
     assert not found.moving.any()
-    monkeypatch.undo()
+    assert not caplog.records
     followed = adjust_tracks(block.views, jumped)
+    assert "step of view 1" in caplog.text
     assert [one.kind for one in followed.findings] == ["step"]
     assert followed.changed > 0.5  # of two pixels, beside what the plain model bends

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,8 @@ from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.constraints.gauge import MOTIONS, datum_shares, gauge_report, weakest_modes
 from barpc.ba.constraints.ground import PointConstraints, convergence_angles, ground_control
 from barpc.ba.control.snooping import image_test
-from barpc.ba.parameters.projected import Cameras
-from barpc.ba.robust import rounds
 from barpc.ba.robust.weights import Observations
+from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State, WhitenedProblem, camera_step, gauss_newton
 from barpc.scene import GroundPoints
@@ -44,6 +44,14 @@ class Case:
     @property
     def reduced(self) -> Any:
         return self.problem.reduce(self.params, self.points, self.weight)
+
+    @property
+    def state(self) -> State:
+        return State(self.params, self.points)
+
+    @property
+    def covariance(self) -> Covariance:
+        return Minimum(self.state, self.reduced).covariance(self.problem.free)
 
     @cached_property
     def dense(self) -> tuple[np.ndarray, np.ndarray, float]:
@@ -79,14 +87,8 @@ def make_case(drift: int = 0, fixed: tuple[str, ...] = ()) -> Case:
     weak = np.zeros(12, dtype=bool)
     weak[[2, 5, 8]] = True
     control = ground_control(gcps, np.array([10, 11]))
-    heights = PointConstraints(
-        (control,),
-        weak,
-        np.arange(10),
-        (0.0, 500.0),
-        replace(options, dem_sigma=4.0, dem_bias_sigma=6.0),
-        terrain,
-    )
+    held = replace(options, dem_sigma=4.0, dem_bias_sigma=6.0)
+    heights = PointConstraints((control,), weak, np.arange(10), (0.0, 500.0), held, terrain)
     problem = heights.hold(problem, points)
 
     def plane(p: int):
@@ -172,15 +174,14 @@ def test_one_step_is_the_gauss_newton_step_of_the_whole(case):
     _assert_close(case.reduced.point_step(step).ravel(), whole[size:], 1e-4)
     assert gain == pytest.approx(-gradient @ whole, rel=1e-5)
     projected = case.problem.linearise(case.params, case.points)
-    state = Minimum(_state(case), case.reduced).state
-    moved = gauss_newton(case.problem, state, case.weight, case.problem.linearise(case.params, case.points))
+    moved = gauss_newton(case.problem, case.state, case.weight, projected)
     assert projected.image.shape == (2, len(case.plain.view))
     _assert_close(moved.params - case.params, whole[:size].reshape(case.params.shape), 1e-4)
     assert moved.cost == pytest.approx(cost + gradient @ whole, rel=1e-5)
 
 
 def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced_problem(case):
-    compressed = WhitenedProblem(case.problem, _state(case), case.weight, None)
+    compressed = WhitenedProblem(case.problem, case.state, case.weight, None)
     size = case.params.size
     upper0 = la.cholesky(case.reduced.plain(np.ones(size, dtype=bool)))
     for x in (np.zeros(size), np.random.default_rng(3).normal(0, 0.5, size)):
@@ -199,10 +200,6 @@ def test_what_scipy_sees_has_the_cost_the_gradient_and_the_matrix_of_the_reduced
     assert evaluations == 2  # asked twice at one place, linearised once
     compressed.at(x + 1e-3)
     assert len(compressed.state.history) == 3
-
-
-def _state(case: Case) -> State:
-    return State(case.params, case.points)
 
 
 def test_damping_adds_its_part_of_the_diagonal(case):
@@ -224,7 +221,7 @@ def test_fixed_views_do_not_move_and_have_no_variance():
     whole[free] = -np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
     step, _, _ = camera_step(held.problem, held.reduced)
     _assert_close(step.ravel(), whole[:24], 1e-4)
-    covariance = Minimum(_state(held), held.reduced).covariance(held.problem.free)
+    covariance = held.covariance
     inverse = np.zeros_like(matrix)
     inverse[np.ix_(free, free)] = np.linalg.inv(matrix[np.ix_(free, free)])
     _assert_close(covariance.full, inverse[:24, :24], 1e-4)
@@ -242,22 +239,18 @@ def test_points_alone_take_the_gauss_newton_step_of_their_own_blocks(case):
     _assert_close(moved, expected, 0.05)  # the error that heights share is held in this step
 
 
-def test_covariances_are_blocks_of_the_inverse_of_the_whole(case):
-    matrix, _, _ = case.dense
-    inverse = np.linalg.inv(matrix)
-    size, q = case.params.size, case.params.shape[1]
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
-    _assert_close(covariance.view(1, 3), inverse[q : 2 * q, 3 * q : 4 * q], 1e-4)
-    _assert_close(covariance.view(2), inverse[2 * q : 3 * q, 2 * q : 3 * q], 1e-4)
-    _assert_close(covariance.full, inverse[:size, :size], 1e-4)
-    _assert_close(covariance.view(0, 2), inverse[:q, 2 * q : 3 * q], 1e-4)
+def test_covariances_are_blocks_of_the_inverse_of_the_whole_put_together_of_any_number_of_columns(case, sized):
+    inverse = np.linalg.inv(case.dense[0])
+    size = case.params.size
     index = np.array([1, 5, 7, 8, 10])
-    of_points = covariance.points(index)
-    for p, found in zip(index, of_points, strict=True):
+    for p, found in zip(index, case.covariance.points(index), strict=True):
         place = size + 3 * p + np.arange(3)
         _assert_close(found, inverse[np.ix_(place, place)], 1e-4)
-    pair = np.r_[q : 2 * q, 3 * q : 4 * q]
-    _assert_close(covariance.joint(np.array([1, 3])), inverse[np.ix_(pair, pair)], 1e-4)
+    for columns in (1, 5, size - 1, size, 1000):
+        sized(columns_kept=columns * size, dense_views=0)
+        full = case.covariance.full
+        _assert_close(full, inverse[:size, :size], 1e-4)
+        np.testing.assert_array_equal(full, full.T)
 
 
 def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, sized):
@@ -268,15 +261,15 @@ def test_a_residual_in_an_image_is_taken_in_units_of_its_own_deviation(case, siz
     rows = np.flatnonzero(np.isin(structure.point, [2, 5, 6, 10, 11]))
     assert (np.bincount(structure.point[rows])[[2, 10]] > 1).all()
     residual = case.problem.residuals(case.params, case.points)
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
-    found = image_test(covariance, case.problem, _state(case), residual, case.weight, rows)
+    covariance = case.covariance
+    found = image_test(covariance, case.problem, case.state, residual, case.weight, rows)
     left = 1.0 - np.einsum("ki,ij,kj->k", jacobian, np.linalg.inv(matrix), jacobian)
     whitened = case.plain.residual(case.params, case.points)
     places = 2 * rows[:, None] + [0, 1]
     assert (left[places] < 0.99).any()  # or all would be residuals over what is stated
     np.testing.assert_allclose(found, (np.abs(whitened[places]) / np.sqrt(left[places])).max(axis=1), rtol=1e-4)
     sized(tests_kept=1)
-    one_by_one = image_test(covariance, case.problem, _state(case), residual, case.weight, rows)
+    one_by_one = image_test(covariance, case.problem, case.state, residual, case.weight, rows)
     np.testing.assert_allclose(one_by_one, found, rtol=1e-9)
 
 
@@ -299,22 +292,13 @@ def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
     assert weakest_modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
 
 
-def test_the_whole_covariance_is_put_together_of_any_number_of_columns(case, sized):
-    matrix, _, _ = case.dense
-    size = case.params.size
-    for columns in (1, 5, size - 1, size, 1000):
-        sized(columns_kept=columns * size)
-        covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
-        _assert_close(covariance.full, np.linalg.inv(matrix)[:size, :size], 1e-4)
-        np.testing.assert_array_equal(covariance.full, covariance.full.T)
-
-
+@pytest.mark.parametrize("dense_views", [100, 0])
 @pytest.mark.parametrize("small", [0, 900])
-def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, sized, small):
-    sized(dense_unknowns=small)
+def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, sized, small, dense_views):
+    sized(dense_unknowns=small, dense_views=dense_views)
     q = case.params.shape[1]
     inverse = np.linalg.inv(case.dense[0])
-    fresh = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    fresh = case.covariance
     places = np.r_[2 * q : 3 * q, 0:q]  # in the order asked for
     for _ in range(2):
         _assert_close(fresh.joint(np.array([2, 0])), inverse[np.ix_(places, places)], 1e-4)
@@ -330,7 +314,7 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
     before = case.points + np.random.default_rng(2).normal(0, 1, case.points.shape)
     use = np.ones(len(case.points), dtype=bool)
     use[4] = False
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    covariance = case.covariance
     report = gauge_report(covariance, case.points, before, use)
     index = np.flatnonzero(use)
     middle = case.points[index].mean(axis=0)
@@ -363,7 +347,7 @@ def test_the_gauge_is_the_least_squares_motion_of_all_points_and_its_covariance(
 
 
 def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averages_over_all(case, monkeypatch, sized):
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    covariance = case.covariance
     before, use = case.points - [3.0, 0.0, 1.0] * (np.arange(12) == 7)[:, None], np.ones(12, dtype=bool)
     whole = gauge_report(covariance, case.points, before, use)
     sized(scene_points=11)
@@ -385,11 +369,7 @@ def test_a_sample_of_many_points_stands_for_the_scene_and_their_own_noise_averag
 
 def test_a_joint_prior_of_an_earlier_block_adds_its_information():
     made = simulate_block(4, 60, seed=3)
-    options = AdjustOptions(
-        noise_floor=0.0,
-        min_convergence=0.01,
-        drift=0,
-    )
+    options = AdjustOptions(noise_floor=0.0, min_convergence=0.01, drift=0)
     centers = centers_of(made)
     old = made.tracks.select(made.tracks.view < 3)
     first = adjust_tracks(made.views[:3], old, options, centers=centers[:3])
@@ -471,46 +451,6 @@ def test_squares_are_taken_of_residuals_in_sigmas_over_their_freedom(observation
     np.testing.assert_allclose(s[1:], (0.18 / block.sigma**2 / freedom)[1:])
 
 
-def test_the_noise_is_the_sum_of_squares_over_what_is_left_of_freedom(observations):
-    counts, block, problem = observations
-    use = np.ones(len(block.view), dtype=bool)
-    residual = np.random.default_rng(0).normal(0, 1.0, (2, len(use)))
-    ties = block.point < 10  # control points are tested one by one, by what the tie points say
-    freedom = 2 * ties.sum() - 3 * 10 - 18
-    assert freedom < 20
-    assert counts.noise(residual, use, problem, 0) == 1.0  # too few to tell
-    free = replace(problem, free=np.zeros(18, dtype=bool))
-    freedom = 2 * ties.sum() - 3 * 10
-    expected = np.sqrt(((residual / block.sigma)[:, ties] ** 2).sum() / freedom)
-    assert freedom >= 20
-    assert counts.noise(residual, use, free, 0) == pytest.approx(expected, rel=1e-12)
-
-
-def test_tie_points_of_a_view_count_together_at_most_as_the_floor_says(observations):
-    counts, block, _ = observations
-    use = np.ones(len(block.view), dtype=bool)
-    use[3] = False
-    weight = counts.weight(use, 2.0)
-    assert weight[3] == 0.0
-    for v in range(3):
-        mine = (block.view == v) & use
-        ties, control = mine & (block.point < 10), mine & (block.point >= 10)
-        np.testing.assert_allclose(weight[control], 1 / (2.0 * block.sigma[control]))
-        free = (1 / (2.0 * block.sigma[ties])) ** 2
-        assert (weight[ties] ** 2).sum() == pytest.approx(min(free.sum(), 1 / 0.05**2), rel=1e-12)
-
-
-def test_what_a_camera_cannot_follow_is_as_good_as_fourteen_independent_errors(observations):
-    counts, block, _ = observations
-    use = np.ones(len(block.view), dtype=bool)
-    misfit = np.array([0.5, 2.0, 9.0])  # px; more than three would loosen the view that causes it
-    weight = counts.weight(use, 1.0, misfit)
-    for v, size in enumerate((0.5, 2.0, 3.0)):
-        ties = (block.view == v) & (block.point < 10)
-        free = ((1 / block.sigma[ties]) ** 2).sum()
-        assert (weight[ties] ** 2).sum() == pytest.approx(min(free, 1 / (0.05**2 + size**2 / 14)), rel=1e-12)
-
-
 def test_an_observation_without_a_second_one_is_left_out_unless_a_prior_holds_its_point(observations):
     counts, block, _ = observations
     pair = int(np.flatnonzero(np.bincount(block.point)[:10] == 2)[0])
@@ -537,40 +477,6 @@ def test_residuals_of_gcps_point_from_the_given_to_the_adjusted_place():
     np.testing.assert_allclose(found.gcp_residuals, np.tile(-offset, (4, 1)), atol=1.0)
 
 
-@pytest.mark.slow
-def test_robust_rounds_end_where_the_losss_scale_is_three_sigmas_of_the_noise(monkeypatch):
-    made = simulate_block(4, 150, seed=21, noise=0.1, outliers=0.4)
-    scales, noises = [], []
-    loss, robust, squared = rounds.geman_mcclure, rounds._robust, Observations.squared
-    last = {}
-
-    def seen(self, residual, counted):
-        last["s"] = squared(self, residual, counted)
-        return last["s"]
-
-    def watched(scaled):
-        k = int(np.argmax(np.where(np.isfinite(last["s"]), last["s"], 0)))
-        scales.append(float(np.sqrt(last["s"][k] / scaled[k])))
-        return loss(scaled)
-
-    def ended(*given):
-        found = robust(*given)
-        noises.append(found[3])
-        monkeypatch.setattr(rounds, "_robust", robust)  # of the first run of rounds
-        monkeypatch.setattr(rounds, "geman_mcclure", loss)
-        return found
-
-    monkeypatch.setattr(Observations, "squared", seen)
-    monkeypatch.setattr(rounds, "geman_mcclure", watched)
-    monkeypatch.setattr(rounds, "_robust", ended)
-    options = AdjustOptions(noise_floor=0.0, min_convergence=0.01, drift=0)
-    adjust_tracks(made.views, made.tracks, options, centers=centers_of(made))
-    assert scales[0] > 5 * scales[-1]
-    assert 3.0 * noises[0] <= scales[-1] * 1.0001 <= 3.6001 * noises[0]
-    shrink = np.array(scales[1::2][1:]) / np.array(scales[1::2][:-1])
-    assert (shrink >= 0.2499).all()
-
-
 @pytest.mark.parametrize(
     ("strong", "spread", "alt", "sigma"),
     [
@@ -594,18 +500,12 @@ def test_weak_tracks_are_held_to_the_altitude_of_the_others(strong, spread, alt,
     assert replace(heights, weak=np.zeros(strong + 2, dtype=bool)).hold(none, points).point_prior is None
 
 
-def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(case, monkeypatch):
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+def test_only_observations_of_known_points_are_looked_at_again_for_the_datum(case):
+    covariance = case.covariance
     report = gauge_report(covariance, case.points, case.points, np.ones(12, dtype=bool))
     asked: list[Any] = []
-    project = Cameras.project
-
-    def counted(self: Cameras, params: Any, ecef: Any, bounds: Any) -> Any:
-        asked.append(ecef.shape[1])
-        return project(self, params, ecef, bounds)
-
-    monkeypatch.setattr(Cameras, "project", counted)
-    given = covariance, report.by_unknown, case.problem, _state(case), case.weight
+    cameras: Any = SimpleNamespace(seeing=lambda xy: asked.append(xy.shape[1]) or case.problem.cameras.seeing(xy))
+    given = covariance, report.by_unknown, replace(case.problem, cameras=cameras), case.state, case.weight
     shares = datum_shares(*given, (12, 12))
     assert not asked
     assert shares["gcps"].max() == shares["fixed_views"].max() == shares["reference"].max() == 0.0
@@ -625,9 +525,9 @@ def test_the_shares_of_the_datum_are_what_each_row_pays_of_the_cheapest_move(fix
     jacobian = case.plain.jacobian(case.params, case.points)[:, free]
     size = int(case.problem.free.sum())
     use = np.ones(12, dtype=bool)
-    covariance = Minimum(_state(case), case.reduced).covariance(case.problem.free)
+    covariance = case.covariance
     report = gauge_report(covariance, case.points, case.points, use)
-    found = datum_shares(covariance, report.by_unknown, case.problem, _state(case), case.weight, (10, known))
+    found = datum_shares(covariance, report.by_unknown, case.problem, case.state, case.weight, (10, known))
 
     middle = case.points.mean(axis=0)
     enu = enu_of(*ground_of(middle)[:2])

@@ -193,13 +193,6 @@ def test_axes_are_those_of_the_covariance_the_largest_first() -> None:
     assert spread[0] > spread[1] > 0
 
 
-def test_a_small_part_of_an_image_has_one_observation_the_first() -> None:
-    xy = np.array([[0.0, 31.0, 40.0, 1600.0, 20.0, 1599.9], [0.0, 31.0, 10.0, 3200.0, 150.0, 3199.0]])
-    unused = CheckTies(np.zeros(6, dtype=int), xy, xy, np.arange(6.0))
-    found = scan._thinned(unused, np.array([1600.0, 3200.0]))  # parts of 50 by 100
-    assert sorted(found.deviation.tolist()) == [0.0, 3.0, 4.0]
-
-
 def test_the_variance_of_a_place_s_mean_is_that_of_its_parts_its_own_mean_taken_off() -> None:
     rng = np.random.default_rng(2)
     n = 90

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from barpc.ba import resection
-from barpc.ba.resection import Placed, _median_length, _Sight, diagnose_rpc, median_noise, retained_tracks
+from barpc.ba.resection import Placed, _Sight, diagnose_rpc, median_noise, retained_tracks
 from barpc.base.geodesy import ecef_from_ground, enu_basis
 from tests.distributions import chi2
 
@@ -24,9 +24,6 @@ def placed(left: np.ndarray, noise: float = 1.0, squared: np.ndarray | None = No
 
 def test_the_median_of_squares_of_two_coordinates_is_one_where_they_are_as_stated() -> None:
     assert median_noise(9.0 * chi2.ppf((np.arange(999) + 0.5) / 999, 2)) == pytest.approx(3.0, rel=1e-6)
-    length = np.stack([[3.0, 6.0, 30.0, np.nan], [4.0, 8.0, 40.0, 0.0]])
-    assert _median_length(length) == pytest.approx(30.0)  # of 5, 10, 50 and what is none
-    assert _median_length(length[:, 2:]) == np.inf
 
 
 @pytest.mark.parametrize(("size", "far"), [(3.99, False), (4.01, True)])
@@ -135,6 +132,11 @@ def test_a_view_that_sees_nothing_stays_where_it_is() -> None:
         (lambda image, up: image[::-1], (None, None, True, False)),
         (lambda image, up: image + 0.9, (None, None, False, True)),
         (lambda image, up: image + 40.0 * np.sin(XY / 40.0), (None, None, False, False)),
+        # half may be seen nowhere, and no more
+        *(
+            (lambda image, up, k=k: np.where(np.arange(80) < k, np.nan, image + 40.0), found)
+            for k, found in ((39, ((40.0, 40.0), None, False, False)), (41, (None, None, False, False)))
+        ),
     ],
 )
 def test_what_would_make_an_rpc_as_good_as_stated_is_said(change, expected) -> None:

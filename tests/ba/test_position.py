@@ -15,20 +15,11 @@ from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
 from barpc.report import Run, summarize
 from barpc.report.records import json_form
-from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.triangulation import triangulate
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.ba.conftest import centers_of
+from tests.ba.conftest import centers_of, seen
+from tests.ba.test_uncertainty import _divided
 from tests.lanes import rest_slow
-
-
-def seen(given: Tracks | GroundPoints, ground: np.ndarray, sensors: list, seed: int, noise: float = 0.05):
-    """The observations where sensors show ground points (P, 3), with noise [px]."""
-    xy = np.random.default_rng(seed).normal(0.0, noise, given.xy.shape)
-    for v, sensor in enumerate(sensors):
-        rows = given.view == v
-        xy[rows] += sensor.project(ground[given.point[rows]])
-    return replace(given, xy=xy)
 
 
 def right_cameras(num_tracks: int, num_gcps: int) -> SimulatedBlock:
@@ -105,11 +96,8 @@ def test_list_table_verdict_and_summary_say_one_figure_of_a_motion() -> None:
 @pytest.mark.slow
 def test_an_image_that_is_added_makes_no_motion_less_known(tmp_path) -> None:
     """Its ties with the one view that it resembles are another scene, which is tilted more easily."""
-    block, centers = simulate_block(4, 600, seed=4, per_site=4), None
-    centers, tracks = centers_of(block), block.tracks
-    last = np.zeros(tracks.num_points, dtype=int)
-    np.maximum.at(last, tracks.point, tracks.view)
-    old, new = (tracks.select(last[tracks.point] < 3), tracks.select(last[tracks.point] == 3))
+    block = simulate_block(4, 600, seed=4, per_site=4)
+    centers, (old, new, _) = centers_of(block), _divided(block, 3)
     few = np.isin(new.view, (2, 3)) | np.isin(new.point, np.unique(new.point)[:8])
     first = adjust_tracks(block.views[:3], old, AdjustOptions(), centers=centers[:3])
     block_prior(first).save(tmp_path / "prior.npz")

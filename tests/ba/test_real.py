@@ -6,6 +6,8 @@ The check points never enter a solve.
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,35 +16,59 @@ import rasterio
 
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.base.errors import BarpcWarning
-from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.geodesy import enu_basis, ground_from_ecef
 from barpc.pointio.gcps import read_gcps
 from barpc.rasters.dem import Dem
 from barpc.rpcio import read_rpc
 from barpc.scene import GroundPoints, Tracks, View
+from barpc.sensor import SensorModel
 from barpc.sensor.rpc import altitude_range
 from barpc.sensor.triangulation import epipolar_offset, triangulate
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 
-TRIPLET = [("img_01", "img_02"), ("img_01", "img_03"), ("img_02", "img_03")]
 
+@dataclass(frozen=True)
+class Delivered:
+    """Views as delivered, their tie points, and check points of every pair."""
 
-def _table(shared: Path, scene: str, pair: tuple[str, str], kind: str) -> np.ndarray:
-    path = shared / "truth" / "ties" / f"{scene}__{pair[0]}__{pair[1]}__{kind}.csv"
-    rows = np.loadtxt(path, delimiter=",", skiprows=1)[:, :4]
-    return rows.reshape(-1, 2, 2)
+    views: list[View]
+    folder: Path
+    scene: str
 
+    def matches(self, kind: str) -> dict[tuple[int, int], np.ndarray]:
+        """Points (n, 2, 2) in both images of each pair."""
+        names, start = [view.name for view in self.views], self.folder / "truth" / "ties"
+        paths = {(a, b): start / f"{self.scene}__{names[a]}__{names[b]}__{kind}.csv"
+                 for a, b in combinations(range(len(names)), 2)}  # fmt: skip
+        tables = {pair: np.loadtxt(path, delimiter=",", skiprows=1) for pair, path in paths.items()}
+        return {pair: rows[:, :4].reshape(-1, 2, 2) for pair, rows in tables.items()}
 
-def _pairs(shared: Path, scene: str, pairs, names, kind: str) -> Tracks:
-    view, point, xy, count = [], [], [], 0
-    for pair in pairs:
-        rows = _table(shared, scene, pair, kind)
-        view += [np.tile([names.index(name) for name in pair], len(rows))]
-        point += [count + np.repeat(np.arange(len(rows)), 2)]
-        xy += [rows.reshape(-1, 2)]
-        count += len(rows)
-    view = np.concatenate(view)
-    return Tracks(view, np.concatenate(point), np.concatenate(xy), np.full(len(view), 0.3))
+    def tracks(self, kind: str = "sift") -> Tracks:
+        found = self.matches(kind)
+        view, xy = (np.concatenate(each) for each in zip(*(
+            (np.tile(pair, len(rows)), rows.reshape(-1, 2)) for pair, rows in found.items()
+        ), strict=True))  # fmt: skip
+        return Tracks(view, np.repeat(np.arange(len(view) // 2), 2), xy, np.full(len(view), 0.3))
+
+    def adjusted(self, *options: AdjustOptions, dem: Dem | None = None) -> Adjustment:
+        return adjust_tracks(self.views, self.tracks(), *options, dem=dem)
+
+    def offsets(self, found: Adjustment) -> list[np.ndarray]:
+        """Of check points from epipolar lines [px], of each pair."""
+        return [
+            epipolar_offset(found.sensors[a], found.sensors[b], rows[:, 0], rows[:, 1], 300.0)[0]
+            for (a, b), rows in self.matches("ncc_check").items()
+        ]
+
+    def shift(self, found: Adjustment) -> np.ndarray:
+        """How far check points went, east, north, up [m]."""
+        checks = self.tracks("ncc_check")
+        before, after = (
+            triangulate(list(sensors), checks.view, checks.point, checks.xy).points
+            for sensors in ([view.sensor for view in self.views], found.sensors)
+        )
+        return enu_basis(ground_from_ecef(before[0])) @ np.nanmean(after - before, axis=0)
 
 
 def _view(path: Path, rpc, size) -> View:
@@ -50,50 +76,44 @@ def _view(path: Path, rpc, size) -> View:
 
 
 @pytest.fixture(scope="module")
-def triplet(shared_data) -> list[View]:
+def triplet(shared_data) -> Delivered:
     folder = shared_data / "optical" / "phr_triplet_north"
     sizes = {"img_01": (1024, 560), "img_02": (1028, 530), "img_03": (1021, 490)}
-    return [_view(folder / f"{n}.tif", read_rpc(folder / f"{n}.tif"), size) for n, size in sizes.items()]
+    views = [_view(folder / f"{n}.tif", read_rpc(folder / f"{n}.tif"), size) for n, size in sizes.items()]
+    return Delivered(views, shared_data, folder.name)
 
 
 @pytest.fixture(scope="module", params=rest_slow(["right_image", "right_image_bias"]))
-def ventoux(shared_data, request) -> list[View]:
+def ventoux(shared_data, request) -> Delivered:
     folder = shared_data / "optical" / "phr_ventoux"
     left = read_rpc(folder / "left_image.geom").crop(5000, 5000)
     right = read_rpc(folder / f"{request.param}.geom").crop(4915, 5162)
-    return [
-        _view(folder / "left_image.tif", left, (500, 500)),
-        _view(folder / "right_image.tif", right, (498, 495)),
-    ]
+    images = ("left_image", left, (500, 500)), ("right_image", right, (498, 495))
+    return Delivered([_view(folder / f"{n}.tif", rpc, size) for n, rpc, size in images], shared_data, folder.name)
 
 
-def _offsets(shared, found: Adjustment, scene, pairs) -> list[np.ndarray]:
-    sensors = dict(zip(found.names, found.sensors, strict=True))
-    out = []
-    for pair in pairs:
-        rows = _table(shared, scene, pair, "ncc_check")
-        out.append(epipolar_offset(sensors[pair[0]], sensors[pair[1]], rows[:, 0], rows[:, 1], 300.0)[0])
-    return out
+@pytest.fixture(scope="module")
+def quickbird(shared_data) -> tuple[View, GroundPoints]:
+    """One image and its GCPs."""
+    path = shared_data / "optical" / "qb2_single" / "qb2_basic1b.tif"
+    view = _view(path, read_rpc(path), (850, 1450))
+    return view, read_gcps(path.parent / "gcps.geojson", [view.name])
 
 
-def _shift(views, found: Adjustment, checks: Tracks) -> np.ndarray:
-    before = triangulate([v.sensor for v in views], checks.view, checks.point, checks.xy).points
-    after = triangulate(list(found.sensors), checks.view, checks.point, checks.xy).points
-    enu = enu_basis(ground_from_ecef(before[0]))
-    return enu @ np.nanmean(after - before, axis=0)
+def refined(view: View, gcps: GroundPoints) -> SensorModel:
+    """One camera, by control points alone."""
+    none = np.zeros(0, dtype=int)
+    return adjust_tracks([view], Tracks(none, none, np.zeros((0, 2)), np.zeros(0)), None, gcps).sensors[0]
 
 
 @pytest.mark.slow
-def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
-    names = [view.name for view in triplet]
-    tracks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "sift")
-    checks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "ncc_check")
-    capped = adjust_tracks(triplet, tracks, AdjustOptions(noise_floor=0.1))
-    assert np.abs(_shift(triplet, capped, checks)).max() <= 0.1
-    found = adjust_tracks(triplet, tracks)
-    for offset in _offsets(shared_data, found, "phr_triplet_north", TRIPLET):
+def test_the_triplet_agrees_and_stays_where_it_was(triplet):
+    capped = triplet.adjusted(AdjustOptions(noise_floor=0.1))
+    assert np.abs(triplet.shift(capped)).max() <= 0.1
+    found = triplet.adjusted()
+    for offset in triplet.offsets(found):
         assert abs(np.median(offset)) <= 0.03
-    shift = _shift(triplet, found, checks)
+    shift = triplet.shift(found)
     # metres, from detector points: 0.45 up, where 67 are not known; a metre is what is trusted
     assert np.abs(shift).max() <= 0.5
     assert np.abs(shift[:2]).max() <= 0.15
@@ -102,56 +122,34 @@ def test_the_triplet_agrees_and_stays_where_it_was(shared_data, triplet):
 
 
 @pytest.mark.slow
-def test_without_a_cap_many_points_move_the_scene_by_metres(shared_data, triplet):
-    names = [view.name for view in triplet]
-    tracks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "sift")
-    checks = _pairs(shared_data, "phr_triplet_north", TRIPLET, names, "ncc_check")
-    found = adjust_tracks(triplet, tracks, AdjustOptions(noise_floor=0.0))
-    assert np.abs(_shift(triplet, found, checks)).max() > 2.0
+def test_without_a_cap_many_points_move_the_scene_by_metres(triplet):
+    found = triplet.adjusted(AdjustOptions(noise_floor=0.0))
+    assert np.abs(triplet.shift(found)).max() > 2.0
 
 
-def test_ventoux_agrees_and_stays_where_it_was(shared_data, ventoux):
-    pairs = [("left_image", "right_image")]
-    names = [view.name for view in ventoux]
-    tracks = _pairs(shared_data, "phr_ventoux", pairs, names, "sift")
-    checks = _pairs(shared_data, "phr_ventoux", pairs, names, "ncc_check")
-    found = adjust_tracks(ventoux, tracks)
-    (offset,) = _offsets(shared_data, found, "phr_ventoux", pairs)
+def test_ventoux_agrees_and_stays_where_it_was(ventoux):
+    found = ventoux.adjusted()
+    (offset,) = ventoux.offsets(found)
     assert abs(np.median(offset)) <= 0.10
-    assert np.abs(_shift(ventoux, found, checks)).max() <= 1.0
+    assert np.abs(ventoux.shift(found)).max() <= 1.0
 
 
-def test_one_quickbird_image_is_refined_by_its_gcps(shared_data):
-    path = shared_data / "optical" / "qb2_single" / "qb2_basic1b.tif"
-    view = _view(path, read_rpc(path), (850, 1450))
-    gcps = read_gcps(path.parent / "gcps.geojson", [view.name])
-    before = view.sensor.project(gcps.lonlatalt) - gcps.xy
-    none = np.zeros(0, dtype=int)
-    found = adjust_tracks([view], Tracks(none, none, np.zeros((0, 2)), np.zeros(0)), None, gcps)
-    after = found.sensors[0].project(gcps.lonlatalt) - gcps.xy
+def test_one_quickbird_image_is_refined_by_its_gcps(quickbird):
+    view, gcps = quickbird
+    before, after = (sensor.project(gcps.lonlatalt) - gcps.xy for sensor in (view.sensor, refined(view, gcps)))
     assert np.sqrt((before**2).mean()) > 1.0
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
 
 
 @pytest.mark.slow
-def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
-    path = shared_data / "optical" / "qb2_single" / "qb2_basic1b.tif"
-    view = _view(path, read_rpc(path), (850, 1450))
-    gcps = read_gcps(path, [view.name])
-    none = np.zeros(0, dtype=int)
-    empty = Tracks(none, none, np.zeros((0, 2)), np.zeros(0))
-    before, after = [], []
-    for left_out in range(len(gcps.names)):
-        keep = np.arange(len(gcps.names)) != left_out
-        rest = GroundPoints(
-            tuple(np.array(gcps.names)[keep]), gcps.lonlatalt[keep], gcps.sigma[keep], np.arange(keep.sum()),
-            gcps.view[keep], gcps.xy[keep], gcps.xy_sigma[keep],
-        )  # fmt: skip
-        found = adjust_tracks([view], empty, None, rest)
-        for sensor, rows in ((view.sensor, before), (found.sensors[0], after)):
-            rows.append(sensor.project(gcps.lonlatalt[left_out]) - gcps.xy[left_out])
+def test_a_gcp_that_was_left_out_lies_nearer_than_before(quickbird):
+    view, _ = quickbird
+    gcps = read_gcps(view.path, [view.name])
+    before, after = view.sensor.project(gcps.lonlatalt) - gcps.xy, []
+    for left_out in range(5):
+        sensor = refined(view, gcps.select(np.arange(5) != left_out))
+        after.append(sensor.project(gcps.lonlatalt[left_out]) - gcps.xy[left_out])
     assert np.sqrt(np.mean(np.square(after))) < np.sqrt(np.mean(np.square(before)))
-    assert ecef_from_ground(gcps.lonlatalt).shape == (5, 3)
 
 
 @pytest.mark.landing(1)
@@ -160,10 +158,6 @@ def test_a_gcp_that_was_left_out_lies_nearer_than_before(shared_data):
 @pytest.mark.parametrize("with_geoid", [True, False])
 def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data, ventoux, with_geoid, tmp_path):
     """Also one that does not say what its heights count from: the tile's without its name."""
-    names = [view.name for view in ventoux]
-    pairs = [("left_image", "right_image")]
-    tracks = _pairs(shared_data, "phr_ventoux", pairs, names, "sift")
-    checks = _pairs(shared_data, "phr_ventoux", pairs, names, "ncc_check")
     path = shared_data / "dem/N44E005.hgt"
     if not with_geoid:
         with rasterio.open(path) as tile:
@@ -172,9 +166,8 @@ def test_a_dem_that_holds_ventoux_moves_it_by_no_more_than_is_stated(shared_data
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BarpcWarning)
         dem = Dem.open(path, shared_data / "dem/egm96_15.gtx" if with_geoid else None)
-    found = adjust_tracks(ventoux, tracks, AdjustOptions(), dem=dem)
-    free = adjust_tracks(ventoux, tracks, AdjustOptions())
-    moved = _shift(ventoux, found, checks)
+    found, free = ventoux.adjusted(dem=dem), ventoux.adjusted()
+    moved = ventoux.shift(found)
     assert np.linalg.norm(moved[:2]) < 7.0  # with errors that average away it was 15 m
     assert (np.abs(moved) < 2.5 * free.gauge.sigma).all()
     together = 5.0 if with_geoid else 18.0  # 5 or 20 m, as it is known what the heights count from

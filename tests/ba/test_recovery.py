@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import starmap
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks, check_residuals, split_points
-from barpc.ba.robust.weights import Observations
-from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, DisconnectedError, InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import Tracks
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
-from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, solve
-from tests.constants import chosen
+from tests.ba.conftest import INDEPENDENT, centers_of, least_squares, of_noise_as_stated, solve
 from tests.lanes import known, rest_slow
 
 EVERY = {"hold_out": False}
@@ -93,8 +90,7 @@ PLACES = [(5.4, 43.3), (5.0, 0.0), (0.0, 51.0), (90.0, 30.0), (180.0, 10.0), (30
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("views", "tracks", "places"),
-    [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)],
+    ("views", "tracks", "places"), [(4, 500, PLACES[4:]), pytest.param(10, 1500, PLACES, marks=pytest.mark.slow)]
 )
 def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, places):
     for lon, lat in places:
@@ -110,14 +106,11 @@ def test_the_cost_is_optimal_wherever_on_earth_the_scene_lies(views, tracks, pla
 
 @pytest.mark.parametrize(
     ("size", "solver"),
-    [
-        ("small", "auto"),
-        *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse")),
-    ],
+    [("small", "auto"), *(pytest.param("block", solver, marks=pytest.mark.slow) for solver in ("auto", "sparse"))],
 )
 def test_an_adjustment_takes_few_linearisations_from_metres_away(request, size, solver):
     block = request.getfixturevalue(size)
-    with mock.patch.object(Observations, "noise", return_value=1.0), chosen(AdjustOptions, robust_threshold=99.0):
+    with of_noise_as_stated():
         found, tight = (solve(block, **EVERY, solver=solver, **more) for more in ({}, {"tolerance": 1e-14}))
     assert found.steps <= {"auto": 5, "sparse": 4}[solver]  # two passes: the second with priors that have learnt
     assert block.held_out_rms([v.sensor for v in block.views]) > 100 * block.held_out_rms(list(found.sensors))
@@ -128,16 +121,11 @@ def test_an_adjustment_takes_few_linearisations_from_metres_away(request, size, 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("views", "bounds", "seeds"),
-    [
-        (3, {0.10: 1.15, 0.25: 1.60, 0.40: 2.00}, (1, 2)),
-        pytest.param(3, {0.10: 1.15, 0.25: 1.60, 0.40: 2.00}, range(1, 6), marks=pytest.mark.nightly),
-        pytest.param(10, {0.10: 1.15, 0.25: 1.50, 0.40: 2.00}, range(1, 6), marks=pytest.mark.nightly),
-    ],
+    ("views", "bounds"), [(3, {0.10: 1.15, 0.25: 1.60, 0.40: 2.00}), (10, {0.10: 1.15, 0.25: 1.50, 0.40: 2.00})]
 )
-def test_outliers_cost_little(views, bounds, seeds):
+def test_outliers_cost_little(views, bounds):
     rms = {part: [] for part in (0.0, *bounds)}
-    for seed in seeds:
+    for seed in range(1, 6):
         for part in rms:
             dirty = simulate_block(views, 3000, seed=seed, outliers=part)
             found = solve(dirty, drift=0, hold_out=False)
@@ -147,14 +135,6 @@ def test_outliers_cost_little(views, bounds, seeds):
     clean = np.sqrt(np.mean(np.square(rms[0.0])))
     for part, bound in bounds.items():
         assert np.sqrt(np.mean(np.square(rms[part]))) <= bound * clean, (part, rms)
-
-
-@pytest.mark.slow
-def test_a_fixed_view_keeps_its_camera_and_the_others_come_to_it(block):
-    fixed = block.views[4].name
-    found = solve(block, fixed=(fixed,))
-    assert not found.params[4].any()
-    assert block.held_out_rms(list(found.sensors)) < 0.02
 
 
 @pytest.mark.slow
@@ -179,14 +159,6 @@ def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
     assert plain.params.shape[1] == 6
 
 
-@pytest.mark.slow
-def test_a_drift_is_followed_where_the_model_has_one():
-    drifting = simulate_block(4, 300, seed=1, drift=20e-6)
-    plain, found = (solve(drifting, drift=drift, jitter="off", **EVERY) for drift in (0, 1))
-    assert drifting.held_out_rms(list(plain.sensors)) > 1.0
-    assert 0.005 < drifting.held_out_rms(list(found.sensors)) < 0.05
-
-
 @pytest.mark.parametrize(
     ("model", "bound"),
     [
@@ -204,8 +176,7 @@ def test_image_models_correct_what_they_can(model, bound):
 @pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("tracks", "seeds"),
-    rest_slow(starmap(pytest.param, [(50, range(3)), (50, range(3, 6)), (600, range(6))])),
+    ("tracks", "seeds"), rest_slow(starmap(pytest.param, [(50, range(3)), (50, range(3, 6)), (600, range(6))]))
 )
 def test_three_gcps_bring_the_scene_to_its_place(tracks, seeds):
     errors, sigmas = [], []
@@ -234,9 +205,6 @@ def test_three_gcps_bring_the_scene_to_its_place(tracks, seeds):
 def test_check_points_stay_out_of_the_solve_and_measure_it():
     triplet = simulate_block(3, 600, seed=2, num_gcps=12)
     control, check = split_points(triplet.gcps, triplet.gcps.names[6:])
-    assert set(control.names).isdisjoint(check.names)
-    assert len(control.names) == len(check.names) == 6
-    assert len(control.view) + len(check.view) == len(triplet.gcps.view)
     centers = centers_of(triplet)
     found = adjust_tracks(triplet.views, triplet.tracks, AdjustOptions(**INDEPENDENT), control, centers=centers)
     before = check_residuals([view.sensor for view in triplet.views], check).rms()
@@ -300,13 +268,8 @@ def test_a_dem_holds_the_height_of_the_scene():
     block = simulate_block(3, 600, seed=8, alt_range=(200.0, 201.0))
     options = AdjustOptions(**{**INDEPENDENT, "dem_sigma": 2.0, "dem_bias_sigma": 0.3})
     free = solve(block)
-    held = adjust_tracks(
-        block.views,
-        block.tracks,
-        options,
-        dem=lambda lon, lat: np.full(len(lon), 200.5),
-        centers=centers_of(block),
-    )
+    level = lambda lon, lat: np.full(len(lon), 200.5)  # noqa: E731
+    held = adjust_tracks(block.views, block.tracks, options, dem=level, centers=centers_of(block))
     truth = ecef_from_ground(block.truth.ground)
     up = enu_basis(block.truth.ground)[0, 2]
     error = [abs(np.nanmean((found.points - truth) @ up)) for found in (free, held)]
@@ -314,32 +277,23 @@ def test_a_dem_holds_the_height_of_the_scene():
     assert held.gauge.sigma[2] < 0.5 < free.gauge.sigma[2]
 
 
-def test_tracks_under_a_small_angle_are_held_and_said_to_be():
-    block = simulate_block(3, 300, seed=8)
-    with pytest.warns(BarpcWarning, match="constrained in height"):
-        found = solve(block, min_convergence=90.0, hold_out=False)
-    assert found.held.all()
-    assert np.isfinite(found.params).all()
-
-
-def test_groups_without_common_tie_points_are_named(block):
-    tracks = block.tracks
-    split = tracks.select((tracks.view < 5) == (tracks.view[np.searchsorted(tracks.point, tracks.point)] < 5))
+@pytest.mark.filterwarnings("ignore:.*constrained in height")
+@pytest.mark.parametrize("count", [1, 5])
+def test_groups_without_common_tie_points_are_named(block, count):
+    """What some views and the others see of a track are two."""
+    _, point = np.unique(2 * block.tracks.point + (block.tracks.view < count), return_inverse=True)
+    split = replace(block.tracks, point=point)
     with pytest.raises(DisconnectedError) as caught:
         adjust_tracks(block.views, split, centers=centers_of(block))
-    assert sorted(len(group) for group in caught.value.groups) == [5, 5]
+    assert sorted(len(group) for group in caught.value.groups) == [count, 10 - count]
     options = AdjustOptions(min_convergence=0.01)
     with pytest.warns(BarpcWarning, match="keep their cameras"):
         found = adjust_tracks(block.views, split, options, centers=centers_of(block), keep_largest=True)
-    assert len(found.left_out) == 5
-    left = [found.names.index(name) for name in found.left_out]
+    assert len(found.left_out) == count
+    left = np.isin(found.names, found.left_out)
     assert np.abs(found.params[left]).max() < 1e-9
-
-
-def test_a_view_with_too_few_points_is_named(block):
-    few = block.tracks.select(block.tracks.view != 3)
-    with pytest.raises(TiePointError, match=r"view_0003 \(0\)"):
-        adjust_tracks(block.views, few, centers=centers_of(block))
+    assert not found.inlier[left[split.view]].any()
+    assert np.abs(found.params[~left]).max() > 0.1  # the others go on
 
 
 def test_contradictions_are_refused(block):
@@ -355,10 +309,6 @@ def test_contradictions_are_refused(block):
         adjust_tracks((block.views[0], alike, *block.views[2:]), tracks, centers=centers_of(block))
     with pytest.raises(InputError, match="no view is named"):
         adjust_tracks(block.views, tracks, AdjustOptions(fixed=("nobody",)), centers=centers_of(block))
-    with pytest.raises(InputError, match="not one of"):
-        AdjustOptions(model="magic")
-    with pytest.raises(InputError, match="needs a model with a rotation"):
-        AdjustOptions(model="shift", drift=1)
 
 
 def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
@@ -368,6 +318,7 @@ def test_rows_of_tracks_may_come_in_any_order(block, adjusted):
     found = adjust_tracks(block.views, mixed, AdjustOptions(**INDEPENDENT), centers=centers_of(block))
     np.testing.assert_allclose(found.params, adjusted.params, atol=1e-4)
     np.testing.assert_allclose(found.residuals, adjusted.residuals[order], atol=1e-4)
+    np.testing.assert_array_equal(found.held_out, adjusted.held_out[order])
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import pytest
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.constraints.ground import MAX_INDEPENDENT_ERRORS, reference_control
-from barpc.ba.parameters.priors import prior_sigmas
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
 from barpc.scene import GroundPoints, Reference
 from barpc.simulate import simulate_block
@@ -116,12 +115,3 @@ def test_common_errors_are_the_terrain_s_the_orthoimage_s_and_what_stands_on_it(
             assert not np.delete(prior.common[:, :, column], axis, axis=1).any()
     edge = np.abs(prior.common[:, 2, 1:3]).max(axis=0) * up
     assert edge == pytest.approx([BIAS[2], BIAS[2]], rel=1e-6)
-
-
-def test_a_camera_that_is_known_to_be_off_is_not_held_to_what_it_states(block):
-    stated = prior_sigmas(block.views, AdjustOptions(), 0, None, 0)
-    off = np.array([60.0, 1.0, np.nan])
-    found = prior_sigmas(block.views, AdjustOptions(), 0, off, 0)
-    assert found[0] == pytest.approx(60.0)
-    assert found[1:] == pytest.approx(stated[1:])
-    assert prior_sigmas(block.views, AdjustOptions(sigma_attitude=2.0), 0, off, 0)[0, :3] == pytest.approx(2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from barpc.ba.constraints.terrain import (
     variance_inflation,
     without_outliers,
 )
-from barpc.base.geodesy import enu_basis, ground_from_ecef
+from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.rasters.dem import Dem
 from barpc.simulate import simulate_block
 from benchmarks.worlds import judge
@@ -233,12 +234,18 @@ def test_what_contradicts_the_cameras_is_let_go_and_the_rest_is_not() -> None:
 
 
 def test_a_dem_of_a_known_datum_is_wrong_together_by_less() -> None:
-    def bias(dem: Any, **options: Any) -> float:
-        none = np.zeros(0, dtype=bool)
-        heights = PointConstraints((), none, np.zeros(0, dtype=np.int64), (0.0, 1.0), AdjustOptions(**options), dem)
-        return heights._bias
+    class Level(Dem):
+        def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+            return np.full(len(lon), ALT)
 
-    known, unknown = (Dem(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
+    def bias(dem: Any, **options: Any) -> float:
+        every = np.ones(9, dtype=bool)
+        heights = PointConstraints((), every, np.arange(9), (0.0, 1.0), AdjustOptions(**options), dem)
+        found = heights.test(ecef_from_ground(points(9)), every)
+        assert found is not None
+        return found.bias
+
+    known, unknown = (Level(None, None, "", known) for known in (True, False))  # type: ignore[arg-type]
     assert (bias(known), bias(unknown), bias(lambda lon, lat: lon)) == (5.0, 20.0, 20.0)
     assert bias(known, dem_bias_sigma=0.7) == 0.7
 
@@ -308,36 +315,25 @@ def test_a_wrong_dem_neither_bends_nor_moves_a_scene(seed: int, kind: str) -> No
 
 def test_heights_between_the_same_posts_are_no_independent_ones() -> None:
     """A DEM of wide posts has as many heights as posts under the points."""
-    rng = np.random.default_rng(0)
-    at = rng.uniform(0.0, 2000.0, (400, 2))
-    ground = np.column_stack([5.0 + at[:, 0] / 80e3, 44.0 + at[:, 1] / 111e3, np.zeros(400)])
-    ground[:, 2] = 300.0 + 40.0 * np.sin(at[:, 0] / 130.0) + 30.0 * np.cos(at[:, 1] / 110.0)
 
+    @dataclass
     class Posts:
-        def __init__(self, step: float) -> None:
-            self.step = step
+        step: float
 
         def __call__(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-            east, north = (np.asarray(lon) - 5.0) * 80e3, (np.asarray(lat) - 44.0) * 111e3
-            return 300.0 + 40.0 * np.sin(east / 130.0) + 30.0 * np.cos(north / 110.0)
+            return sum_of(HILLS)(lon, lat)
 
         def posts(self, lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-            col, row = np.floor((lon - 5.0) * 80e3 / self.step), np.floor((lat - 44.0) * 111e3 / self.step)
+            col, row = np.floor((np.stack([lon - LON, lat - LAT]) * UNIT[:, None] + SIDE / 2) / self.step)
             first = row * 1000.0 + col
             return np.stack([first, first + 1, first + 1000, first + 1001], axis=1)
 
-    every = np.arange(400)
-    noisy = ground + rng.normal(0.0, 1.0, (400, 1)) * [0.0, 0.0, 1.0]
-    found = {}
-    for step in (20.0, 400.0, 1000.0):
-        dem = Posts(step)
-        relief = Relief.of(dem, noisy, np.ones(400, dtype=bool), np.full(400, 0.3), 2.0)
-        told = believe(relief, every, noisy, 2.0)
-        assert told is not None
-        found[step] = told.alike
-    assert found[20.0] < 4.0  # some hundred posts
-    assert found[400.0] == pytest.approx(400 / 36, rel=0.15)
-    assert found[1000.0] == pytest.approx(400 / 9, rel=0.15)
+    noisy = points(400)
+    noisy[:, 2] += np.random.default_rng(0).normal(0.0, 1.0, 400)
+    fine, coarse, coarsest = (sure(judged(Posts(SIDE / cells), noisy, 2.0)).alike for cells in (100, 5, 2))
+    assert fine < 4.0  # some hundred posts
+    assert coarse == pytest.approx(400 / 36, rel=0.15)
+    assert coarsest == pytest.approx(400 / 9, rel=0.15)
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State
 from barpc.simulate import SimulatedBlock, simulate_block
 from tests.ba.conftest import centers_of, solve
-from tests.constants import Sized, chosen
 from tests.lanes import known
 
 CALM = {"drift": 0, "hold_out": False}
@@ -66,19 +65,6 @@ def test_rounds_go_on_until_the_noise_stands(clean) -> None:
     found = solve(replace(clean, tracks=tracks), **CALM)
     assert 2 <= int(found.status.split()[0]) <= 4
     assert found.noise == pytest.approx(5.0, rel=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("outliers", "looked"), [pytest.param(0.05, True, marks=pytest.mark.slow), (0.008, True), (0.004, False)]
-)
-def test_tracks_that_were_cut_are_looked_at_again_where_they_are_many(monkeypatch, outliers, looked) -> None:
-    again = seen(monkeypatch, rounds, "retriangulate_rejected")
-    dirty = simulate_block(3, 400, seed=5, outliers=outliers)
-    found = solve(dirty, **CALM)
-    assert 0.99 - 3 * outliers < found.inlier.mean() < 1.0
-    # before every pass but the first
-    assert len(again) == (int(found.status.split()[0]) - 1 if looked else 0)
 
 
 def test_a_view_that_lost_much_is_solved_again_from_an_agreement(clean, monkeypatch) -> None:
@@ -178,18 +164,6 @@ def test_residuals_settle_where_no_move_of_a_point_makes_them_smaller() -> None:
         whitened = (residual[:, rows] * weight[rows]).ravel()
         left = whitened - matrix @ np.linalg.lstsq(matrix, whitened, rcond=None)[0]
         np.testing.assert_allclose((settled[:, rows] * weight[rows]).ravel(), left, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_a_cut_that_changes_little_is_not_solved_again(sized: Sized) -> None:
-    dirty = simulate_block(3, 400, seed=5, outliers=0.1)
-    passes = []
-    for threshold, share in ((1.2, 0.0), (2.0, 0.0), (2.0, 0.2)):
-        sized(slight_cut=share)
-        with chosen(AdjustOptions, robust_threshold=threshold):
-            found = solve(dirty, **CALM)
-        passes.append(int(found.status.split()[0]))
-    assert passes == [6, 3, 2]  # no more than six, and never less than two
 
 
 @pytest.mark.nightly
@@ -376,7 +350,7 @@ def test_what_was_known_is_gone_on_with_where_the_unknowns_are_the_same(clean, s
     assert (first.goes_on, first.is_known, first.noise, first.misfit, first.passes) == (False, False, 1.0, 0.0, 0)
     np.testing.assert_array_equal(first.counted, tied(use & block.use))
     assert first.problem.camera_prior is problem.camera_prior
-    assert first.smooth._usable.all()
+    np.testing.assert_array_equal(first.observations.sigma, block.sigma)  # all ties count, for what is smooth, too
 
 
 @pytest.mark.parametrize("waves", [0.0, 6.0])

@@ -20,25 +20,24 @@ from tests.constants import Sized
 SIZE = (10000, 20000)
 
 
-def made(counts: tuple[int, ...], seed: int = 0) -> Smooth:
-    """Views of 10000 x 20000 px with so many observations each."""
+def made(counts: tuple[int, ...], at: np.ndarray | None = None) -> Smooth:
+    """Views of 10000 x 20000 px with so many observations each, anywhere or `at` columns and rows, -1 to 1."""
     n = len(counts)
     view = np.repeat(np.arange(n), counts)
     structure = make_structure(view, np.arange(len(view)), n, len(view))
     half = np.repeat(np.array(SIZE)[:, None] / 2.0, n, axis=1)
     unknowns = Unknowns("rotation", 0, np.zeros((n, 3)), np.ones(n), half - 0.5, half)
-    xy = np.random.default_rng(seed).uniform(0, 1, (2, len(view))) * np.array(SIZE)[:, None] - 0.5
+    xy = ((anywhere(len(view)) if at is None else at) + 1.0) * half[:, :1] - 0.5
     return Smooth(structure, xy, unknowns)
 
 
-def place(smooth: Smooth) -> tuple[np.ndarray, np.ndarray]:
-    """Col and row, -1 to 1."""
-    col, row = (smooth._place + 0.5) / np.array(SIZE)[:, None] * 2 - 1
-    return col, row
+def anywhere(count: int) -> np.ndarray:
+    """Columns and rows of observations, -1 to 1."""
+    return np.random.default_rng(0).uniform(0, 1, (2, count)) * 2 - 1
 
 
-def noise(smooth: Smooth, sigma: float, seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).normal(0, sigma, smooth._place.shape)
+def noise(count: int, sigma: float) -> np.ndarray:
+    return np.random.default_rng(1).normal(0, sigma, (2, count))
 
 
 def test_splines_reproduce_cubics_and_wiggle_a_dozen_times() -> None:
@@ -70,18 +69,17 @@ def test_splines_reproduce_cubics_and_wiggle_a_dozen_times() -> None:
 )  # fmt: skip
 def test_what_is_smooth_comes_back_and_what_scatters_does_not(shape) -> None:
     smooth = made((900, 700))
-    col, row = place(smooth)
+    col, row = anywhere(1600)
     wave = np.stack([0.4 * shape(col, row), -0.2 * shape(col, row)])
     weight = np.ones(1600)
     np.testing.assert_allclose(smooth.part(wave, weight), wave, atol=0.04)
-    left = noise(smooth, 0.1)
-    found = smooth.part(wave + left, weight) - wave
+    found = smooth.part(wave + noise(1600, 0.1), weight) - wave
     assert np.sqrt((found**2).mean()) < 0.03
 
 
 def test_each_observation_counts_by_its_weight() -> None:
     smooth = made((800,))
-    _, row = place(smooth)
+    _, row = anywhere(800)
     wave = np.stack([np.sin(3 * row), row**2])
     wrong = wave.copy()
     wrong[:, ::4] += 50.0
@@ -103,7 +101,7 @@ def test_each_observation_counts_by_its_weight() -> None:
 
 def test_rows_without_observations_go_on_as_their_neighbours() -> None:
     smooth = made((900,))
-    _, row = place(smooth)
+    _, row = anywhere(900)
     line = np.stack([1.0 + 2.0 * row, -row])
     weight = (np.abs(row - 0.2) > 0.35).astype(float)  # nothing is seen over a sixth of the image
     found = smooth.part(np.where(weight, line, 7.0), weight)
@@ -112,16 +110,11 @@ def test_rows_without_observations_go_on_as_their_neighbours() -> None:
 
 def test_beyond_the_image_the_edge_goes_on() -> None:
     """Observations may lie somewhat outside: they take no cubic with them."""
-    smooth = made((900,))
-    inside = place(smooth)
-    out = np.array([[-0.5, -4000, 14000, 5000, 5000], [-0.5, 3000, 3000, -6000, 29000]])
-    xy = np.hstack([smooth._place, out])
-    structure = make_structure(np.zeros(905, int), np.arange(905), 1, 905)
-    half = np.array(SIZE)[:, None] / 2.0
-    wide = Smooth(structure, xy, Unknowns("rotation", 0, np.zeros((1, 3)), np.ones(1), half - 0.5, half))
+    inside = anywhere(900)
+    out = np.array([[-1.0, -1.8, 1.8, 0.0, 0.0], [-1.0, -0.7, -0.7, -1.6, 1.9]])
     weight = np.r_[np.ones(900), np.zeros(5)]
     line = np.hstack([np.stack([2 * inside[0], -inside[1]]), np.zeros((2, 5))])
-    found = wide.part(line, weight)[:, 900:]
+    found = made((905,), np.hstack([inside, out])).part(line, weight)[:, 900:]
     np.testing.assert_allclose(found, [[-2, -2, 2, 0, 0], [1, 0.7, 0.7, 1, -1]], atol=0.03)
 
 
@@ -144,10 +137,10 @@ def test_a_view_needs_ten_observations_a_term() -> None:
 
 def test_noise_alone_leaves_nothing_and_a_wave_its_root_mean_square() -> None:
     smooth = made((1500, 1500, 1500, 100))
-    col, row = place(smooth)
+    col, row = anywhere(4600)
     first = smooth.structure.view == 0
     second = smooth.structure.view == 1
-    residual = noise(smooth, 0.2)
+    residual = noise(4600, 0.2)
     residual[0, first] += 0.3 * np.sin(5 * row[first])
     residual[1, second] += 0.3 * col[second]
     use = np.ones(len(row), dtype=bool)
@@ -175,9 +168,9 @@ def test_noise_alone_leaves_nothing_and_a_wave_its_root_mean_square() -> None:
 def test_the_significance_is_that_of_the_f_test() -> None:
     """Of the 36 coefficients of both coordinates, against what they leave."""
     smooth = made((400,) * 30)
-    _, row = place(smooth)
+    _, row = anywhere(12000)
     size = np.repeat(np.linspace(0, 0.2, 30), 400)
-    residual = noise(smooth, 0.3) + size * np.sin(5 * row)
+    residual = noise(12000, 0.3) + size * np.sin(5 * row)
     part = smooth.part(residual, np.ones(12000))
     explained, total = (smooth.structure.sum_views((x**2).sum(axis=0)[None])[:, 0] for x in (part, residual))
     value = (explained / 36) / ((total - explained) / (800 - 36))
@@ -194,10 +187,10 @@ def test_the_significance_is_that_of_the_f_test() -> None:
 def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: int) -> None:
     """Steps every hundredth of the image, of both signs."""
     smooth = made((4000, 4000))
-    along = place(smooth)[axis]
+    along = anywhere(8000)[axis]
     step = np.random.default_rng(5).choice([-1.0, 1.0], 101)[((along + 1) * 50).astype(int)]
     mine = smooth.structure.view == 0
-    residual = noise(smooth, 0.2)
+    residual = noise(8000, 0.2)
     residual[1, mine] += 0.15 * step[mine]
     use = np.ones(8000, dtype=bool)
     tested = smooth.test(residual, use)
@@ -206,7 +199,7 @@ def test_what_neighbours_share_is_found_though_it_is_no_smooth_function(axis: in
     assert found.shared[0] == pytest.approx(0.15, rel=0.15)
     assert found.shared[1] == 0.0
     for size, found in ((0.9, True), (3.0, False)):  # a mean product of 8 of its standard deviations, of 2
-        faint = 0.15 * step * mine + noise(smooth, 0.3 * size)
+        faint = 0.15 * step * mine + noise(8000, 0.3 * size)
         given = np.stack([0 * step, faint[1]])
         shared = smooth.test_neighbours(smooth.test(given, use), given, use, 1.0).shared
         assert (shared[0] > 0.0) == found  # else it may be chance
@@ -222,18 +215,16 @@ def test_terms_of_a_block_that_is_not_large_are_worked_out_once(
     monkeypatch.setattr(Smooth, "_terms", lambda self, rows: asked.append(rows) or terms(self, rows))
     smooth = made((300, 300))
     for _ in range(3):
-        smooth.part(noise(smooth, 0.1), np.ones(600))
+        smooth.part(noise(600, 0.1), np.ones(600))
     assert asked == [slice(0, 600)] if once else len(asked) >= 6
 
 
 def test_terms_that_observations_hardly_tell_apart_stay_small() -> None:
-    """All of a view in a narrower and narrower stripe of columns: its powers are nearly the same."""
-    smooth = made((400,))
-    for width in np.geomspace(1e-3, 1.0, 60):
-        smooth._kept[SPLINES] = 0.5 + width * smooth._col  # type: ignore[index]
-        for power in (2, 3):
-            smooth._kept[SPLINES + power - 1] = smooth._kept[SPLINES] ** power  # type: ignore[index]
-        found = smooth.part(noise(smooth, 0.1), np.ones(400))
+    """All of a view in a narrower and narrower stripe of columns, and in one: its powers are nearly the same."""
+    col, row = anywhere(400)
+    for width in (0.0, *np.geomspace(1e-3, 0.5, 60)):
+        smooth = made((400,), np.stack([0.5 + width * col, row]))
+        found = smooth.part(noise(400, 0.1), np.ones(400))
         assert np.sqrt((found**2).mean()) < 0.03
 
 

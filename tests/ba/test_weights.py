@@ -13,7 +13,6 @@ from barpc.ba.parameters.additional_parameters import AdditionalParameters
 from barpc.ba.parameters.priors import PointPrior
 from barpc.ba.robust import rounds
 from barpc.ba.robust.rounds import _robust
-from barpc.ba.robust.systematic_residuals import SPLINES
 from barpc.ba.robust.weights import MEDIAN, Observations, geman_mcclure
 from barpc.ba.solving.structure import make_structure
 from tests import distributions as stats
@@ -80,16 +79,24 @@ def test_points_of_a_reference_count_as_stated_whatever_the_noise_and_resemble_e
         assert weight[0, -1] == 0.0
 
 
-def test_the_floor_is_that_of_every_stretch_of_a_spline() -> None:
-    """What neighbours share averages away over as many stretches as there are unknowns in the image."""
+def test_tie_points_of_a_view_count_together_at_most_as_the_floor_says() -> None:
+    """That of every stretch of a spline: what neighbours share averages away over the unknowns of the image.
+
+    What a camera cannot follow is as good as fourteen errors of its own, of three pixels at most: more would loosen the
+    view that causes it.
+    """
     waves = AdditionalParameters(13)
     use = np.ones(14, dtype=bool)
+    use[3] = False
     for made, stretches in ((observations(0.3), 1), (observations(0.3, waves), waves.size)):
-        weight = made.weight(use, 1.0)[:TRACKS]
-        information = TRACKS / 0.1**2
-        assert (weight**2).sum() == pytest.approx(min(information, stretches / 0.3**2))
-    misfit = observations().weight(use, 1.0, np.array([2.0, 9.0])).reshape(2, 7)[:, :TRACKS]
-    np.testing.assert_allclose((misfit**2).sum(axis=1), [SPLINES / 2.0**2, SPLINES / 3.0**2])
+        weight = made.weight(use, 2.0).reshape(2, 7)
+        information = np.array([TRACKS - 1, TRACKS]) / 0.2**2
+        np.testing.assert_allclose((weight[:, :TRACKS] ** 2).sum(axis=1), np.minimum(information, stretches / 0.3**2))
+        np.testing.assert_allclose(weight[:, TRACKS], 1 / 0.2)  # control has no part in it
+        assert weight[0, 3] == 0.0
+    for floor in (0.0, 0.3):
+        weight = observations(floor).weight(use, 1.0, np.array([2.0, 9.0])).reshape(2, 7)[:, :TRACKS]
+        np.testing.assert_allclose((weight**2).sum(axis=1), 1 / (floor**2 + np.array([2.0, 3.0]) ** 2 / 14))
 
 
 @pytest.mark.parametrize(
@@ -198,13 +205,10 @@ def test_where_almost_nothing_is_far_off_there_is_nothing_to_be_careful_about(mo
 
 
 def test_a_few_that_fit_by_chance_are_no_noise(monkeypatch) -> None:
-    """Not below half of what is stated, nor below what the best fifth shows."""
+    """Not below half of what is stated."""
     *_, noise, counted = robust(monkeypatch, [0.01])
     assert noise == 0.5
     np.testing.assert_allclose(counted, 1.0, atol=2e-3)
-    best = np.sqrt(-np.log(0.8) / 0.2)  # the fifth part of such squares, over a fifth
-    *_, noise, _ = robust(monkeypatch, [30.0])
-    assert noise >= 30.0 * best * 0.99
 
 
 @pytest.mark.parametrize(("sigmas", "careful"), [(4.9, False), (5.1, True)])
