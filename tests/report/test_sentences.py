@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 
 from barpc.ba.constraints.ground import TerrainTest
+from barpc.ba.control.agreement import Agreement
 from barpc.ba.control.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
+from barpc.ba.terms.term import Finding
 from barpc.base.options import RunOptions
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
+from barpc.report.measures.block import explanations
 from barpc.report.outcome import Added, Run
-from barpc.report.quality_checks import control_reasons, held_lines
-from barpc.report.summary.block import ExplanationEntry
+from barpc.report.quality_checks import held_lines
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import enu, metres
 from barpc.report.verdict import block_verdict, view_status
@@ -39,7 +41,7 @@ def adjusted(**fields: Any) -> Any:
         "left_out": (), "names": NAMES, "noise": 1.0, "in_space_rms": None, "two_groups": (), "control": None,
         "deformed": None, "unseen": None, "findings": (), "left": (), "alike": np.full(3, 9.0),
         "reference_inlier": np.zeros(0, bool),
-        "prior": SimpleNamespace(odd=np.zeros(3, bool), scale=np.ones(3), drift_sigma=()),
+        "prior": a_prior(),
         "smooth": SmoothTest(np.zeros(3), np.ones(3), np.full(3, NO_NUMBER), np.zeros(3)),
         "held_out_noise": np.ones(3), "held_out_rms": np.full(3, 0.2), "held": np.zeros(9, bool), "terrain": None,
         "options": SimpleNamespace(drift=None, fixed=(), min_convergence=1.0, dem_sigma=2.0, sigma_attitude=7.5,
@@ -52,6 +54,11 @@ def adjusted(**fields: Any) -> Any:
         "apart": None, "altimetry": None, "cameras": SimpleNamespace(unknowns=SimpleNamespace(drift=1)),
     }  # fmt: skip
     return SimpleNamespace(**{**usual, **fields})
+
+
+def a_prior(scale: Any = (1.0, 1.0, 1.0), odd: Any = (0, 0, 0), perhaps: Any = None) -> Any:
+    """Accuracies of three cameras as stated, but for what is given."""
+    return SimpleNamespace(odd=np.array(odd, bool), scale=np.array(scale), drift_sigma=(), perhaps_odd=perhaps)
 
 
 def run_of(adjustment: Any = None, kind: str = "adjust", **fields: Any) -> Any:
@@ -224,8 +231,7 @@ def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, most, 
 
 def test_an_rpc_that_is_far_off_beside_the_others_is_asked_about():
     def advice(odd: list[int], name: str = "A") -> str:
-        marked = np.isin(np.arange(3), odd)
-        prior = SimpleNamespace(odd=marked, scale=np.array([7.0, 8.0, 9.0]), drift_sigma=())
+        prior = a_prior([7.0, 8.0, 9.0], np.isin(np.arange(3), odd))
         return view_status(a_view(name), run_of(adjusted(prior=prior)))["advice"]
 
     assert advice([0]) == (
@@ -288,22 +294,18 @@ def test_headlines_count_one_and_many():
 
 @pytest.mark.parametrize(("scales", "said_of"), [((2.0, 9.0, 9.0), False), ((2.1, 9.0, 9.0), True), ((), False)])
 def test_priors_are_doubted_where_every_camera_s_was_widened(scales, said_of):
-    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.array(scales), drift_sigma=(), perhaps_odd=None)
-    found = reasons(adjusted(prior=prior))
+    found = reasons(adjusted(prior=a_prior(scales)))
     assert bool(found) == said_of
     if said_of:
         assert "The stated sigmas were multiplied by 2.1 or more, and that of the position with them. Check" in found[0]
         assert "two images" not in found[0]
-        two = block_verdict(run_of(adjusted(prior=prior), views=run_of().views[:2]), views()[:2])["reasons"]
+        two = block_verdict(run_of(adjusted(prior=a_prior(scales)), views=run_of().views[:2]), views()[:2])["reasons"]
         assert two[0].split(". ")[2] == "Tie points of two images cannot show which camera is wrong"
 
 
 def test_with_gcps_the_position_is_not_as_uncertain_as_the_cameras():
-    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.full(3, 7.0), drift_sigma=(), perhaps_odd=None)
-    alone, held = (
-        next(verdicts._of_cameras(run_of(adjusted(prior=prior), gcps=gcps), adjusted(prior=prior)))
-        for gcps in (None, object())
-    )
+    found = adjusted(prior=a_prior([7.0] * 3))
+    (alone,), (held,) = reasons(found), reasons(found, gcps=gcps())
     start = "The corrections are larger than the stated accuracies of the cameras allow. The stated sigmas were "
     start += "multiplied by 7.0"
     assert alone.startswith(f"{start}, and that of the position with them. ")
@@ -312,12 +314,11 @@ def test_with_gcps_the_position_is_not_as_uncertain_as_the_cameras():
 
 
 def test_an_image_that_alone_explains_what_all_may_is_named():
-    prior = SimpleNamespace(odd=np.zeros(3, bool), scale=np.full(3, 7.0), perhaps_odd=np.array([False, True, False]))
-    said_of = next(verdicts._of_cameras(run_of(adjusted(prior=prior)), adjusted(prior=prior)))
+    (line,) = reasons(adjusted(prior=a_prior([7.0] * 3, perhaps=np.array([False, True, False]))))
     assert (
-        " Errors of B alone explain the corrections about as well. Check the RPCs and the stated accuracies, first of B"
-        in said_of
+        " Errors of B alone explain the corrections about as well. Check the RPCs and the stated accuracies, " in line
     )
+    assert "accuracies, first of B, or add" in line
 
 
 def test_an_accuracy_that_nobody_stated_is_no_reason():
@@ -328,9 +329,8 @@ def test_an_accuracy_that_nobody_stated_is_no_reason():
         ([0, 0, 0], [2.1, 9.0, 9.0], "A (31 px), B (31 px), C (31 px)"),
         ([0, 1, 0], [1.0, 9.0, 1.0], "B (31 px)"),
     ):
-        prior = SimpleNamespace(odd=np.array(odd, bool), scale=np.array(scale), drift_sigma=())
         silent = tuple(SimpleNamespace(name=name, sensor=replace(make_rpc(), err_bias=None)) for name in NAMES)
-        run = run_of(adjusted(prior=prior, options=nobody), views=silent)
+        run = run_of(adjusted(prior=a_prior(scale, odd), options=nobody), views=silent)
         found = block_verdict(run, off)
         assert found["reasons"] == []
         assert [view_status(view, run)["cause"] for view in off] == [None] * 3
@@ -385,11 +385,8 @@ def test_two_groups_are_not_said_again_of_an_odd_image():
     groups = (TwoGroups((0, 2), 0.31, 0.42),)
     (line,) = reasons(adjusted(two_groups=groups))
     assert line.startswith("Tie points of A and C form two groups, 31 % displaced by 0.42 px from the others")
-    for odd in ([1, 0, 0], [0, 0, 1]):
-        prior = SimpleNamespace(odd=np.array(odd, bool), scale=np.ones(3), drift_sigma=())
-        assert reasons(adjusted(two_groups=groups, prior=prior)) == []
-    prior = SimpleNamespace(odd=np.array([0, 1, 0], bool), scale=np.ones(3), drift_sigma=())
-    assert len(reasons(adjusted(two_groups=groups, prior=prior))) == 1
+    for odd, told in (([1, 0, 0], 0), ([0, 0, 1], 0), ([0, 1, 0], 1)):
+        assert len(reasons(adjusted(two_groups=groups, prior=a_prior(odd=odd)))) == told
 
 
 def moved(by: float, **fields: Any) -> Any:
@@ -447,18 +444,43 @@ def test_control_that_is_wrong_is_named_with_how_far_it_is_off():
         "1 GCP used, with residuals above 4 standard deviations: P2 (+0.00 m east, +0.00 m north, +0.02 m up, "
         "w = 4.5), predicted minus given. Check coordinates and stated accuracies.",
     ]
-    two = reasons(adjusted(control=control(used=np.zeros(3, bool), w=np.array([9.0, np.nan, 9.0]))), gcps=gcps())
-    assert two[0].startswith("3 GCPs rejected")
-    assert "P1 (in too few images to determine its error)" in two[0]
 
 
 def test_control_that_scatters_is_said_to_unless_one_is_named():
-    (line,) = reasons(adjusted(control=control(fits=False, scatter=2.34)), gcps=gcps())
-    assert line.startswith("3 GCPs scatter 2.3 times as much as stated")
+    scattered = control(fits=False, scatter=3.21, used=np.array([True, True, False]))
+    assert reasons(adjusted(control=scattered), gcps=gcps())[1:] == [
+        "2 GCPs scatter 3.2 times as much as stated. Check their coordinates and stated accuracies."
+    ]
     named = reasons(adjusted(control=control(fits=False, scatter=2.34, w=np.array([1.0, 4.5, 1.0]))), gcps=gcps())
     assert [text.split()[1:3] for text in named] == [["GCP", "used,"]]
     assert reasons(adjusted(control=control()), gcps=gcps()) == []
     assert reasons(adjusted(), gcps=gcps(left_out=("a: no such image",))) == ["a: no such image."]
+
+
+def test_control_that_is_not_used_says_why():
+    off, few = np.array([[1.0, -2.0, 3.0], [NO_NUMBER] * 3, [3.0, 0.0, 1.0]]), NO_NUMBER
+
+    def said(*used: int, w: Any = (9.5, few, 1.0), **agreed: Any) -> str:
+        agreement = Agreement(np.array(used, bool), **agreed)
+        tested = control(residual=off, w=np.array(w), used=agreement.used, agreed=agreement)
+        (line,) = reasons(adjusted(control=tested), gcps=gcps())
+        return line
+
+    of_few, cure = "P1 (in too few images to determine its error)", "Check coordinates, axes and image positions."
+    assert said(0, 0, 1) == (
+        f"2 GCPs rejected, as the others contradict them: P0 ({enu(off[0])}, w = 9.5), {of_few}, predicted minus "
+        f"given. {cure}"
+    )
+    assert said(1, 0, 1, w=(1.0, few, 1.0)).endswith(f"{of_few}. {cure}")
+    assert said(0, 0, 1, alike=True).endswith(f"{cure} They agree with each other: check their datum and heights, too.")
+    one, other = np.array([True, True, False]), np.array([False, False, True])
+    apart = f"(predicted minus given differs by {enu(off[0] - off[2])})"
+    for sets, told in (
+        ((one, other), f"P0, P1 against P2 {apart}"),
+        ((one & [False, True, True], other), "P1 against P2"),
+    ):
+        assert f"GCPs contradict each other, {told}, and none was used." in said(0, 0, 0, sets=sets)
+    assert "the RMS of check tie points rises from 0.100 to 0.250 px" in said(0, 0, 0, torn=(0.1, 0.25))
 
 
 def test_a_reference_that_shows_something_else_is_of_no_use():
@@ -688,44 +710,6 @@ def test_a_reference_whose_points_lie_off_each_other_by_more_than_its_pixel_is_t
         assert "by more than the resolution of its matches, 10 m, in A (10 m). Check it for distortions" in found[0]
 
 
-def test_control_that_contradicts_is_named_with_what_it_is_off_by():
-    def said(status: str, **fields: Any) -> list[str]:
-        usual = {
-            "status": lambda g: status.split()[g], "w": np.array([9.5, NO_NUMBER, 1.0]), "torn": (), "sets": (),
-            "residual": np.array([[1.0, -2.0, 3.0], [NO_NUMBER] * 3, [3.0, 0.0, 1.0]]), "agreed": None, "fits": True,
-            "used": np.array([True, True, False]), "scatter": 3.21,
-        }  # fmt: skip
-        return list(control_reasons(NAMES, SimpleNamespace(**{**usual, **fields})))
-
-    assert said("used used used") == []
-    (line,) = said("rejected rejected used")
-    off = f"A ({enu(np.array([1.0, -2.0, 3.0]))}, w = 9.5)"
-    assert line.startswith("2 GCPs rejected, as the others contradict them: ")
-    assert off in line
-    of_few = "B (in too few images to determine its error)"
-    assert line.endswith(f"{of_few}, predicted minus given. Check coordinates, axes and image positions.")
-    (line,) = said("used rejected used")
-    assert line.endswith(f"{of_few}. Check coordinates, axes and image positions.")
-    (line,) = said("used used rejected", agreed=SimpleNamespace(alike=True))
-    assert line.endswith("They agree with each other: check their datum and heights, too.")
-    (line,) = said("contradicts used used", fits=False)
-    assert line.startswith("1 GCP used, with residuals above 4 standard deviations: ")
-    assert said("used used used", fits=False) == [
-        "2 GCPs scatter 3.2 times as much as stated. Check their coordinates and stated accuracies."
-    ]
-    sets = (np.array([True, True, False]), np.array([False, False, True]))
-    (line,) = said("undecided undecided undecided", sets=sets)
-    apart = enu(np.array([-2.0, -2.0, 2.0]))
-    assert (
-        f"GCPs contradict each other, A, B against C (predicted minus given differs by {apart}), and none was used."
-        in line
-    )
-    (line,) = said("undecided undecided undecided", sets=(sets[0] & [False, True, True], sets[1]))
-    assert "GCPs contradict each other, B against C, and none was used." in line
-    (line,) = said("rejected rejected rejected", torn=(0.1, 0.25))
-    assert "the RMS of check tie points rises from 0.100 to 0.250 px" in line
-
-
 def test_altimetry_says_how_well_it_agrees_or_why_it_holds_nothing():
     usual = {
         "agree": 70, "near": 80, "spread": 0.4, "expected": 0.5, "motion": np.array([1.0, -2.0, 3.0]), "total": 90,
@@ -815,22 +799,23 @@ def test_what_control_holds_is_said_with_how_far_it_agrees(agrees, used, scale, 
     assert next(held_lines(tested, points, views(), "it is known to a metre")) == words
 
 
+def displaced(first: float, px: float = 1.0, *, view: int = 0, axis: int = 0, or_of: tuple[int, ...] = ()) -> Finding:
+    """A displaced part of an image."""
+    size = np.array([px, 0.0])
+    return Finding("step", view, (axis, first, 1e6, 0.0, 0.0), size, 9.0, 9.0, "", size, or_of=or_of)
+
+
 @pytest.mark.parametrize("count", [2, 3, 7])
-def test_many_displaced_detectors_of_an_image_are_one_sentence(monkeypatch, count):
+def test_many_displaced_detectors_of_an_image_are_one_sentence(count):
     """Of one image alone; rows, other images and parts that another image may have keep a sentence of their own."""
-    parts = [part(f"columns {n}", 100.0 * n, 0.1 * n) for n in range(1, count + 1)]
-    others = part("rows", 5.0, axis="rows"), part("of b", 7.0, image="b"), part("or c", 9.0, candidates=("c",))
-    monkeypatch.setattr(verdicts, "explanations", lambda _: (others[0], *parts, *others[1:]))
-    said = list(verdicts._explanation_sentences(None))  # type: ignore[arg-type]
-    edges = ", ".join(f"{100 * n}" for n in range(1, count + 1))
-    whole = (
-        f"{count} parts of the columns of a are displaced by up to {0.1 * count:.2f} px, as by detectors with edges at"
+    parts = [displaced(100.0 * n, 0.1 * n) for n in range(1, count + 1)]
+    found = adjusted(
+        findings=[displaced(5.0, axis=1), *parts, displaced(7.0, view=1), displaced(9.0, or_of=(2,))],
+        cameras=SimpleNamespace(unknowns=SimpleNamespace(drift=1, half=np.full((2, 3), 2000.0))),
     )
-    own = [one.sentence for one in parts] if count < 3 else [f"{whole} {edges}"]
-    assert said == ["rows", *own, "of b", "or c"]
-
-
-def part(sentence: str, first: float, size: float = 1.0, axis: str = "columns", **fields: Any) -> ExplanationEntry:
-    """A displaced part of image a."""
-    given = {"image": "a", "axis": axis, "first": first, "size_px": size, **fields}
-    return ExplanationEntry("step", sentence, given.pop("image"), 9.0, 9.0, **given)
+    rows, *own, of_b, or_c = (f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in explanations(found))
+    if count > 2:
+        edges = ", ".join(f"{100 * n}" for n in range(1, count + 1))
+        size = f"{0.1 * count:.2f} px, as by detectors with edges at"
+        own = [f"{count} parts of the columns of A are displaced by up to {size} {edges}."]
+    assert [line for line in said(run_of(found)) if "displaced" in line] == [rows, *own, of_b, or_c]
