@@ -167,8 +167,3 @@ def test_images_held_by_control_points_alone_are_not_weak(block_run):
     summary = summarize(replace(run, tracks=tracks, adjustment=adjustment))
     assert {view["status"] for view in summary["views"] if view["num_gcps"] >= 3} == {"adjusted"}
     assert {view["status"] for view in summary["views"] if view["num_gcps"] < 3} <= {"weak"}
-
-
-def test_passed_is_status_good(block_run, check_run):
-    for summary in (block_run.summary, check_run.summary):
-        assert summary["passed"] == (summary["status"] == "good") == (not summary["reasons"])

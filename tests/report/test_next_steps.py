@@ -267,7 +267,7 @@ def test_one_image_is_handed_over_for_an_orthoimage_and_for_no_surface():
     (use,) = next_steps(a_summary([a_view("A", outputs={"A.vrt": {}})]))
     assert len(use.commands) == 1
     assert "ortho" in use.commands[0]
-    assert "best pair" not in use.text
+    assert "Best pair" not in use.text
 
 
 def test_nothing_is_handed_over_of_a_run_that_wrote_nothing():

@@ -98,7 +98,7 @@ def test_every_question_is_asked_of_a_full_run(block_run):
 
 def test_a_check_asks_only_what_it_can_answer(check_run):
     html = html_of(check_run)
-    assert "What was changed" not in html
+    assert "How was each camera corrected?" not in html
     assert "new RPC files" not in html
 
 

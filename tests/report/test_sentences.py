@@ -15,7 +15,7 @@ from barpc.ba.control.snooping import ControlTest
 from barpc.ba.robust.consensus import TwoGroups
 from barpc.ba.robust.systematic_residuals import SmoothTest
 from barpc.ba.terms.term import Finding
-from barpc.base.options import RunOptions
+from barpc.base.options import FitOptions, RunOptions
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
 from barpc.report.measures.block import explanations
@@ -147,6 +147,9 @@ def test_what_is_advised_has_its_figures():
 
     assert advice(num_observations=5) == "Only 5 tie points. Check overlap, clouds and dates"
     assert advice(num_observations=0) == "No tie points. Check overlap, clouds and dates"
+    few = a_view(num_observations=5)
+    told = replace(few, **view_status(few, run_of())).reservation  # type: ignore[arg-type]
+    assert told == "A: weakly connected. Only 5 tie points. Check overlap, clouds and dates."
     assert advice(rmse_after=0.72).startswith("Tie points keep residuals of 0.72 px. Check for wrong matches")
     lost = advice(num_observations=60, num_rejected=40)
     assert lost.startswith("40 % of its tie points were rejected")
@@ -193,6 +196,7 @@ def a_fit(largest: float | None, rmse: float = 0.0) -> FitEntry:
         (0.011, {}, "failed"),
         (None, {}, "failed"),
         (0.011, {"grids": True}, "adjusted"),
+        (0.011, {"fit": FitOptions(tolerance=0.011)}, "adjusted"),
     ],
 )
 def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status):
