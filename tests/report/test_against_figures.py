@@ -5,19 +5,23 @@ A sentence without a row of `SENTENCES` fails: whoever adds one says what it mus
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from html import unescape
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 
 pytest.importorskip("jinja2")
 
 from barpc.base.errors import listed
 from barpc.report import Run, Summary
 from barpc.report.page import SECTIONS
+from barpc.report.records import json_form
 from barpc.report.runfiles import ObservationTable, RunFiles
+from barpc.report.summary import published_schema
 from barpc.report.summary.block import DatumEntry
 from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import enu, metres
@@ -611,7 +615,9 @@ def made(request) -> tuple[Summary, list[str]]:
 
 @pytest.mark.landing(16)
 def test_no_sentence_is_against_its_figure(made):
+    """Of summaries that follow the published schema."""
     summary, sentences = made
+    Draft202012Validator(published_schema()).validate(json.loads(json.dumps(json_form(summary))))
     of_images = {view.reservation: view for view in summary.views if view.advice}
     told = {
         f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in (summary.scene.explanations if summary.scene else ())
