@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -89,6 +92,20 @@ class Finished:
     @property
     def views(self) -> tuple[View, ...]:
         return self.run.views
+
+
+@pytest.fixture
+def copied(tmp_path) -> Callable[..., Path]:
+    """Copies the folder of a run, `change` made to what its summary holds."""
+
+    def made(finished: Finished, name: str = "copy", change: Callable[[dict[str, Any]], object] | None = None) -> Path:
+        shutil.copytree(finished.folder, folder := tmp_path / name)
+        if change is not None:
+            change(summary := json.loads((folder / "summary.json").read_text()))
+            (folder / "summary.json").write_text(json.dumps(summary))
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")
