@@ -295,6 +295,8 @@ def test_check_points_are_shown():
         a_check("R", (4.0, 0.0, 0.3)),
     )
     section = asked("accuracy", check_points=points)
+    assert section.question == "How accurate is it on the ground?"
+    assert [table.key for table in section.tables] == ["check-points"]
     assert section.answer == "The verdict has the RMS of 3 check points, which the adjustment did not use."
     assert texts(section.tables[0]) == [
         ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
