@@ -615,9 +615,11 @@ def made(request) -> tuple[Summary, list[str]]:
 
 @pytest.mark.landing(16)
 def test_no_sentence_is_against_its_figure(made):
-    """Of summaries that follow the published schema."""
+    """Of summaries that follow the published schema, and come back from their file as they were."""
     summary, sentences = made
-    Draft202012Validator(published_schema()).validate(json.loads(json.dumps(json_form(summary))))
+    kept = json.loads(json.dumps(json_form(summary)))
+    Draft202012Validator(published_schema()).validate(kept)
+    assert Summary.read(kept) == summary
     of_images = {view.reservation: view for view in summary.views if view.advice}
     told = {
         f"{one.sentence[0].upper()}{one.sentence[1:]}." for one in (summary.scene.explanations if summary.scene else ())
