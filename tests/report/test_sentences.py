@@ -290,8 +290,9 @@ def test_headlines_count_one_and_many():
     assert headline(well, left_out=(("x", "y"),)) == "1 of 4 images is not adjusted."
     check = {"kind": "check", "left_out": (("x", "y"), ("z", "y")), "adjustment": None}
     assert headline(well, **check) == "2 of 5 images are not usable."
-    noisy = adjusted(noise=2.6)
-    assert headline(well, adjustment=noisy) == "All 3 images are adjusted; the block needs review."
+    noisy, groups = adjusted(noise=2.6), (TwoGroups((1, 2), 0.31, 0.42),)
+    for of_block in (noisy, adjusted(in_space_rms=0.95), adjusted(two_groups=groups)):
+        assert headline(well, adjustment=of_block) == "All 3 images are adjusted; the block needs review."
     assert headline(["weak", *well[1:]], adjustment=noisy) == "1 of 3 images needs review; the block needs review."
     assert headline(well, kind="check", adjustment=None) == "The cameras of all 3 images agree."
 
@@ -485,6 +486,23 @@ def test_control_that_is_not_used_says_why():
     ):
         assert f"GCPs contradict each other, {told}, and none was used." in said(0, 0, 0, sets=sets)
     assert "the RMS of check tie points rises from 0.100 to 0.250 px" in said(0, 0, 0, torn=(0.1, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("fields", "word"),
+    [
+        ({"adjustment": adjusted(control=control(used=np.arange(3) < 2)), "gcps": gcps()}, "1 GCP rejected"),
+        ({"adjustment": adjusted(control=control(w=np.array([1.0, 1.0, 4.5]))), "gcps": gcps()}, "w = 4.5"),
+        ({"gcps": gcps(left_out=("a.csv: names unknown.tif",))}, "unknown.tif"),
+        ({"check_points": gcps(left_out=("a.csv: names unknown.tif",))}, "unknown.tif"),
+    ],
+)
+def test_ground_points_with_a_reservation_need_a_look(fields, word):
+    found = block_verdict(run_of(**fields), views())
+    assert (found["status"], found["passed"]) == ("look", False)
+    assert found["headline"] == "All 3 images are adjusted; ground points need review."
+    (reason,) = found["reasons"]
+    assert word in reason
 
 
 def test_a_reference_that_shows_something_else_is_of_no_use():
