@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import AdjustOptions
 from barpc.base.options import RunOptions
-from barpc.fit import fit_rpc
 from barpc.pipeline.outputs import write_tables
 from barpc.report import Run, Summary, verdict
 from barpc.report.records import json_form
@@ -23,6 +22,8 @@ from barpc.sensor.centers import camera_center
 from barpc.simulate import simulate_block
 from barpc.workspace import Workspace
 from tests.sealing import seal
+
+from .worlds import run_of
 
 STAGE = {"stage": "adjustment", "seconds": 2.5, "cpu_seconds": 2.0, "peak_memory_mb": 150.0}
 
@@ -37,27 +38,16 @@ def run_of_block(
 ) -> Run:
     """A block adjusted and refitted, as a run."""
     block = simulate_block(num_views, num_tracks, seed=5, num_gcps=6 * gcps, attitude=3e-6, **block_options)
-    views = block.views
     if names is not None:
-        views = tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
-    control = block.gcps if gcps else None
-    options = RunOptions(adjust=AdjustOptions(), gcp=("points.gcp",) if gcps else ())
-    adjustment = adjust_tracks(views, block.tracks, options.adjust, control)
-    centers = tuple(camera_center(view.sensor, view.size, view.alt_range) for view in views)
-    fits = tuple(fit_rpc(s, v.size, v.alt_range) for s, v in zip(adjustment.sensors, views, strict=True))
-    return Run(
-        "adjust",
-        views,
-        (),
-        block.tracks,
-        adjustment=adjustment,
-        centers=centers,
-        fits=fits,
-        written=tuple({f"{view.name}_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}} for view in views),
-        options=options,
-        stages=[STAGE],
-        gcps=control,
-    )
+        views = (replace(view, name=name) for view, name in zip(block.views, names, strict=True))
+        block = replace(block, views=tuple(views))
+    fields = {
+        "centers": tuple(camera_center(view.sensor, view.size, view.alt_range) for view in block.views),
+        "written": tuple({f"{v.name}_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}} for v in block.views),
+        "options": RunOptions(adjust=AdjustOptions(), gcp=("points.gcp",) if gcps else ()),
+        "stages": [STAGE],
+    }
+    return run_of(block, gcps=block.gcps if gcps else None, run=fields)
 
 
 def summarize(run: Run) -> dict[str, Any]:

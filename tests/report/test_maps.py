@@ -170,6 +170,18 @@ def test_no_number_of_the_graticule_stands_at_the_sheet_s_edge():
         assert len(down) >= 1
 
 
+@pytest.mark.parametrize(
+    ("axis", "at", "shown"),
+    [(0, 50.5, True), (0, 49.5, False), (0, 375.5, True), (0, 376.5, False), (0, 410.0, False),
+     (1, 16.5, True), (1, 15.5, False), (1, 255.5, True), (1, 256.5, False), (1, 270.0, False)],
+)  # fmt: skip
+def test_a_meridian_or_parallel_has_room_for_its_number(axis, at, shown):
+    place = (10.25, (at - 150) / 200) if axis else (10.0 - (at - 210) / 200, 0.25)
+    lines = drawn_graticule(Plane(*place, np.array([200.0, 200.0]), 300.0, 1e-3)).lines("grid")
+    found = [line for line in lines if line[axis] == pytest.approx(at, abs=0.006) and line[axis] == line[axis + 2]]
+    assert bool(found) == shown
+
+
 @pytest.mark.parametrize(("lon", "words"), [(180.0, "180° W"), (181.0, "179° W"), (179.0, "179° E"), (-1.0, "1° W")])
 def test_degrees_are_east_or_west_of_greenwich(lon, words):
     found = Plane(lon, 0.0, np.array([130.0, 130.0]), 300.0, 1e-3)
@@ -561,17 +573,3 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     none = panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])
     bars = [[text for text, *_ in Drawing(found[0][0][0]).texts("name")] for found in (after, before, none)]
     assert bars == [["0.5 px"], ["2.9 px"], ["1 px"]]
-
-
-@pytest.mark.parametrize(("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)])
-def test_a_meridian_has_room_for_its_number(x, shown):
-    found = Plane(10.0 - (x - 210) / 200, 0.25, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_graticule(found).lines("grid")
-    assert (any(line[0] == pytest.approx(x, abs=0.006) and line[0] == line[2] for line in lines)) == shown
-
-
-@pytest.mark.parametrize(("y", "shown"), [(16.5, True), (15.5, False), (255.5, True), (256.5, False), (270.0, False)])
-def test_a_parallel_has_room_for_its_number(y, shown):
-    found = Plane(10.25, (y - 150) / 200, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_graticule(found).lines("grid")
-    assert (any(line[1] == pytest.approx(y, abs=0.006) and line[1] == line[3] for line in lines)) == shown

@@ -29,6 +29,7 @@ from barpc.tie.reference import ReferenceControl, ViewMatch
 from tests.distributions import norm
 
 from .made import a_gcp
+from .worlds import only
 
 
 def tracks_of(*rows: tuple[int, int, float, float], sigma: float = 0.1) -> Tracks:
@@ -235,30 +236,12 @@ def test_a_gcp_is_seen_where_it_is_and_its_residual_is_carried_into_the_images(b
 def test_a_gcp_that_no_image_shows_is_not_seen_and_one_rejected_is_not_used(block_run):
     run = block_run.run
     keep = run.gcps.point != 2
-    gcps = replace(
-        run.gcps,
-        view=run.gcps.view[keep],
-        point=run.gcps.point[keep],
-        xy=run.gcps.xy[keep],
-        xy_sigma=run.gcps.xy_sigma[keep],
-    )
     tested = run.adjustment.control
     control = replace(tested, used=np.arange(6) != 1, w=np.where(np.arange(6) == 3, 9.0, 1.0))
-    found = measure_gcps(
-        replace(
-            run,
-            gcps=gcps,
-            adjustment=replace(run.adjustment, control=control, gcp_w=run.adjustment.gcp_w[keep]),
-        )
-    )
-    assert [entry.status for entry in found] == [
-        "used",
-        "rejected",
-        "not seen",
-        "contradicts",
-        "used",
-        "used",
-    ]
+    adjustment = replace(run.adjustment, control=control, gcp_w=run.adjustment.gcp_w[keep])
+    found = measure_gcps(replace(run, gcps=only(run.gcps, keep), adjustment=adjustment))
+    status = ["used", "rejected", "not seen", "contradicts", "used", "used"]
+    assert [entry.status for entry in found] == status
     assert [entry.used for entry in found] == [True, False, False, True, True, True]
     assert found[2].images == ()
     assert np.isnan(found[2].residual_px)

@@ -22,10 +22,10 @@ from barpc.report.page import report_html
 from barpc.report.summary import LeftOutEntry, StepEntry
 from barpc.report.summary.words import CAUSES
 from barpc.scene import GroundPoints
-from barpc.sensor.corrected import Corrected
-from barpc.simulate import Look, SimulatedBlock, simulate_block
+from barpc.simulate import Look, simulate_block
 
 from .made import a_correction, a_gcp, a_pair, a_summary, a_view, files_of, section, seen
+from .worlds import exact_cameras, on_terrain, seen_by
 
 OFF = 1.5  # a prediction is right to this factor, both ways
 OPTIONS = AdjustOptions(dem_sigma=2.0)
@@ -47,20 +47,10 @@ class Case:
     """A block whose tie points lie on the hills, seen by the true cameras, and its ground control."""
 
     def __init__(self, views: int, **options: object) -> None:
-        made = simulate_block(views, 1200, seed=3, num_gcps=0, **options)
-        self.exact = [Corrected(v.sensor, c) for v, c in zip(made.views, made.truth.corrections, strict=True)]
-        self.ground = made.truth.ground.copy()
-        self.ground[:, 2] = Hills()(*self.ground[:, :2].T)
-        tracks, rng = made.tracks, np.random.default_rng(7)
-        self.rng = rng
-        xy = self.seen(self.ground, tracks.point, tracks.view) + rng.normal(0.0, 0.1, tracks.xy.shape)
-        self.block: SimulatedBlock = replace(made, tracks=replace(tracks, xy=xy, sigma=np.full(len(xy), 0.1)))
-
-    def seen(self, ground: Array, point: Array, view: Array) -> Array:
-        xy = np.empty((len(view), 2))
-        for v, camera in enumerate(self.exact):
-            xy[view == v] = camera.project(ground[point[view == v]])
-        return xy
+        made, self.rng = simulate_block(views, 1200, seed=3, num_gcps=0, **options), np.random.default_rng(7)
+        self.exact = exact_cameras(made)
+        self.block = on_terrain(made, Hills()(*made.truth.ground[:, :2].T), self.rng)
+        self.ground = self.block.truth.ground
 
     def control(self, num: int, wrong: float = 0.0) -> GroundPoints:
         """Points of 1 m and 0.5 px spread over the block; the first one `wrong` metres too far east."""
@@ -73,7 +63,7 @@ class Case:
         rows = np.flatnonzero(np.isin(tracks.point, chosen))
         point = np.searchsorted(np.sort(chosen), tracks.point[rows])
         ground = self.ground[np.sort(chosen)].copy()
-        xy = self.seen(ground, point, tracks.view[rows]) + self.rng.normal(0.0, 0.5, (len(rows), 2))
+        xy = seen_by(self.exact, ground, point, tracks.view[rows]) + self.rng.normal(0.0, 0.5, (len(rows), 2))
         metre = np.array([1.0 / 81000.0, 1.0 / 111000.0, 1.0])
         ground += self.rng.normal(0.0, 1.0, ground.shape) * metre
         ground[0, 0] += wrong * metre[0]
