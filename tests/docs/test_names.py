@@ -51,8 +51,7 @@ def other_flags() -> set[str]:
 def unknown_flags(code: str) -> set[str]:
     """Flags of a piece of code that neither a verb nor a script has."""
     if re.match(
-        r"(pip|rattler-build|pytest|ruff|mkdocs|gdal|git|python -m build|twine|oty|otbcli|sbatch|srun|towncrier)",
-        code,
+        r"(pip|rattler-build|pytest|ruff|mkdocs|gdal|git|python -m build|twine|oty|otbcli|sbatch|srun|towncrier)", code
     ):
         return set()
     return set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code)) - all_flags() - other_flags()

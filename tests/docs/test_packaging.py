@@ -93,10 +93,7 @@ def test_the_container_copies_what_the_wheel_is_made_of_and_is_named_by_the_vers
         barpc.__version__
     }
     assert set(re.findall(r"barpc:(\S+)", text)) == {barpc.__version__}
-    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == [
-        "USER 1000",
-        'ENTRYPOINT ["barpc"]',
-    ]
+    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == ["USER 1000", 'ENTRYPOINT ["barpc"]']
     let_in = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")}
     wheel = project()["tool"]["hatch"]["build"]["targets"]["wheel"]
     used = {*wheel["packages"], *wheel["shared-data"], "pyproject.toml", "README.md", "LICENSE"}

@@ -29,12 +29,7 @@ STAGE = {"stage": "adjustment", "seconds": 2.5, "cpu_seconds": 2.0, "peak_memory
 
 
 def run_of_block(
-    num_views: int,
-    num_tracks: int,
-    *,
-    gcps: bool = False,
-    names: list[str] | None = None,
-    **block_options: object,
+    num_views: int, num_tracks: int, *, gcps: bool = False, names: list[str] | None = None, **block_options: object
 ) -> Run:
     """A block adjusted and refitted, as a run."""
     block = simulate_block(num_views, num_tracks, seed=5, num_gcps=6 * gcps, attitude=3e-6, **block_options)

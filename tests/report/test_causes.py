@@ -57,13 +57,7 @@ def reasons(found: Any) -> list[str]:
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
     (found,) = explanations(adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "", np.zeros(2))]))
     assert found.sentence == sentence
-    assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (
-        kind,
-        NAMES[view],
-        42.0,
-        7.0,
-        None,
-    )
+    assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (kind, NAMES[view], 42.0, 7.0, None)
     assert (found.first, found.last) == ends
     assert found.size_px == pytest.approx(np.hypot(*size))
 
@@ -144,10 +138,7 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
 @pytest.mark.parametrize(
     ("side", "said"),
     [
-        (
-            "north-west",
-            "35 % of the tie points, in the north-west of the block, move together",
-        ),
+        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
         ("", "35 % of the tie points, about 5.0500, 43.1000 deg, move together"),
     ],
 )

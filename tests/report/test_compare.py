@@ -153,10 +153,7 @@ def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets(compared):
 
 
 def test_options_of_one_run_alone_count_and_those_without_effect_do_not(compared):
-    options = (
-        {"x": 1, "now": None, "deep": {"y": 2}, "overwrite": True},
-        {"x": 1, "now": 3, "z": {}, "keep_going": 1},
-    )
+    options = ({"x": 1, "now": None, "deep": {"y": 2}, "overwrite": True}, {"x": 1, "now": 3, "z": {}, "keep_going": 1})
     found = compared(*(a_summary([a_view("A"), a_view(f"only {k}")], options=options[k]) for k in (0, 1)))
     assert found["options"] == [
         {"option": "now", "values": [None, 3]},

@@ -17,18 +17,7 @@ from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.ground_points import CheckPointEntry
 
-from .made import (
-    Drawing,
-    a_gcp,
-    a_pair,
-    a_square,
-    a_summary,
-    a_view,
-    corners,
-    files_of,
-    section,
-    seen,
-)
+from .made import Drawing, a_gcp, a_pair, a_square, a_summary, a_view, corners, files_of, section, seen
 
 jinja2 = pytest.importorskip("jinja2")
 
@@ -459,10 +448,7 @@ def test_the_scale_of_residuals_is_written_without_powers_of_ten(size, said):
 def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     views = [a_view("A", size=(900, 450)), a_view("B", size=(900, 450))]
     pushed = [(0, k, (60.0 + k % 2, 60.0), (0.0, 0.0), (0.3, 0.02 * (-1) ** k), True) for k in range(40)]
-    one = [
-        (1, 99, (899.5, 449.5), (0.0, 0.0), (0.0, 0.6), True),
-        (1, 98, (5.0, 5.0), (0, 0), (9.0, 9.0), False),
-    ]
+    one = [(1, 99, (899.5, 449.5), (0.0, 0.0), (0.0, 0.6), True), (1, 98, (5.0, 5.0), (0, 0), (9.0, 9.0), False)]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
     assert key == ""

@@ -59,10 +59,7 @@ def copies(shift=(12.0, -7.0), num=20, others=0, off=0.0, sizes=((500, 500), (50
     second = xy + shift + off
     second[:others] += 3.3
     tracks = Tracks(
-        np.tile([0, 1], num),
-        np.repeat(np.arange(num), 2),
-        np.stack([xy, second], 1).reshape(-1, 2),
-        np.ones(2 * num),
+        np.tile([0, 1], num), np.repeat(np.arange(num), 2), np.stack([xy, second], 1).reshape(-1, 2), np.ones(2 * num)
     )
     views = tuple(SimpleNamespace(name=name, size=size) for name, size in zip("AB", sizes, strict=True))
     return Run("check", views, (), tracks).copies  # type: ignore[arg-type]
@@ -253,8 +250,7 @@ def test_a_gcp_that_no_image_shows_is_not_seen_and_one_rejected_is_not_used(bloc
 
 def control_run(*tests: tuple[int, str, float]) -> Any:
     return SimpleNamespace(
-        control_tests=[ControlResidual(*test) for test in tests],
-        views=[SimpleNamespace(name=n) for n in "ABC"],
+        control_tests=[ControlResidual(*test) for test in tests], views=[SimpleNamespace(name=n) for n in "ABC"]
     )
 
 
@@ -295,21 +291,11 @@ def test_a_reference_is_said_to_hold_the_points_that_were_kept():
     assert [view.num_points for view in entry.views] == [2, 0, 1]
     assert [view.offset_en_m for view in entry.views] == [(1.0, -2.0), None, (0.5, 0.0)]
     first = entry.views[0]
-    assert (first.name, first.peak, first.num_tried, first.num_passed, first.scatter_m) == (
-        "A",
-        9.0,
-        50,
-        30,
-        0.4,
-    )
+    assert (first.name, first.peak, first.num_tried, first.num_passed, first.scatter_m) == ("A", 9.0, 50, 30, 0.4)
     unused = measure_reference(
         SimpleNamespace(reference=replace(found, control=None), adjustment=adjustment, views=[0, 0, 0])
     )
-    assert (unused.used, unused.num_points, [view.num_points for view in unused.views]) == (
-        False,
-        0,
-        [0, 0, 0],
-    )
+    assert (unused.used, unused.num_points, [view.num_points for view in unused.views]) == (False, 0, [0, 0, 0])
     assert not measure_reference(SimpleNamespace(reference=found, adjustment=None, views=[0, 0, 0])).used
     assert measure_reference(SimpleNamespace(reference=None, adjustment=adjustment)) is None
 

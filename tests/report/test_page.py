@@ -172,11 +172,7 @@ def test_a_run_without_a_single_tie_point_still_has_a_page(block_run, tmp_path):
 
 
 def test_a_folder_without_a_finished_run_is_refused_with_a_reason(tmp_path):
-    for text, said in (
-        (None, "no finished run"),
-        ("{", "not JSON that can be read"),
-        ('{"schema": 1}', "schema 1"),
-    ):
+    for text, said in ((None, "no finished run"), ("{", "not JSON that can be read"), ('{"schema": 1}', "schema 1")):
         if text is not None:
             (tmp_path / "summary.json").write_text(text)
         with pytest.raises(InputError, match=said):

@@ -14,18 +14,7 @@ from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.select.foreign_camera import FOREIGN_CAMERA
 from barpc.ba.terms import TERMS
 from barpc.base.errors import listed
-from barpc.report.records import (
-    Cell,
-    Column,
-    Number,
-    Record,
-    cell_of,
-    column,
-    column_of,
-    json_form,
-    table,
-    value_of,
-)
+from barpc.report.records import Cell, Column, Number, Record, cell_of, column, column_of, json_form, table, value_of
 from barpc.report.summary import SCHEMA, published_schema
 from barpc.report.summary.block import EXPLANATIONS, MODES
 from barpc.report.summary.pairs import OffsetEntry, PairEntry

@@ -57,20 +57,7 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     )  # fmt: skip
     (table,) = asked("images", [view]).tables
     assert texts(table) == [
-        [
-            "A",
-            "needs review",
-            "60",
-            "0",
-            "25.0",
-            "25%",
-            "1.234",
-            "0.100",
-            "0.120",
-            "+1.00, -2.00",
-            "0.51",
-            "12.3",
-        ]
+        ["A", "needs review", "60", "0", "25.0", "25%", "1.234", "0.100", "0.120", "+1.00, -2.00", "0.51", "12.3"]
     ]
     assert [cell.key for cell in table.rows[0]][1:6] == [4, 60, 0, 25.0, 0.254]
     assert table.rows[0][1].kind == "status doubtful"

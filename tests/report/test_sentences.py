@@ -130,11 +130,7 @@ def test_wrong_matches_that_lie_anywhere_are_told_and_need_no_look():
     lines = said(calm, [a_view(name, num_observations=60, num_rejected=few[name]) for name in NAMES])
     assert told + "as mismatches do." in lines
     lost = {"num_observations": 60, "num_rejected": 40}
-    assert [view_status(a_view(name, **lost), run)["status"] for name in NAMES] == [
-        "adjusted",
-        "doubtful",
-        "adjusted",
-    ]
+    assert [view_status(a_view(name, **lost), run)["status"] for name in NAMES] == ["adjusted", "doubtful", "adjusted"]
     assert not any("in random directions" in line for line in said(run_of(adjusted(alike=np.full(3, 5.1)))))
     assert not any("in random directions" in line for line in said(run))  # few were rejected
     untested = run_of(adjusted(alike=np.full(3, -np.inf)))  # as those of a view that the others were adjusted without
@@ -213,12 +209,7 @@ def test_an_rpc_is_to_hold_its_camera_to_the_tolerance(largest, options, status)
 @pytest.mark.parametrize("more", ["jitter_px", "detector_px", "step_px", "sinusoid_px"])
 @pytest.mark.parametrize(
     ("left", "most", "options", "doubted"),
-    [
-        (0.06, 0.15, {}, False),
-        (0.06, 0.16, {}, True),
-        (0.07, 0.15, {}, True),
-        (0.07, 0.25, {"grids": True}, False),
-    ],
+    [(0.06, 0.15, {}, False), (0.06, 0.16, {}, True), (0.07, 0.15, {}, True), (0.07, 0.25, {"grids": True}, False)],
 )
 def test_a_camera_that_follows_jitter_needs_more_than_one_rpc(more, left, most, options, doubted):
     run = run_of(options=RunOptions(**options))
@@ -426,12 +417,7 @@ def test_a_scene_that_moved_far_is_said_to_where_nothing_but_the_cameras_holds_i
 
 
 def control(**fields: Any) -> ControlTest:
-    usual = {
-        "used": np.ones(3, bool),
-        "residual": np.zeros((3, 3)),
-        "w": np.ones(3),
-        "redundancy": np.full(3, 0.5),
-    }
+    usual = {"used": np.ones(3, bool), "residual": np.zeros((3, 3)), "w": np.ones(3), "redundancy": np.full(3, 0.5)}
     return ControlTest(**{**usual, **fields})
 
 
@@ -667,9 +653,7 @@ def test_a_reference_is_said_to_hold_what_and_how_far_off_the_cameras_were():
     assert any(line.startswith("Without ground control") for line in useless)
     with_gcps = said(
         run_of(
-            adjusted(control=control()),
-            gcps=gcps(),
-            reference=ReferenceControl(SimpleNamespace(), (one,), 0.5, 1.0),
+            adjusted(control=control()), gcps=gcps(), reference=ReferenceControl(SimpleNamespace(), (one,), 0.5, 1.0)
         )
     )
     assert any(line.startswith("With 3 GCPs") for line in with_gcps)

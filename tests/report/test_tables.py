@@ -278,12 +278,7 @@ def test_points_of_a_reference_are_written_as_control_is_read():
         views=[SimpleNamespace(path="/a/x.tif"), SimpleNamespace(path="/b/y.tif")],
     )
     first, second = json.loads(gcps_geojson(run))["features"]
-    assert first["properties"] == {
-        "id": "P",
-        "filename": "y.tif",
-        "ji": [1.0, 2.0],
-        "sigma_m": [1.0, 1.0, 2.0],
-    }
+    assert first["properties"] == {"id": "P", "filename": "y.tif", "ji": [1.0, 2.0], "sigma_m": [1.0, 1.0, 2.0]}
     assert first["geometry"] == {"type": "Point", "coordinates": [10.0, 20.0, 30.0]}
     assert (second["properties"]["id"], second["properties"]["ji"]) == ("Q", [5.0, 6.0])
 

@@ -116,11 +116,7 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
         else a_pair(f"view_{k:04d}", f"view_{k + 1:04d}")
         for k in range(num - 1)
     ]
-    verdict = (
-        "It rests on this.",
-        *(view.reservation for view in views if view.advice),
-        *fields.pop("more", ()),
-    )
+    verdict = ("It rests on this.", *(view.reservation for view in views if view.advice), *fields.pop("more", ()))
     return a_summary(
         views,
         pairs,

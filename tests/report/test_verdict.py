@@ -58,12 +58,7 @@ def test_a_view_without_tie_points_to_the_others_is_not_adjusted():
             "doubtful",
             "Its RPC does not match the image: with its axes",
         ),
-        (
-            SimpleNamespace(covariance=0.04 * np.eye(9)),
-            33.0,
-            "doubtful",
-            "Its RPC is 33 times less accurate than",
-        ),
+        (SimpleNamespace(covariance=0.04 * np.eye(9)), 33.0, "doubtful", "Its RPC is 33 times less accurate than"),
     ],
 )
 def test_a_view_whose_rpc_is_not_its_own_is_named(block_run, placed, scale, status, said):
