@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,13 @@ from barpc.report import outcome as runs
 from barpc.report.measures.block import measure_scene
 from barpc.report.measures.ground_points import measure_check_points, measure_control, measure_gcps, measure_reference
 from barpc.report.measures.pairs import MAX_PER_PAIR
-from barpc.report.measures.views import _image_correction_entry, ce90, measure_views, rmse_by_view
+from barpc.report.measures.views import ce90, measure_views, rmse_by_view
 from barpc.report.outcome import ControlResidual, pair_ties, triangulate_tracks
+from barpc.report.records import json_form
 from barpc.report.summary.ground_points import GcpEntry
 from barpc.report.summary.views import cell_numbers
-from barpc.scene import Tracks
-from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline
+from barpc.scene import Tracks, middle_altitude
+from barpc.sensor.image_corrections import Calibrated, ColumnSpline, RowSpline, Splined
 from barpc.sensor.triangulation import epipolar_offset
 from barpc.tie.detail import Gap
 from barpc.tie.reference import ReferenceControl, ViewMatch
@@ -145,20 +147,22 @@ def test_tracks_are_intersected_alike_in_parts_of_any_size(block_run, sized, row
 
 
 def test_a_track_is_intersected_from_what_counts_and_the_rest_is_measured_against_it(block_run):
-    run = block_run.run
-    tracks = run.tracks
-    keep = run.keep.copy()
-    first = np.flatnonzero(tracks.point == tracks.point[0])
-    xy = tracks.xy.copy()
-    xy[first[0]] += [30.0, -40.0]
-    keep[first] = True
-    keep[first[0]] = len(first) < 3
+    """Outliers do not bend the points that errors are measured at."""
+    run, tracks = block_run.run, block_run.run.tracks
+    keep, xy = run.keep.copy(), tracks.xy.copy()
+    long = np.flatnonzero(np.bincount(tracks.point[keep]) > 2)[0]
+    away = np.flatnonzero((tracks.point == long) & keep)[0]
+    keep[away] = False
+    xy[away] += [30.0, -40.0]
     found = triangulate_tracks(replace(tracks, xy=xy), run.after, run.altitude, keep)
     assert found.points.shape == (tracks.num_points, 3)
-    lone = np.bincount(tracks.point[keep], minlength=tracks.num_points) < 2
-    assert np.isnan(found.points[lone]).all()
-    if not keep[first[0]]:
-        assert np.hypot(*found.residuals[first[0]]) == pytest.approx(50.0, abs=3.0)
+    counted = np.bincount(tracks.point[keep], minlength=tracks.num_points) > 1
+    assert np.isnan(found.points[~counted]).all()
+    clean, kept = tracks.select(keep), keep & counted[tracks.point]
+    alone = triangulate_tracks(clean, run.after, middle_altitude(run.views), np.ones(len(clean), dtype=bool))
+    assert np.abs(found.residuals[kept] - alone.residuals).max() < 1e-6
+    assert np.abs((run.ties_after.residuals - found.residuals)[kept & (tracks.point != long)]).max() < 1e-6
+    assert np.hypot(*found.residuals[away]) == pytest.approx(50.0, abs=3.0)
 
 
 def test_the_tables_hold_every_so_many_th_track(sized, block_run):
@@ -339,29 +343,39 @@ def test_what_asked_for_more_is_the_image_with_the_largest_part_that_is_no_chanc
     assert scene.jitter_justification is at.drift_justification is None
 
 
-def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps():
+def followed(run: Run, spline: RowSpline) -> dict[str, Any]:
+    """What the summary says of corrections in the image of a view, whose camera has this one."""
+    first, *others = run.adjustment.sensors
+    changed = replace(run, adjustment=replace(run.adjustment, sensors=(Splined(first, spline), *others)))
+    entries = [json_form(view.correction) for view in measure_views(changed)[:2]]
+    found, without = (
+        {key: one[key] for key in one if re.match("jitter|detector|step_|sinusoid", key)} for one in entries
+    )
+    assert without == {}
+    return found
+
+
+def test_what_follows_in_the_image_is_the_rms_over_its_rows_and_of_its_steps(block_run):
     """A spline that is a straight line, from -3 px in the first row to 3 px in the last: over the root of three."""
-    line = np.array([-9.0, -3.0, 3.0, 9.0])[:, None] * [0.6, 0.8]
-    assert _image_correction_entry(None) == {}
-    plain = _image_correction_entry(RowSpline(line, 500.0, 400.0))
-    assert set(plain) == {"jitter_px", "jitter_rows"}
-    assert plain["jitter_px"] == pytest.approx(3.0 / np.sqrt(3.0), rel=3e-3)
-    assert plain["jitter_rows"] == 800.0
-    steps = np.array([[0.0, 0.0], [3.0, 4.0], [0.0, -1.0]])
-    both = _image_correction_entry(RowSpline(line, 500.0, 400.0, np.array([99.5, 199.5]), steps))
-    assert both["jitter_px"] == plain["jitter_px"]  # the steps are no part of it
-    assert both["detector_px"] == pytest.approx(np.sqrt(26.0 / 3.0))
-    assert both["detectors"] == (100.0, 200.0)
-    alone = _image_correction_entry(RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
+    run, line, steps = block_run.run, np.array([-9.0, -3.0, 3.0, 9.0])[:, None] * [0.6, 0.8], np.zeros((3, 2))
+    steps[1:] = (3.0, 4.0), (0.0, -1.0)
+    plain = followed(run, RowSpline(line, 500.0, 400.0))
+    assert plain == {"jitter_px": pytest.approx(3.0 / np.sqrt(3.0), rel=3e-3), "jitter_rows": 800.0}
+    both = followed(run, RowSpline(line, 500.0, 400.0, np.array([99.5, 199.5]), steps))
+    detectors = {"detector_px": pytest.approx(np.sqrt(26.0 / 3.0)), "detectors": [100.0, 200.0]}
+    assert both == {**plain, **detectors}  # the steps are no part of the jitter
+    alone = followed(run, RowSpline(np.zeros((0, 2)), 0.0, 1.0, np.array([9.5]), steps[:2]))
     assert set(alone) == {"detector_px", "detectors"}
     strips = {"steps": np.zeros((2, 5)), "step_sizes": np.array([[3.0, 4.0], [0.0, 1.0]])}
     swings = {
         "periods": np.array([90.0, 70.0]),
         "amplitudes": np.array([[[0.3, 0.0], [0.0, 0.4]], [[0.0, 0.0], [1.2, 0.0]]]),
     }
-    found = _image_correction_entry(RowSpline(np.zeros((0, 2)), **strips, **swings))
-    assert found["step_px"] == pytest.approx(np.sqrt(26.0 / 2.0))
-    assert (found["sinusoid_px"], found["sinusoid_rows"]) == (pytest.approx(1.3), (90.0, 70.0))
+    assert followed(run, RowSpline(np.zeros((0, 2)), **strips, **swings)) == {
+        "step_px": pytest.approx(np.sqrt(26.0 / 2.0)),
+        "sinusoid_px": pytest.approx(1.3),
+        "sinusoid_rows": [90.0, 70.0],
+    }
 
 
 def test_places_are_brought_back_to_where_cameras_without_a_calibration_see_them(block_run):

@@ -12,12 +12,11 @@ from jsonschema import Draft202012Validator
 
 from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.report import Run
-from barpc.report.outcome import pair_ties, triangulate_tracks
+from barpc.report.outcome import pair_ties
 from barpc.report.records import Number, column, json_form, table
 from barpc.report.runfiles import read_summary
 from barpc.report.summary import published_schema
 from barpc.report.summary.views import ViewEntry
-from barpc.scene import middle_altitude
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.triangulation import epipolar_offset
 from tests.report.conftest import summarize
@@ -84,14 +83,6 @@ def test_a_summary_read_from_its_file_is_the_one_that_was_written(block_run):
     read = read_summary(block_run.folder)
     assert read == block_run.record
     assert json_form(read) == json.loads((block_run.folder / "summary.json").read_text()) == block_run.summary
-
-
-def test_outliers_do_not_bend_the_points_that_errors_are_measured_at(block_run):
-    run = block_run.run
-    clean = run.tracks.select(run.keep)
-    alone = triangulate_tracks(clean, run.after, middle_altitude(run.views), np.ones(len(clean), dtype=bool))
-    kept = run.keep & np.isin(run.tracks.point, np.flatnonzero(np.bincount(run.tracks.point[run.keep]) >= 2))
-    assert np.abs(run.ties_after.residuals[kept] - alone.residuals).max() < 1e-6
 
 
 def test_the_shift_of_a_camera_is_how_far_its_image_points_move(block_run):
