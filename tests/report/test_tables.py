@@ -26,7 +26,9 @@ from .made import a_pair, a_summary, a_view, without_points
 def rows_of(finished, name: str = "residuals.csv") -> list[dict[str, str]]:
     """The rows of a table of a run, by column."""
     with (finished.folder / "tables" / name).open(newline="", encoding="utf-8") as file:
-        return [*csv.DictReader(file)]
+        rows = [*csv.DictReader(file)]
+    assert not [row for row in rows if None in row or None in row.values()]  # of another number of cells
+    return rows
 
 
 def test_residuals_have_the_column_names_of_asp(block_run):
