@@ -26,6 +26,11 @@ def adjustment(findings: Any = (), left: Any = (), apart: Any = None, changed: f
     return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart, changed=changed)
 
 
+def moving(motion: Motion, gap: float = 7.0) -> Any:
+    """An adjustment with a group of tie points that move together, by `motion`."""
+    return adjustment([Finding("moving_objects", -1, None, np.zeros(2), 42.0, gap, "step", np.zeros(0), motion=motion)])
+
+
 def reasons(found: Any) -> list[str]:
     """What is said of places that stand out and of what else a group may be."""
     run: Any = SimpleNamespace(adjustment=found, met_worse=[])
@@ -143,9 +148,7 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
     ],
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
-    motion = Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
-    (found,) = explanations(adjustment([finding]))
+    (found,) = explanations(moving(Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)))
     assert found.sentence == (
         f"{said} (a cloud, water or shadows, or, between dates, a glacier, a landslide, a fault?), by 1.1 m from east "
         "to west apart from an effect of height, and were excluded; the larger part of the ground was taken to stand "
@@ -171,23 +174,18 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
 def test_a_group_that_moves_is_ground_only_between_dates(dates: tuple[str, str], cause: str) -> None:
     """Of less than a third nothing is said of the rest; control points on it are named."""
     motion = Motion(1.14, (1, 0), 0.3, (5.0, 43.0, 5.1, 43.2), "west", ("P1", "P4"), dates)
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
-    (found,) = explanations(adjustment([finding]))
+    (found,) = explanations(moving(motion))
     assert f"together {cause}, by 1.1 m" in found.sentence
     assert found.sentence.endswith("of height, and were excluded, with the GCPs P1, P4")
 
 
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
 def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
-    motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, gap, "step", np.zeros(0), motion=motion)
-    said = reasons(adjustment([finding]))
-    assert bool(said) == told
-    if told:
-        assert said == [
-            "Moving objects explain the tie points that move together hardly better than displaced rows or columns of "
-            "an image. Check where these tie points lie."
-        ]
+    said = (
+        "Moving objects explain the tie points that move together hardly better than displaced rows or columns of an "
+        "image. Check where these tie points lie."
+    )
+    assert reasons(moving(Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), ""), gap)) == [said] * told
 
 
 def interval(view: int, share: float, off: float) -> Interval:

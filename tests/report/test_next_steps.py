@@ -153,8 +153,13 @@ def triplet() -> Case:
     return Case(3)
 
 
-def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(triplet):
-    plain, _ = triplet.adjusted()
+@pytest.fixture(scope="module")
+def plain(triplet) -> Summary:
+    """What is said of three images by themselves."""
+    return triplet.adjusted()[0]
+
+
+def test_a_clean_run_hands_over_its_files_and_names_no_part_to_review(plain):
     assert kinds(plain) == ["use", "improve"]
     use, improve = plain.next
     files = "view_0000.vrt, view_0001.vrt, view_0002.vrt"
@@ -191,31 +196,25 @@ def test_with_a_dem_only_control_is_asked_for_and_with_wrong_control_the_part_th
     assert wrong.next[0].text.startswith("After review, use")
 
 
-def test_control_in_use_that_does_not_agree_promises_nothing(triplet):
-    summary, _ = triplet.adjusted()
-    assert expected(summary)
-    torn = replace(summary, gcps=(a_gcp("P", 5.0, 43.0, status="contradicts"),))
+def test_control_in_use_that_does_not_agree_promises_nothing(plain):
+    assert expected(plain)
+    torn = replace(plain, gcps=(a_gcp("P", 5.0, 43.0, status="contradicts"),))
     assert not {step.kind for step in next_steps(torn)} & {"improve"}
 
 
 @pytest.mark.parametrize("motion", [None, float("nan")])
-def test_a_covariance_that_is_not_known_promises_nothing(triplet, motion):
-    summary, _ = triplet.adjusted()
-    scene = summary.scene
-    assert scene is not None
-    first = scene.weakest_modes[0]
+def test_a_covariance_that_is_not_known_promises_nothing(plain, motion):
+    scene, first = plain.scene, plain.scene.weakest_modes[0]
     modes = (replace(first, motion_m=(motion, *first.motion_m[1:])), *scene.weakest_modes[1:])
     for some in (modes, scene.weakest_modes[:-1], ()):
-        assert not expected(
-            replace(summary, next=next_steps(replace(summary, scene=replace(scene, weakest_modes=some))))
-        )
+        steps = next_steps(replace(plain, scene=replace(scene, weakest_modes=some)))
+        assert not expected(replace(plain, next=steps))
 
 
-def test_no_gain_is_promised_that_is_smaller_than_the_prediction_is_sure_of(triplet):
+def test_no_gain_is_promised_that_is_smaller_than_the_prediction_is_sure_of(plain):
     """A DEM that is wrong by more than the cameras are."""
-    summary, _ = triplet.adjusted()
-    coarse = {**(summary.options or {}), "adjust": {"dem_bias_sigma": summary.scene.sigma_enu_m[2]}}  # type: ignore[union-attr]
-    steps = next_steps(replace(summary, options=coarse))
+    coarse = {**plain.options, "adjust": {"dem_bias_sigma": plain.scene.sigma_enu_m[2]}}
+    steps = next_steps(replace(plain, options=coarse))
     assert [one.source for step in steps for one in step.expected] == ["gcps"]
 
 
@@ -313,12 +312,11 @@ def test_a_check_of_cameras_that_agree_has_no_next_step():
     assert not next_steps(a_summary([a_view("A"), a_view("B")], [a_pair()], kind="check"))
 
 
-def test_the_terminal_ends_with_the_steps_and_the_folder_that_was_written(triplet, capsys):
-    summary, _ = triplet.adjusted()
-    print_summary(replace(summary, out_dir="a run"))
+def test_the_terminal_ends_with_the_steps_and_the_folder_that_was_written(plain, capsys):
+    print_summary(replace(plain, out_dir="a run"))
     lines = capsys.readouterr().out.splitlines()
     commands = ["dsm 'a run' -o dsm.tif", "export 'a run' s2p --to s2p", "ortho 'a run' -o ortho"]
-    assert lines[-5:] == [summary.next[0].text, *(f"  barpc {one}" for one in commands), summary.next[1].text]
+    assert lines[-5:] == [plain.next[0].text, *(f"  barpc {one}" for one in commands), plain.next[1].text]
 
 
 def test_the_page_shows_the_steps_before_its_questions_and_links_to_parts_that_it_has(block_run):
