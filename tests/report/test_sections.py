@@ -192,14 +192,6 @@ def test_pairs_are_told_by_the_worst_offset():
     assert asked("pairs") is None
 
 
-def test_pairs_without_an_angle_say_nothing_of_heights():
-    for field in ("height_m_per_px", "convergence_deg"):
-        unknown = asked("pairs", pairs=[a_pair(**{field: None})])
-        assert unknown.answer.endswith(
-            "No pair of images that passed has 30 matches and a convergence angle that determines heights."
-        )
-
-
 def test_corrections_are_told_by_the_farthest_move():
     ellipse = EllipseEntry(3.0, 1.0, 45.0, 5.0)
     views = [
@@ -364,11 +356,12 @@ def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
     assert table.columns[2] == "reservation"
 
 
-def test_heights_need_images_without_reservation_and_thirty_matches():
+def test_heights_need_images_without_reservation_thirty_matches_and_an_angle():
     none = "No pair of images that passed has 30 matches and a convergence angle that determines heights."
     best, doubted = a_pair("A", "B", 30, height_m_per_px=0.5), [VIEWS[0], a_view("B", **BAD), VIEWS[2]]
     assert none not in asked("pairs", pairs=[best]).answer
-    assert asked("pairs", pairs=[replace(best, num_matches=29)]).answer.endswith(none)
+    for lacking in ({"num_matches": 29}, {"height_m_per_px": None}, {"convergence_deg": None}):
+        assert asked("pairs", pairs=[replace(best, **lacking)]).answer.endswith(none)
     assert asked("pairs", doubted, pairs=[best]).answer.endswith(none)
 
 
