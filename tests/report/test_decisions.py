@@ -33,10 +33,6 @@ def with_views(summary: Summary, *changes: dict[str, Any]) -> Summary:
     return replace(summary, views=tuple(views))
 
 
-def asked(summary: Summary, **adjust: Any) -> Summary:
-    return replace(summary, options={**summary.options, "adjust": {**summary.options["adjust"], **adjust}})
-
-
 @pytest.fixture
 def record(block_run) -> Summary:
     return block_run.record
@@ -65,10 +61,8 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
 
 
 def test_the_matcher_is_said_to_be_asked_for(record):
-    tie = {**record.options["tie"], "matcher": "structure"}
-    assert "Not all pairs were matched by structure: " in said(
-        replace(matched(record), options={**record.options, "tie": tie})
-    )
+    options = {**record.options, "tie": {**record.options["tie"], "matcher": "structure"}}
+    assert "Not all pairs were matched by structure: " in said(replace(matched(record), options=options))
 
 
 def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
@@ -92,7 +86,8 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert "Degree 1 left systematic residuals of 0.31 px in B." in surely
     assert "as in the earlier run" in said(record, drift_degree=1, drift_sigma_m=(None,))
     assert "No attitude drift was estimated" in said(record, drift_degree=0, drift_sigma_m=())
-    text = said(asked(record, drift=2), drift_degree=2)
+    adjust = {**record.options["adjust"], "drift": 2}
+    text = said(replace(record, options={**record.options, "adjust": adjust}), drift_degree=2)
     assert "The degree of the attitude drift, 2, was set by an option." in text
 
 
