@@ -20,10 +20,10 @@ from barpc.report.measures.block import explanations, left_entries, strangeness
 NAMES = "west", "east"
 
 
-def adjustment(findings: Any = (), left: Any = (), apart: Any = None, changed: float = 0.0) -> Any:
-    half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
-    cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
-    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart, changed=changed)
+def adjustment(findings: Any = (), names: Any = NAMES, **fields: Any) -> Any:
+    half = np.array([[4000.0, 2000.0, 4000.0], [6000.0, 3000.0, 6000.0]])
+    usual = {"left": (), "apart": None, "changed": 0.0, "cameras": SimpleNamespace(unknowns=SimpleNamespace(half=half))}
+    return SimpleNamespace(names=names, findings=findings, **{**usual, **fields})
 
 
 def moving(motion: Motion, gap: float = 7.0) -> Any:
@@ -68,32 +68,17 @@ def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sent
 
 
 @pytest.mark.parametrize(
-    ("names", "or_of", "sentence"),
-    [
-        (
-            ("west", "east", "north"),
-            (),
-            "rows of east have a sinusoidal displacement of 0.10 px with a period of 200 rows",
-        ),
-        (
-            ("west", "east", "north"),
-            (0, 2),
-            "rows of east or west or north have a sinusoidal displacement of 0.10 px with a period of 200 rows",
-        ),
-        # of two images nobody sees what there is along the epipolar lines
-        (
-            ("west", "east"),
-            (0,),
-            "rows of east or west have a sinusoidal displacement of at least 0.10 px with a period of 200 rows",
-        ),
-    ],
+    ("count", "or_of", "whose", "least"),
+    [(3, (), "east", ""), (3, (0, 2), "east or west or north", ""), (2, (0,), "east or west", "at least ")],
 )
-def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sentence) -> None:
+def test_a_swing_is_said_with_its_period_and_whose_it_may_be(count, or_of, whose, least) -> None:
+    """Of two images nobody sees what there is along the epipolar lines."""
+    names = ("west", "east", "north")[:count]
     size, unknowns = np.array([0.06, 0.08]), np.array([0.06, 0.0, 0.0, 0.08])
     one = Finding("sinusoid", 1, None, size, 60.0, 2.0, "sinusoid" if or_of else "", unknowns, 199.6, or_of)
-    of_names = SimpleNamespace(**{**vars(adjustment([one])), "names": names})
-    (found,) = explanations(of_names)  # type: ignore[arg-type]
-    assert found.sentence == sentence
+    (found,) = explanations(adjustment([one], names=names))
+    displacement = f"sinusoidal displacement of {least}0.10 px with a period of 200 rows"
+    assert found.sentence == f"rows of {whose} have a {displacement}"
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
     assert found.candidates == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
