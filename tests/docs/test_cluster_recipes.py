@@ -50,18 +50,7 @@ def sbatch(script: str, tmp_path: Path, *words: str) -> int:
         pytest.skip("no SLURM controller answers (scontrol ping)")
     (tmp_path / "job.sh").write_text(script)
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    call = [
-        "sbatch",
-        "--wait",
-        "-n",
-        "3",
-        "-t",
-        "10",
-        "-o",
-        tmp_path / "job.log",
-        *words,
-        tmp_path / "job.sh",
-    ]
+    call = ["sbatch", "--wait", "-n", "3", "-t", "10", "-o", tmp_path / "job.log", *words, tmp_path / "job.sh"]
     return subprocess.run(call, env=environment, cwd=tmp_path, timeout=540).returncode
 
 
@@ -95,14 +84,7 @@ def test_the_job_script_of_dask_jobqueue_asks_for_what_the_page_says():
     assert call is not None
     with eval(f"make({call[1]})", {"make": jobqueue.SLURMCluster}) as cluster:
         script = cluster.job_script()
-    for wanted in (
-        "-n 1\n",
-        "--cpus-per-task=1\n",
-        "--mem=2G\n",
-        "-t 04:00:00\n",
-        "OMP_NUM_THREADS=1",
-        "--nthreads 1",
-    ):
+    for wanted in ("-n 1\n", "--cpus-per-task=1\n", "--mem=2G\n", "-t 04:00:00\n", "OMP_NUM_THREADS=1", "--nthreads 1"):
         assert wanted in script, script
     compile(block("jobqueue"), "page", "exec")
 

@@ -6,15 +6,11 @@ import re
 import shlex
 from pathlib import Path
 
-import click
 import pytest
 
 from barpc.base.options import read_options
-from barpc.cli import COMMANDS, cli
-from tests.docs.pages import DOCS, PAGES, ROOT, blocks
-
-PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
-"""Pages that speak of what is: the changelog speaks of what was, too."""
+from barpc.cli import COMMANDS
+from tests.docs.pages import DOCS, PRESENT, ROOT, blocks, flags
 
 GENERAL = {"--help", "-h", "--version", "-q", "-v", "-vv", "--quiet", "--verbose", "--debug", "--json"}
 
@@ -25,12 +21,6 @@ def commands(page: Path) -> list[str]:
     lines += re.findall(r"`(barpc [^`\n]+)`", page.read_text(encoding="utf-8"))
     lines += [part for line in lines for part in line.split("&&")[1:]]
     return [line.strip() for line in lines if re.match(r"\s*barpc\s+[-a-z]", line)]
-
-
-def flags(verb: str) -> set[str]:
-    command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
-    assert command is not None
-    return {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
 
 
 @pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))

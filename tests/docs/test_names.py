@@ -5,21 +5,20 @@ from __future__ import annotations
 import importlib
 import json
 import re
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import click
 import pytest
 
 import barpc
 from barpc.base.declarations import declared
 from barpc.base.options import RunOptions
-from barpc.cli import COMMANDS, cli
+from barpc.cli import COMMANDS
 from barpc.report.summary import published_schema
-from tests.docs.pages import DOCS, PAGES, ROOT, blocks
+from tests.docs.pages import DOCS, PRESENT, ROOT, blocks, flags
 
-PRESENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 GENERAL = {"--help", "--version", "--quiet", "--verbose", "--debug", "--json"}
 """Flags of every verb."""
 SCRIPTS = [ROOT / "benchmarks", ROOT / "tests", ROOT / "docs", ROOT / ".ci"]
@@ -36,10 +35,9 @@ def inline(page: Path) -> list[str]:
 
 
 @cache
-def flags() -> set[str]:
+def all_flags() -> set[str]:
     """Flags of all verbs."""
-    verbs = [cli.get_command(click.Context(cli, **cli.context_settings), verb) for verb in COMMANDS]
-    return GENERAL | {name for verb in verbs if verb for p in verb.params for name in (*p.opts, *p.secondary_opts)}
+    return GENERAL.union(*map(flags, COMMANDS))
 
 
 @cache
@@ -53,16 +51,10 @@ def other_flags() -> set[str]:
 def unknown_flags(code: str) -> set[str]:
     """Flags of a piece of code that neither a verb nor a script has."""
     if re.match(
-        r"(pip|rattler-build|pytest|ruff|mkdocs|gdal|git|python -m build|twine|oty|otbcli|sbatch|srun|towncrier)",
-        code,
+        r"(pip|rattler-build|pytest|ruff|mkdocs|gdal|git|python -m build|twine|oty|otbcli|sbatch|srun|towncrier)", code
     ):
         return set()
-    return set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code)) - flags() - other_flags()
-
-
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_flag_in_a_sentence_exists(page):
-    assert {code: wrong for code in inline(page) if (wrong := unknown_flags(code))} == {}
+    return set(re.findall(r"(?<!\S)--[a-z][a-z-]*", code)) - all_flags() - other_flags()
 
 
 def options() -> dict[str, set[str]]:
@@ -86,11 +78,6 @@ KEYWORDS = {"atmosphere", "bistatic", "first_pixel", "strict", "model", "executo
 """Arguments of functions, and choices behind a file's name."""
 
 
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_option_in_a_sentence_exists(page):
-    assert [wrong for code in inline(page) for wrong in wrong_options(code)] == []
-
-
 IMPORT = re.compile(r"^ *(?:from (barpc[\w.]*) import ([\w, ]+)|import (barpc\.[\w.]+))", re.MULTILINE)
 
 
@@ -107,16 +94,10 @@ def private(code: str) -> list[str]:
     return [name for name in taken if name not in listed and name.removeprefix("barpc.") not in barpc.__all__]
 
 
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_code_of_a_page_takes_public_names_only(page):
-    assert [name for block in blocks(page, "python") for name in private(block.text)] == []
-
-
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
 def test_notebooks_take_public_names_only(path):
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     assert [name for cell in cells if cell["cell_type"] == "code" for name in private("".join(cell["source"]))] == []
-    assert private("from barpc.base.geodesy import Array, fit_rpc\nimport barpc.ba") != []
 
 
 def found(name: str) -> bool:
@@ -143,11 +124,6 @@ def names(page: Path) -> set[str]:
     return {name if name.startswith("barpc") else f"barpc.{name}" for name in said}
 
 
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_module_and_function_that_a_page_names_exists(page):
-    assert sorted(name for name in names(page) if not found(name)) == []
-
-
 def paths(page: Path) -> set[str]:
     """Files and folders of the repository in a page's sentences and commands."""
     shell = [line for block in blocks(page, "", "bash", "sh") for line in block.text.splitlines()]
@@ -155,12 +131,6 @@ def paths(page: Path) -> set[str]:
     modules = re.findall(r"python -m ((?:benchmarks|tests)[\w.]*)", text)
     plain = re.findall(rf"(?<![\w/.-])(?:{FOLDERS})/[\w./-]*\w", text)
     return {*plain, *(module.replace(".", "/") for module in modules)}
-
-
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_file_of_the_repository_that_a_page_names_exists(page):
-    for path in paths(page):
-        assert (ROOT / path).exists() or (ROOT / f"{path}.py").exists(), path
 
 
 def value(name: str) -> bool:
@@ -174,24 +144,46 @@ def value(name: str) -> bool:
     return True
 
 
-@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_value_of_the_summary_that_a_page_names_exists(page):
+def wrong_values(page: Path) -> list[str]:
+    """Values of the summary that a page names and that there are not."""
     if "truth.json" in page.read_text(encoding="utf-8"):
-        return  # has views of its own
+        return []  # has views of its own
     said = [code for code in inline(page) if re.fullmatch(r"(views\[\]|pairs\[\]|gcps\[\]|scene)\.[\w.\[\]]+", code)]
-    assert [name for name in said if not value(name)] == []
+    return [name for name in said if not value(name)]
+
+
+WRONG: dict[str, Callable[[Path], Iterable[str]]] = {
+    "flags": lambda page: set().union(*map(unknown_flags, inline(page))),
+    "options": lambda page: {wrong for code in inline(page) for wrong in wrong_options(code)},
+    "public names in code": lambda page: [name for block in blocks(page, "python") for name in private(block.text)],
+    "modules and functions": lambda page: {name for name in names(page) if not found(name)},
+    "files": lambda page: {n for n in paths(page) if not (ROOT / n).exists() and not (ROOT / f"{n}.py").exists()},
+    "values of the summary": wrong_values,
+}
+"""What a page names -> what it names of these that does not exist."""
+
+
+@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("page", PRESENT, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_a_page_names_exists(page, what):
+    assert sorted(WRONG[what](page)) == []
 
 
 def test_the_checks_notice_what_does_not_exist(tmp_path):
     page = tmp_path / "page.md"
-    page.write_text("`--no-such`, `[tie] drift`, `serach = 3`, `barpc.tie.no`, `ba.no`, `benchmarks/no.py`\n")
-    assert [code for code in inline(page) if unknown_flags(code)] == ["--no-such"]
-    assert [wrong for code in inline(page) for wrong in wrong_options(code)] == ["[tie] drift", "serach = 3"]
-    assert sorted(name for name in names(page) if not found(name)) == ["barpc.ba.no", "barpc.tie.no"]
-    assert paths(page) == {"benchmarks/no.py"}
-    assert not value("scene.no")
-    assert not value("views[].no")
-    assert value("pairs[].chosen_by")
+    code = "from barpc import fit_rpc\nfrom barpc.base.geodesy import Array\nimport barpc.ba\n"
+    page.write_text(
+        "`--no-such`, `[tie] drift`, `serach = 3`, `barpc.tie.no`, `ba.no`, `benchmarks/no.py`, `scene.no`, "
+        f"`views[].no`, `pairs[].chosen_by`\n\n```python\n{code}```\n"
+    )
+    assert {what: sorted(wrong(page)) for what, wrong in WRONG.items()} == {
+        "flags": ["--no-such"],
+        "options": ["[tie] drift", "serach = 3"],
+        "public names in code": ["barpc.ba", "barpc.base.geodesy.Array"],
+        "modules and functions": ["barpc.ba.no", "barpc.tie.no"],
+        "files": ["benchmarks/no.py"],
+        "values of the summary": ["scene.no", "views[].no"],
+    }
     assert found("barpc.RpcFit.no") is False
     assert found("barpc.rpcio.FORMATS")
 

@@ -8,6 +8,7 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from email.message import Message
 from email.parser import Parser
 from pathlib import Path
 
@@ -33,6 +34,14 @@ def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return out / wheel, out / sdist
 
 
+@pytest.fixture
+def metadata(archives: tuple[Path, Path]) -> Message:
+    """What the wheel says of itself."""
+    with zipfile.ZipFile(archives[0]) as wheel:
+        name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
+        return Parser().parsestr(wheel.read(name).decode())
+
+
 def test_the_wheel_holds_the_whole_package_and_no_tests_or_samples(archives):
     with zipfile.ZipFile(archives[0]) as wheel:
         names = set(wheel.namelist())
@@ -49,28 +58,23 @@ def test_the_wheel_holds_the_whole_package_and_no_tests_or_samples(archives):
     assert [name for name in names if ".data/" in name] == [manual]
 
 
-def test_the_wheel_says_what_it_is(archives):
+def test_the_wheel_says_what_it_is(archives, metadata):
     with zipfile.ZipFile(archives[0]) as wheel:
-        name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
-        said = Parser().parsestr(wheel.read(name).decode())
         scripts = next(n for n in wheel.namelist() if n.endswith("entry_points.txt"))
         assert "barpc = barpc.cli:main" in wheel.read(scripts).decode()
-    assert said["Version"] == barpc.__version__
-    assert said["License-Expression"] == "Apache-2.0"
-    assert said["Requires-Python"] == ">=3.11"
-    versions = [c.rpartition(" ")[2] for c in said.get_all("Classifier") if "Python :: 3." in c]
+    assert metadata["Version"] == barpc.__version__
+    assert metadata["License-Expression"] == "Apache-2.0"
+    assert metadata["Requires-Python"] == ">=3.11"
+    versions = [c.rpartition(" ")[2] for c in metadata.get_all("Classifier") if "Python :: 3." in c]
     assert versions == ["3.11", "3.12", "3.13"]
-    needed = {r.split(">")[0] for r in said.get_all("Requires-Dist") if "extra ==" not in r}
+    needed = {r.split(">")[0] for r in metadata.get_all("Requires-Dist") if "extra ==" not in r}
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
     assert needed == {r.split(">")[0] for r in declared}
 
 
-def test_what_an_index_shows_has_no_link_into_the_repository_and_all_the_words(archives):
-    with zipfile.ZipFile(archives[0]) as wheel:
-        name = next(name for name in wheel.namelist() if name.endswith("METADATA"))
-        said = Parser().parsestr(wheel.read(name).decode())
-    assert said["Description-Content-Type"] == "text/markdown"
-    text, readme = said.get_payload(), (ROOT / "README.md").read_text(encoding="utf-8")
+def test_what_an_index_shows_has_no_link_into_the_repository_and_all_the_words(metadata):
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    text, readme = metadata.get_payload(), (ROOT / "README.md").read_text(encoding="utf-8")
     assert re.findall(r"\]\((?!https:)", readme)
     assert not re.findall(r"\]\((?!https:)|<img", text)
     for fence in re.findall(r"```.*?```", readme, re.DOTALL):
@@ -88,18 +92,12 @@ def test_an_index_takes_the_archives(archives):
 def test_the_source_archive_holds_what_it_takes_to_test_and_to_build_the_manual(archives):
     with tarfile.open(archives[1]) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    for name in ("pyproject.toml", "README.md", "LICENSE", "CITATION.cff", "mkdocs.yml", "barpc/py.typed"):
-        assert name in names, name
-    for name in (
-        "conftest.py",
-        "tests/conftest.py",
-        "data_samples/view_00.tif",
-        "docs/index.md",
-        "benchmarks/kernels.py",
-    ):
-        assert name in names, name
-    for name in ("recipe/recipe.yaml", "Dockerfile", "docs/man/barpc.1", "notebooks/first_run.ipynb"):
-        assert name in names, name
+    needed = (
+        *("pyproject.toml", "README.md", "LICENSE", "CITATION.cff", "mkdocs.yml", "barpc/py.typed", "conftest.py"),
+        *("tests/conftest.py", "data_samples/view_00.tif", "docs/index.md", "benchmarks/kernels.py"),
+        *("recipe/recipe.yaml", "Dockerfile", "docs/man/barpc.1", "notebooks/first_run.ipynb"),
+    )
+    assert [name for name in needed if name not in names] == []
     assert not [name for name in names if "__pycache__" in name]
     rasters = {name for name in names if name.lower().endswith((".tif", ".ntf", ".hgt", ".jp2", ".gtx"))}
     rasters -= {"barpc/rasters/egm96_15.tif"}  # heights of the geoid, in the public domain

@@ -15,8 +15,8 @@ import pytest
 from packaging.requirements import Requirement
 
 import barpc
-from barpc.cli import COMMANDS, cli
-from tests.docs.pages import DOCS, ROOT
+from barpc.cli import COMMANDS
+from tests.docs.pages import DOCS, ROOT, command
 from tests.docs.test_pages import script
 
 CONDA = {"opencv-python-headless": "py-opencv"}
@@ -43,8 +43,7 @@ def test_the_manual_page_is_what_the_code_says_and_has_every_verb_and_flag():
     sections = {head: body for head, _, body in (part.partition("\n") for part in text.split("\n.SH "))}
     for verb in COMMANDS:
         told = sections[f"BARPC {verb.upper()}"].replace("\\-", "-")
-        command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
-        flags = [name for p in command.params if isinstance(p, click.Option) for name in p.opts]
+        flags = [name for p in command(verb).params if isinstance(p, click.Option) for name in p.opts]
         assert flags or verb in ("verify", "report")  # only those that every verb has
         for flag in flags:
             assert re.search(rf"^\.B (.*, )?{re.escape(flag)}( |,|$)", told, re.MULTILINE), f"{verb} {flag}"
@@ -58,8 +57,8 @@ def test_the_manual_page_keeps_what_roff_would_take_for_its_own():
 
 @pytest.mark.skipif(shutil.which("groff") is None, reason="no groff")
 def test_roff_reads_the_manual_page_without_a_warning():
-    command = ["groff", "-man", "-ww", "-Tutf8", "-z", str(DOCS / "man" / "barpc.1")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = ["groff", "-man", "-ww", "-Tutf8", "-z", str(DOCS / "man" / "barpc.1")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -94,10 +93,7 @@ def test_the_container_copies_what_the_wheel_is_made_of_and_is_named_by_the_vers
         barpc.__version__
     }
     assert set(re.findall(r"barpc:(\S+)", text)) == {barpc.__version__}
-    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == [
-        "USER 1000",
-        'ENTRYPOINT ["barpc"]',
-    ]
+    assert re.findall(r"^(?:USER|ENTRYPOINT) .*$", text, re.MULTILINE) == ["USER 1000", 'ENTRYPOINT ["barpc"]']
     let_in = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")}
     wheel = project()["tool"]["hatch"]["build"]["targets"]["wheel"]
     used = {*wheel["packages"], *wheel["shared-data"], "pyproject.toml", "README.md", "LICENSE"}

@@ -56,20 +56,13 @@ def test_the_page_of_options_is_what_the_code_says():
 def test_the_picture_of_the_house_is_what_the_code_says():
     generator = script("figures/architecture")
     assert generator.OUT.read_text(encoding="utf-8") == generator.drawing()
-    off = (
-        ("ba/adjustment.py", "adjust_tracks", ""),
-        ("fit/refit.py", "fit_rpc", ""),
-        ("fit/refit.py", "no_such", ""),
-    )
+    off = (("ba/adjustment.py", "adjust_tracks", ""), ("fit/refit.py", "fit_rpc", ""), ("fit/refit.py", "no_such", ""))
     assert generator.broken(off) == ["fit/refit.py: fit_rpc", "fit/refit.py: no_such"]
 
 
 def test_every_room_of_barpc_stands_in_the_plan_of_the_house():
     plan = (DOCS / "architecture.md").read_text(encoding="utf-8").split("```")[1]
-    rooms = {path.name for path in (ROOT / "barpc").iterdir() if path.suffix == ".py"} - {
-        "__init__.py",
-        "__main__.py",
-    }
+    rooms = {path.name for path in (ROOT / "barpc").iterdir() if path.suffix == ".py"} - {"__init__.py", "__main__.py"}
     rooms |= {f"{path.parent.name}/" for path in (ROOT / "barpc").glob("*/__init__.py")}
     assert [room for room in sorted(rooms) if room not in plan] == []
     told = set(re.findall(r"\b[a-z]\w+\.py\b", plan))
@@ -109,12 +102,6 @@ def test_the_tables_of_formats_are_those_of_the_code():
 def test_the_page_of_the_report_names_every_table_of_a_run():
     text = (DOCS / "report.md").read_text(encoding="utf-8")
     assert all(f"`tables/{name}`" in text for name in TABLES)
-
-
-def test_every_page_of_the_navigation_exists_and_every_page_is_in_it():
-    configuration = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    listed = re.findall(r": ([\w/]+\.md)$", configuration, re.MULTILINE)
-    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
 
 
 def test_type_checkers_know_every_public_name():

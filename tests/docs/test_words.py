@@ -7,11 +7,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
 
-from barpc.cli import COMMANDS, cli
-from tests.docs.pages import DOCS, ROOT
+from barpc.cli import COMMANDS
+from tests.docs.pages import DOCS, ROOT, command
 
 PACKAGE = ROOT / "barpc"
 DIALECT = (
@@ -74,21 +73,17 @@ def test_no_sentence_or_docstring_of_a_folder_is_in_the_old_dialect(folder: str)
     assert phrases(PACKAGE / folder) == []
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))], ids=lambda page: page.name)
-def test_no_page_is_in_the_old_dialect(page: Path) -> None:
+PAGES = ROOT / "README.md", *sorted(DOCS.rglob("*.md")), *sorted(PACKAGE.rglob("*.j2"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_page_or_template_is_in_the_old_dialect(page: Path) -> None:
     assert found(page.read_text(encoding="utf-8")) == []
-
-
-@pytest.mark.parametrize("template", sorted(PACKAGE.rglob("*.j2")), ids=lambda path: path.name)
-def test_no_template_is_in_the_old_dialect(template: Path) -> None:
-    assert found(template.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize("verb", COMMANDS)
 def test_no_help_is_in_the_old_dialect(verb: str) -> None:
-    command = cli.get_command(click.Context(cli, **cli.context_settings), verb)
-    assert command is not None
-    helps = [command.help, *(getattr(parameter, "help", None) for parameter in command.params)]
+    helps = [command(verb).help, *(getattr(parameter, "help", None) for parameter in command(verb).params)]
     assert [phrase for text in helps for phrase in found(text or "")] == []
 
 

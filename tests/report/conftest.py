@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from barpc.ba import AdjustOptions, adjust_tracks
+from barpc.ba import AdjustOptions
 from barpc.base.options import RunOptions
-from barpc.fit import fit_rpc
 from barpc.pipeline.outputs import write_tables
 from barpc.report import Run, Summary, verdict
 from barpc.report.records import json_form
@@ -21,40 +23,26 @@ from barpc.simulate import simulate_block
 from barpc.workspace import Workspace
 from tests.sealing import seal
 
+from .worlds import run_of
+
 STAGE = {"stage": "adjustment", "seconds": 2.5, "cpu_seconds": 2.0, "peak_memory_mb": 150.0}
 
 
 def run_of_block(
-    num_views: int,
-    num_tracks: int,
-    *,
-    gcps: bool = False,
-    names: list[str] | None = None,
-    **block_options: object,
+    num_views: int, num_tracks: int, *, gcps: bool = False, names: list[str] | None = None, **block_options: object
 ) -> Run:
     """A block adjusted and refitted, as a run."""
     block = simulate_block(num_views, num_tracks, seed=5, num_gcps=6 * gcps, attitude=3e-6, **block_options)
-    views = block.views
     if names is not None:
-        views = tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
-    control = block.gcps if gcps else None
-    options = RunOptions(adjust=AdjustOptions(), gcp=("points.gcp",) if gcps else ())
-    adjustment = adjust_tracks(views, block.tracks, options.adjust, control)
-    centers = tuple(camera_center(view.sensor, view.size, view.alt_range) for view in views)
-    fits = tuple(fit_rpc(s, v.size, v.alt_range) for s, v in zip(adjustment.sensors, views, strict=True))
-    return Run(
-        "adjust",
-        views,
-        (),
-        block.tracks,
-        adjustment=adjustment,
-        centers=centers,
-        fits=fits,
-        written=tuple({f"{view.name}_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}} for view in views),
-        options=options,
-        stages=[STAGE],
-        gcps=control,
-    )
+        views = (replace(view, name=name) for view, name in zip(block.views, names, strict=True))
+        block = replace(block, views=tuple(views))
+    fields = {
+        "centers": tuple(camera_center(view.sensor, view.size, view.alt_range) for view in block.views),
+        "written": tuple({f"{v.name}_RPC.TXT": {"gdal": 1e-9, "rpcm": "cannot read it"}} for v in block.views),
+        "options": RunOptions(adjust=AdjustOptions(), gcp=("points.gcp",) if gcps else ()),
+        "stages": [STAGE],
+    }
+    return run_of(block, gcps=block.gcps if gcps else None, run=fields)
 
 
 def summarize(run: Run) -> dict[str, Any]:
@@ -89,6 +77,20 @@ class Finished:
     @property
     def views(self) -> tuple[View, ...]:
         return self.run.views
+
+
+@pytest.fixture
+def copied(tmp_path) -> Callable[..., Path]:
+    """Copies the folder of a run, `change` made to what its summary holds."""
+
+    def made(finished: Finished, name: str = "copy", change: Callable[[dict[str, Any]], object] | None = None) -> Path:
+        shutil.copytree(finished.folder, folder := tmp_path / name)
+        if change is not None:
+            change(summary := json.loads((folder / "summary.json").read_text()))
+            (folder / "summary.json").write_text(json.dumps(summary))
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")

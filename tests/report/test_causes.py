@@ -20,10 +20,15 @@ from barpc.report.measures.block import explanations, left_entries, strangeness
 NAMES = "west", "east"
 
 
-def adjustment(findings: Any = (), left: Any = (), apart: Any = None, changed: float = 0.0) -> Any:
-    half = np.array([[4000.0, 2000.0], [6000.0, 3000.0]])
-    cameras = SimpleNamespace(unknowns=SimpleNamespace(half=half))
-    return SimpleNamespace(names=NAMES, findings=findings, left=left, cameras=cameras, apart=apart, changed=changed)
+def adjustment(findings: Any = (), names: Any = NAMES, **fields: Any) -> Any:
+    half = np.array([[4000.0, 2000.0, 4000.0], [6000.0, 3000.0, 6000.0]])
+    usual = {"left": (), "apart": None, "changed": 0.0, "cameras": SimpleNamespace(unknowns=SimpleNamespace(half=half))}
+    return SimpleNamespace(names=names, findings=findings, **{**usual, **fields})
+
+
+def moving(motion: Motion, gap: float = 7.0) -> Any:
+    """An adjustment with a group of tie points that move together, by `motion`."""
+    return adjustment([Finding("moving_objects", -1, None, np.zeros(2), 42.0, gap, "step", np.zeros(0), motion=motion)])
 
 
 def reasons(found: Any) -> list[str]:
@@ -57,44 +62,23 @@ def reasons(found: Any) -> list[str]:
 def test_a_finding_is_said_with_its_place_and_size(kind, view, where, size, sentence, ends) -> None:
     (found,) = explanations(adjustment([Finding(kind, view, where, np.array(size), 42.0, 7.0, "", np.zeros(2))]))
     assert found.sentence == sentence
-    assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (
-        kind,
-        NAMES[view],
-        42.0,
-        7.0,
-        None,
-    )
+    assert (found.name, found.image, found.gain, found.gap, found.runner_up) == (kind, NAMES[view], 42.0, 7.0, None)
     assert (found.first, found.last) == ends
     assert found.size_px == pytest.approx(np.hypot(*size))
 
 
 @pytest.mark.parametrize(
-    ("names", "or_of", "sentence"),
-    [
-        (
-            ("west", "east", "north"),
-            (),
-            "rows of east have a sinusoidal displacement of 0.10 px with a period of 200 rows",
-        ),
-        (
-            ("west", "east", "north"),
-            (0, 2),
-            "rows of east or west or north have a sinusoidal displacement of 0.10 px with a period of 200 rows",
-        ),
-        # of two images nobody sees what there is along the epipolar lines
-        (
-            ("west", "east"),
-            (0,),
-            "rows of east or west have a sinusoidal displacement of at least 0.10 px with a period of 200 rows",
-        ),
-    ],
+    ("count", "or_of", "whose", "least"),
+    [(3, (), "east", ""), (3, (0, 2), "east or west or north", ""), (2, (0,), "east or west", "at least ")],
 )
-def test_a_swing_is_said_with_its_period_and_whose_it_may_be(names, or_of, sentence) -> None:
+def test_a_swing_is_said_with_its_period_and_whose_it_may_be(count, or_of, whose, least) -> None:
+    """Of two images nobody sees what there is along the epipolar lines."""
+    names = ("west", "east", "north")[:count]
     size, unknowns = np.array([0.06, 0.08]), np.array([0.06, 0.0, 0.0, 0.08])
     one = Finding("sinusoid", 1, None, size, 60.0, 2.0, "sinusoid" if or_of else "", unknowns, 199.6, or_of)
-    of_names = SimpleNamespace(**{**vars(adjustment([one])), "names": names})
-    (found,) = explanations(of_names)  # type: ignore[arg-type]
-    assert found.sentence == sentence
+    (found,) = explanations(adjustment([one], names=names))
+    displacement = f"sinusoidal displacement of {least}0.10 px with a period of 200 rows"
+    assert found.sentence == f"rows of {whose} have a {displacement}"
     assert (found.image, found.period, found.first) == ("east", 199.6, None)
     assert found.candidates == (tuple(names[v] for v in or_of) or None)
     assert found.size_px == pytest.approx(0.1)
@@ -144,17 +128,12 @@ def test_images_that_settle_alike_are_said_once(rate: float, end: str) -> None:
 @pytest.mark.parametrize(
     ("side", "said"),
     [
-        (
-            "north-west",
-            "35 % of the tie points, in the north-west of the block, move together",
-        ),
+        ("north-west", "35 % of the tie points, in the north-west of the block, move together"),
         ("", "35 % of the tie points, about 5.0500, 43.1000 deg, move together"),
     ],
 )
 def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: str) -> None:
-    motion = Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
-    (found,) = explanations(adjustment([finding]))
+    (found,) = explanations(moving(Motion(1.14, (1, 0), 0.354, (5.0, 43.0, 5.1, 43.2), side)))
     assert found.sentence == (
         f"{said} (a cloud, water or shadows, or, between dates, a glacier, a landslide, a fault?), by 1.1 m from east "
         "to west apart from an effect of height, and were excluded; the larger part of the ground was taken to stand "
@@ -180,23 +159,18 @@ def test_a_group_that_moves_is_said_with_its_share_and_place(side: str, said: st
 def test_a_group_that_moves_is_ground_only_between_dates(dates: tuple[str, str], cause: str) -> None:
     """Of less than a third nothing is said of the rest; control points on it are named."""
     motion = Motion(1.14, (1, 0), 0.3, (5.0, 43.0, 5.1, 43.2), "west", ("P1", "P4"), dates)
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, 7.0, "step", np.zeros(0), motion=motion)
-    (found,) = explanations(adjustment([finding]))
+    (found,) = explanations(moving(motion))
     assert f"together {cause}, by 1.1 m" in found.sentence
     assert found.sentence.endswith("of height, and were excluded, with the GCPs P1, P4")
 
 
 @pytest.mark.parametrize(("gap", "told"), [(4.9, True), (5.1, False)])
 def test_what_else_a_group_may_be_is_a_reason_where_ties_cannot_tell(gap: float, told: bool) -> None:
-    motion = Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), "")
-    finding = Finding("moving_objects", -1, None, np.zeros(2), 42.0, gap, "step", np.zeros(0), motion=motion)
-    said = reasons(adjustment([finding]))
-    assert bool(said) == told
-    if told:
-        assert said == [
-            "Moving objects explain the tie points that move together hardly better than displaced rows or columns of "
-            "an image. Check where these tie points lie."
-        ]
+    said = (
+        "Moving objects explain the tie points that move together hardly better than displaced rows or columns of an "
+        "image. Check where these tie points lie."
+    )
+    assert reasons(moving(Motion(1.0, (0, 1), 0.2, (5.0, 43.0, 5.1, 43.2), ""), gap)) == [said] * told
 
 
 def interval(view: int, share: float, off: float) -> Interval:

@@ -11,8 +11,11 @@ import shutil
 import subprocess
 from html import escape, unescape
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from .conftest import Finished
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
@@ -32,29 +35,26 @@ FLAGS = [
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine (apt-get install chromium)")
 pytest.importorskip("jinja2")
 
-PROBE = Path(__file__).with_name("probe.js").read_text(encoding="utf-8")
 
-
-def probe(html: str, width: int, folder, dark: bool = False) -> dict:
-    """What the browser finds on a page shown `width` pixels wide."""
+def probe(html: str, width: int, folder: Path, dark: bool = False, *, by: str = "probe.js") -> dict[str, Any]:
+    """What a script finds in the browser on a page shown `width` pixels wide."""
+    script = Path(__file__).with_name(by).read_text(encoding="utf-8")
     report = html.replace('"use strict";', '"use strict"; onerror = m => document.title = "ERROR " + m;')
     wrapper = (
         f'<!doctype html><meta charset="utf-8"><body><iframe style="width:{width}px;height:900px;border:0" '
-        f'srcdoc="{escape(report)}"></iframe><script>{PROBE}</script></body>'
+        f'srcdoc="{escape(report)}"></iframe><script>{script}</script></body>'
     )
     path = folder / f"probe_{width}_{dark}.html"
     path.write_text(wrapper, encoding="utf-8")
-    mode = ["--blink-settings=preferredColorScheme=0"] if dark else ["--blink-settings=preferredColorScheme=1"]
-    command = [
-        CHROMIUM,
-        *FLAGS,
-        *mode,
-        f"--user-data-dir={folder / f'profile_{width}_{dark}'}",
-        path.as_uri(),
-    ]
+    mode = f"--blink-settings=preferredColorScheme={int(not dark)}"
+    command = [CHROMIUM, *FLAGS, mode, f"--user-data-dir={folder / f'profile_{width}_{dark}'}", path.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     body = done.stdout[done.stdout.index("<body>") + 6 : done.stdout.rindex("</body>")]
     return json.loads(unescape(body))
+
+
+def page(finished: Finished) -> str:
+    return (finished.folder / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module", params=[390, 1280], ids=["phone", "desk"])
@@ -66,7 +66,7 @@ def width(request):
 @pytest.mark.parametrize("fixture", ["block_run", "check_run", "antimeridian_run"])
 def test_it_opens_without_errors_and_nothing_overflows_or_overlaps(fixture, width, request, tmp_path):
     finished = request.getfixturevalue(fixture)
-    found = probe((finished.folder / "report.html").read_text(encoding="utf-8"), width, tmp_path)
+    found = probe(page(finished), width, tmp_path)
     assert found["title"] == f"barpc: {finished.summary['headline']}"
     assert found["errors"] == []
     assert found["charts"] > 3
@@ -79,7 +79,7 @@ def test_it_opens_without_errors_and_nothing_overflows_or_overlaps(fixture, widt
 
 @pytest.mark.slow
 def test_tables_sort_up_and_down_and_say_so(block_run, tmp_path):
-    found = probe((block_run.folder / "report.html").read_text(encoding="utf-8"), 1280, tmp_path)
+    found = probe(page(block_run), 1280, tmp_path)
     counts = sorted(view["num_observations"] for view in block_run.summary["views"])
     assert list(map(int, found["up"])) == counts
     assert list(map(int, found["down"])) == counts[::-1]
@@ -92,16 +92,14 @@ def test_tables_sort_up_and_down_and_say_so(block_run, tmp_path):
 
 @pytest.mark.slow
 def test_it_is_light_by_day_and_dark_by_night(block_run, tmp_path):
-    html = (block_run.folder / "report.html").read_text(encoding="utf-8")
-    day, night = (probe(html, 600, tmp_path, dark)["colors"] for dark in (False, True))
+    day, night = (probe(page(block_run), 600, tmp_path, dark)["colors"] for dark in (False, True))
     assert day == ["rgb(27, 31, 36)", "rgb(255, 255, 255)"]
     assert night == ["rgb(230, 237, 243)", "rgb(13, 17, 23)"]
 
 
 @pytest.mark.slow  # as what it is used for
 def test_the_probe_does_see_overflow_overlap_and_errors(block_run, tmp_path):
-    html = (block_run.folder / "report.html").read_text(encoding="utf-8")
-    broken = html.replace(
+    broken = page(block_run).replace(
         "</svg>", '<text x="400" y="20">overlapping words</text><text x="401" y="22">x</text></svg>', 1
     )
     broken = broken.replace("</script>", "nonsense();</script>")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,74 +29,45 @@ def compare(*folders: Path) -> dict[str, Any]:
     return compare_runs(*map(seal, folders))
 
 
-@pytest.mark.slow
-def test_a_run_does_not_differ_from_itself(block_run):
-    found = compare(block_run.folder, block_run.folder)
-    assert len(found["views"]) == 9
-    for view in found["views"]:
-        assert view["rpc_difference_px"] == 0
-        assert view["rmse"][0] == view["rmse"][1]
-    assert found["options"] == found["only_a"] == found["only_b"] == []
-
-
-def test_a_shift_of_a_camera_is_found_and_told_from_a_change_of_its_shape(block_run, tmp_path):
-    shutil.copytree(block_run.folder, tmp_path / "other")
-    path = tmp_path / "other" / f"{block_run.views[3].name}_RPC.TXT"
+def test_a_shift_of_a_camera_is_found_and_told_from_a_change_of_its_shape(block_run, copied):
+    path = copied(block_run) / f"{block_run.views[3].name}_RPC.TXT"
     rpc = read_rpc(path)
     write_rpc(replace(rpc, image_offset=rpc.image_offset + [3.0, -4.0]), path, overwrite=True)
-    found = compare(block_run.folder, tmp_path / "other")
+    found = compare(block_run.folder, path.parent)
     assert found["views"][3]["rpc_difference_px"] == pytest.approx(5.0, abs=1e-6)
     assert found["views"][3]["rpc_difference_without_shift_px"] < 1e-6
     assert "differ by up to 5 px (view_0003)" in " ".join(found["lines"])
+    others = [view for k, view in enumerate(found["views"]) if k != 3]
+    assert [view["rpc_difference_px"] for view in others] == [0.0] * 8
+    assert all(view["rmse"][0] == view["rmse"][1] for view in found["views"])
+    assert found["options"] == found["only_a"] == found["only_b"] == []
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (3.0, -4.0, 12.0)])
-def test_the_motion_of_the_scene_is_told_in_metres_from_the_first_run_to_the_second(block_run, tmp_path, motion):
+def test_the_motion_of_the_scene_is_told_in_metres_from_the_first_run_to_the_second(block_run, copied, motion):
     """RPCs whose ground is set elsewhere as a whole, whatever the summary says of it."""
-    shutil.copytree(block_run.folder, tmp_path / "other")
+    other = copied(block_run)
     for view in block_run.views:
-        path = tmp_path / "other" / f"{view.name}_RPC.TXT"
+        path = other / f"{view.name}_RPC.TXT"
         rpc = read_rpc(path)
         by = np.array(motion) / metres_per_unit(rpc.ground_offset)
         write_rpc(replace(rpc, ground_offset=rpc.ground_offset + by), path, overwrite=True)
-    found = compare(block_run.folder, tmp_path / "other")
+    found = compare(block_run.folder, other)
     assert found["moved_enu_m"] == pytest.approx(motion, abs=0.02)
-    back = compare(tmp_path / "other", block_run.folder)["moved_enu_m"]
+    back = compare(other, block_run.folder)["moved_enu_m"]
     assert back == pytest.approx([-one for one in motion], abs=0.02)
     said = next(line for line in found["lines"] if line.startswith("The scene moved by "))
     if any(motion):
         assert re.fullmatch(r"The scene moved by \+3\.0\d m east, -\S+ m north, \+1\S+ m up, 13 m in all, .*", said)
 
 
-def test_of_rpcs_of_one_image_no_motion_of_the_scene_is_told(block_run, tmp_path):
+def test_of_rpcs_of_one_image_no_motion_of_the_scene_is_told(block_run, copied):
     views = block_run.summary["views"]
-    for k, some in enumerate((views[:1], [views[0], {**views[1], "outputs": {}}])):
-        folder = tmp_path / f"{k}"
-        shutil.copytree(block_run.folder, folder)
-        text = json.dumps({**block_run.summary, "views": some, "pairs": []})
-        (folder / "summary.json").write_text(text)
+    for name, some in (("one", views[:1]), ("two", [views[0], {**views[1], "outputs": {}}])):
+        folder = copied(block_run, name, lambda summary, some=some: summary.update(views=some, pairs=[]))
         found = compare(folder, folder)
         assert found["moved_enu_m"] is None
         assert "moved" not in " ".join(found["lines"])
-
-
-def test_options_and_images_of_one_run_alone_are_named(block_run, tmp_path):
-    shutil.copytree(block_run.folder, tmp_path / "other")
-    summary = json.loads((tmp_path / "other/summary.json").read_text())
-    summary["options"]["adjust"]["drift"] = 1
-    gone = summary["views"].pop()["name"]
-    summary["pairs"] = [pair for pair in summary["pairs"] if gone not in (pair["a"], pair["b"])]
-    (tmp_path / "other/summary.json").write_text(json.dumps(summary))
-    found = compare(block_run.folder, tmp_path / "other")
-    assert found["options"] == [{"option": "adjust.drift", "values": [None, 1]}]
-    assert found["only_a"] == [block_run.views[-1].name]
-    assert "Option adjust.drift: None in A, 1 in B." in found["lines"]
-
-
-def test_runs_without_files_are_compared_by_their_errors(block_run, check_run):
-    found = compare(check_run.folder, block_run.folder)
-    assert all(view["rpc_difference_px"] is None for view in found["views"])
-    assert np.median([view["rmse"][0] / view["rmse"][1] for view in found["views"]]) > 3
 
 
 def test_runs_of_other_images_are_refused(block_run, antimeridian_run):
@@ -182,52 +152,47 @@ def test_pairs_in_both_are_set_side_by_side_with_their_last_offsets(compared):
     ]
 
 
-def test_options_of_one_run_alone_count_and_those_without_effect_do_not(tmp_path):
-    both = []
-    for name, options in (
-        ("a", {"x": 1, "deep": {"y": 2}, "overwrite": True}),
-        ("b", {"x": 1, "z": {}, "keep_going": 1}),
-    ):
-        summary = a_summary([a_view("A"), a_view(f"only {name}")], options=options)
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "summary.json").write_text(json.dumps(json_form(summary)))
-        both.append(tmp_path / name)
-    found = compare(*both)
+def test_options_of_one_run_alone_count_and_those_without_effect_do_not(compared):
+    options = ({"x": 1, "now": None, "deep": {"y": 2}, "overwrite": True}, {"x": 1, "now": 3, "z": {}, "keep_going": 1})
+    found = compared(*(a_summary([a_view("A"), a_view(f"only {k}")], options=options[k]) for k in (0, 1)))
     assert found["options"] == [
+        {"option": "now", "values": [None, 3]},
         {"option": "deep.y", "values": [2, None]},
         {"option": "z", "values": [None, {}]},
     ]
-    assert (found["only_a"], found["only_b"]) == (["only a"], ["only b"])
-    assert (found["a"], found["b"], found["versions"]) == (str(both[0]), str(both[1]), ["1", "1"])
+    assert (found["only_a"], found["only_b"], found["versions"]) == (["only 0"], ["only 1"], ["1", "1"])
+    assert [Path(found[key], "summary.json").is_file() for key in "ab"] == [True, True]
+    assert [found[key][-2:] for key in "ab"] == ["_a", "_b"]
     assert [view["name"] for view in found["views"]] == ["A"]
     assert flat_options({"a": {"b": {"c": 1}}, "d": {}}) == {"a.b.c": 1, "d": {}}
 
 
-def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, tmp_path):
-    for name, digit in (("one", "1"), ("two", "2")):
-        shutil.copytree(block_run.folder, tmp_path / name)
-        summary = json.loads((tmp_path / name / "summary.json").read_text())
-        for view in summary["views"]:
-            view["path"] = f"/{name}/{view['name']}.tif"
-        summary["inputs"] = [{"path": view["path"], "bytes": 9, "sha256": digit * 64} for view in summary["views"]]
-        summary["inputs"][0]["sha256"] = "0" * 64  # but for the first
-        (tmp_path / name / "summary.json").write_text(json.dumps(summary))
-    found = compare(tmp_path / "one", tmp_path / "two")
+def test_runs_of_other_images_of_the_same_names_are_not_compared(block_run, copied):
+    def of(folder: str, *digits: str) -> Path:
+        """Images of other places, and of other contents by these digits."""
+
+        def change(summary):
+            for view in summary["views"]:
+                view["path"] = f"/{folder}/{view['name']}.tif"
+            summary["inputs"] = [
+                {"path": view["path"], "bytes": 9, "sha256": digit * 64}
+                for view, digit in zip(summary["views"], digits, strict=True)
+            ]
+
+        return copied(block_run, folder, change)
+
+    one = of("one", "0", *"11111111")
+    found = compare(one, of("two", "0", *"22222222"))
     assert [view["name"] for view in found["views"]] == ["view_0000"]
     assert found["only_a"] == found["only_b"] == [view.name for view in block_run.views[1:]]
-    summary["inputs"][0]["sha256"] = "2" * 64
-    (tmp_path / "two/summary.json").write_text(json.dumps(summary))
     with pytest.raises(InputError, match="are other files, so these runs have none in common: nothing to compare"):
-        compare(tmp_path / "one", tmp_path / "two")
+        compare(one, of("three", *"222222222"))
 
 
-def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, tmp_path):
+def test_a_file_is_the_same_option_from_folders_of_any_depth(block_run, copied, tmp_path):
     def of(folder, path):
-        shutil.copytree(block_run.folder, tmp_path / folder)
-        summary = json.loads((tmp_path / folder / "summary.json").read_text())
-        summary["options"].update(dem=path, gcp=[path, "https://a.org/x"], aoi=None)
-        (tmp_path / folder / "summary.json").write_text(json.dumps(summary))
-        return tmp_path / folder
+        given = {"dem": path, "gcp": [path, "https://a.org/x"], "aoi": None}
+        return copied(block_run, folder, lambda summary: summary["options"].update(given))
 
     one, deeper = of("one", "../srtm.tif"), of("two/deeper", "../../srtm.tif")
     other, moved = of("three/other", "../srtm.tif"), of("other/folder", "../../other.tif")

@@ -69,11 +69,3 @@ def test_the_page_shows_it_by_point_and_by_image(block_run):
     assert decisions(block_run.record)[-1] in unescape(html)
     without = replace(block_run.record, views=tuple(replace(v, control_w=None) for v in block_run.record.views))
     assert 'id="t-control"' not in report_html(without, block_run.folder)
-
-
-@pytest.mark.slow
-def test_a_run_without_control_tests_none(check_run, block_run):
-    assert check_run.record.control_test is None
-    _, summary = summary_of(block_run.run, None)
-    assert summary.control_test is None
-    assert all(view.control_w is None for view in summary.views)

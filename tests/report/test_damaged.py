@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import shutil
 import warnings
 from collections.abc import Iterator
 from copy import deepcopy
@@ -99,13 +98,12 @@ def small_runs(tmp_path_factory) -> dict[str, Finished]:
         pytest.param("adjust", 1, marks=pytest.mark.nightly),
     ],
 )
-def test_every_field_may_be_anything(verb, step, small_runs, block_run, tmp_path):
+def test_every_field_may_be_anything(verb, step, small_runs, block_run, copied):
     """All cases at night; before that every few-th, which is each field some times and each value in turn."""
     run = small_runs[verb]
     if verb == "adjust":  # no kind of field that a larger block has is missed
         assert set(kinds(run.summary)) == set(kinds(block_run.summary))
-    folder = tmp_path / "run"
-    shutil.copytree(run.folder, folder)
+    folder = copied(run)
     assert look(folder, run.summary)
     cases = product(places(run.summary), ((), *((value,) for value in VALUES)))
     taken = 0
@@ -125,26 +123,19 @@ def test_what_is_missing_is_named(block_run, tmp_path, key):
 
 
 @pytest.mark.parametrize("name", ["../outside.json", "/outside.json", "inside/../../outside.json", "..", "link.json"])
-def test_compare_opens_nothing_outside_the_folder(block_run, tmp_path, name):
-    folder = tmp_path / "run"
-    shutil.copytree(block_run.folder, folder)
+def test_compare_opens_nothing_outside_the_folder(block_run, copied, tmp_path, name):
+    outputs = {name.replace("/outside", f"{tmp_path}/outside", name[0] == "/"): {}}
+    folder = copied(block_run, change=lambda summary: summary["views"][0].update(outputs=outputs))
     write_rpc(make_rpc(), tmp_path / "outside.json")
     (folder / "link.json").symlink_to(tmp_path / "outside.json")
-    summary = deepcopy(block_run.summary)
-    summary["views"][0]["outputs"] = {name.replace("/outside", f"{tmp_path}/outside", name[0] == "/"): {}}
-    (folder / "summary.json").write_text(json.dumps(summary))
     seal(folder)
     with contextlib.suppress(InputError):
         differences = [view["rpc_difference_px"] for view in compare_runs(folder, folder)["views"]]
         assert differences == [None, *[0.0] * 8]
 
 
-def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(block_run.folder, folder)
-    summary = {**block_run.summary, "headline": "of \udce9t\udce9"}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    seal(folder)
+def test_a_name_that_is_no_text_does_not_keep_the_report_away(block_run, copied):
+    folder = seal(copied(block_run, change=lambda summary: summary.update(headline="of \udce9t\udce9")))
     assert "of \\udce9t\\udce9" in remake_report(folder).read_text()
 
 

@@ -14,6 +14,10 @@ from barpc.report.summary.ground_points import ControlTestEntry
 
 from .made import files_of, section
 
+STRIP = ExplanationEntry("step", "Rows lie off", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0)
+LEFT = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
+WORSE = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
+
 
 def said(summary: Summary, **scene: Any) -> str:
     return "\n".join(decisions(replace(summary, scene=replace(summary.scene, **scene)) if scene else summary))
@@ -27,10 +31,6 @@ def with_views(summary: Summary, *changes: dict[str, Any]) -> Summary:
         rest = {key: value for key, value in change.items() if key not in own}
         views[k] = replace(views[k], **own, correction=replace(views[k].correction, **rest))
     return replace(summary, views=tuple(views))
-
-
-def asked(summary: Summary, **adjust: Any) -> Summary:
-    return replace(summary, options={**summary.options, "adjust": {**summary.options["adjust"], **adjust}})
 
 
 @pytest.fixture
@@ -61,10 +61,8 @@ def test_what_tied_the_pairs_is_said_with_what_found_fewer(record):
 
 
 def test_the_matcher_is_said_to_be_asked_for(record):
-    tie = {**record.options["tie"], "matcher": "structure"}
-    assert "Not all pairs were matched by structure: " in said(
-        replace(matched(record), options={**record.options, "tie": tie})
-    )
+    options = {**record.options, "tie": {**record.options["tie"], "matcher": "structure"}}
+    assert "Not all pairs were matched by structure: " in said(replace(matched(record), options=options))
 
 
 def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
@@ -88,7 +86,8 @@ def test_a_drift_is_learnt_asked_for_or_an_earlier_runs(record):
     assert "Degree 1 left systematic residuals of 0.31 px in B." in surely
     assert "as in the earlier run" in said(record, drift_degree=1, drift_sigma_m=(None,))
     assert "No attitude drift was estimated" in said(record, drift_degree=0, drift_sigma_m=())
-    text = said(asked(record, drift=2), drift_degree=2)
+    adjust = {**record.options["adjust"], "drift": 2}
+    text = said(replace(record, options={**record.options, "adjust": adjust}), drift_degree=2)
     assert "The degree of the attitude drift, 2, was set by an option." in text
 
 
@@ -98,7 +97,7 @@ def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_
     assert "than the rest" in plain
     for cause in ("systematic", "held_out", "wrong_matches", "left"):
         text = said(with_views(record, {"cause": cause, "advice": "look"}), held_out_places=())
-        assert "No additional parameters were" not in text
+        assert "No further parameters of the images were selected." not in text
         assert "None of the additional parameters that were tested explains the inconsistent residuals." in text
         assert "than the rest" not in text
     odd = with_views(record, {"cause": "odd", "advice": "look"})
@@ -106,7 +105,7 @@ def test_residuals_that_nothing_explains_are_not_beside_a_word_that_nothing_was_
     untested = said(with_views(record, {"held_out_px": None}), held_out_places=())
     assert "than the rest" not in untested
     nothing = said(with_views(record, *[{"num_observations": 0}] * 9))
-    assert "additional" not in nothing
+    assert "parameters" not in nothing
 
 
 def test_priors_hold_or_were_widened(record):
@@ -141,32 +140,22 @@ def test_what_was_cut_and_kept_out_is_counted(record):
     assert f"Observations of tie points: {counts} move together)." in text
 
 
-def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest(record):
-    waving = with_views(
-        record,
-        {"jitter_px": 0.3, "jitter_rows": 400.0},
-        {"jitter_px": 0.1, "jitter_rows": 500.0},
-        {"detectors": (1.0,)},
-    )
-    text = said(waving)
-    assert "Splines with a knot every 400 rows model attitude jitter in 2 images, up to 0.30 px RMS" in text
-    assert "Without splines" not in text
-    assert "Steps between detectors are estimated at up to 1 column of 1 image." in text
-
-
-STRIP = ExplanationEntry(
-    "step", "rows 5-9 of B lie 1.00 px off the rest of it", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0
-)
-
-
-def test_jitter_is_said_with_what_was_left_without_it(record):
+def test_splines_are_said_with_the_rows_between_the_knots_of_the_largest_and_what_was_left_without(record):
     before = JustificationEntry(
         image="B", systematic_px=0.5, systematic_p=1e-9, neighbour_correlated_px=0.0, num_images=2
     )
-    waving = with_views(record, {"jitter_px": 0.1, "jitter_rows": 500.0}, {"jitter_px": 0.3, "jitter_rows": 500.0})
-    text, name = said(waving, jitter_justification=before), record.views[1].name
-    assert f"Splines with a knot every 500 rows model attitude jitter in 2 images, up to 0.30 px RMS ({name})." in text
-    assert "Without splines, systematic residuals of 0.50 px in B remained." in text
+    waving = with_views(
+        record,
+        {"jitter_px": 0.1, "jitter_rows": 500.0},
+        {"jitter_px": 0.3, "jitter_rows": 400.0},
+        {"detectors": (1.0,)},
+    )
+    text, name = said(waving), record.views[1].name
+    assert f"Splines with a knot every 400 rows model attitude jitter in 2 images, up to 0.30 px RMS ({name})." in text
+    assert "Without splines" not in text
+    assert "Steps between detectors are estimated at up to 1 column of 1 image." in text
+    left = "Without splines, systematic residuals of 0.50 px in B remained."
+    assert left in said(waving, jitter_justification=before)
     assert "Splines" not in said(record)
 
 
@@ -204,23 +193,19 @@ def test_an_accuracy_is_widened_from_half_a_percent_on(record):
 
 def test_where_nothing_won_it_is_said_why(record):
     assert "No further parameters of the images were selected." in said(record)
-    left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
-    text = said(record, left=(left,))
-    assert "None of the additional parameters that were tested explains the inconsistent residuals." in text
-    assert "Nothing stood out" not in text
+    nothing = "None of the additional parameters that were tested explains the inconsistent residuals."
+    text = said(record, left=(LEFT,))
+    assert nothing in text
+    assert "No further parameters of the images were selected." not in text
     many = with_views(record, *[{"unknowns": (0.0,) * 1500}] * 9)
-    assert "were tested: the block has more than 12,000 unknowns." in said(many, left=(left,))
-    strip = ExplanationEntry("step", "rows lie off", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0)
-    assert "None of what was tried" not in said(record, left=(left,), explanations=(strip,))
-    assert "Nothing stood out" not in said(record, held_out_places=None)  # of an earlier release
+    assert "were tested: the block has more than 12,000 unknowns." in said(many, left=(LEFT,))
+    assert nothing not in said(record, left=(LEFT,), explanations=(STRIP,))
+    assert "No further parameters" not in said(record, held_out_places=None)  # of an earlier release
 
 
 def test_what_was_taken_and_what_stands_out_are_tables(record):
-    strip = ExplanationEntry("step", "Rows lie off", "B", 120.4, 33.0, "low_frequency", "rows", 5.0, 9.0, 1.0)
-    left = LeftEntry("B", "columns", 10.0, 99.0, 0.42, 0.031, 2.0, 17.0)
-    one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
     pair = replace(record.pairs[0], tied_by="structure", num_matches=240, beaten=("guided 12 of 100", "x 20 of 100"))
-    scene = replace(record.scene, explanations=(strip,), left=(left,), held_out_places=(one,))
+    scene = replace(record.scene, explanations=(STRIP,), left=(LEFT,), held_out_places=(WORSE,))
     told = section(files_of(replace(record, scene=scene, pairs=(pair, *record.pairs[1:]))), "decisions")
     found = {table.key: [[cell.text for cell in row] for row in table.rows] for table in told.tables}
     assert found["explained"] == [["Rows lie off", "120", "33", "low_frequency"]]
@@ -233,6 +218,5 @@ def test_what_took_no_part_is_said_to_agree(record):
     agrees = "No part of an image has significantly larger residuals of check tie points than the rest."
     assert agrees in said(record)
     assert agrees not in said(record, num_held_out=0)
-    one = HeldOutEntry("B", "Rows 0-99 of B: they lie off", None, (0.0, 100.0), 20, 0.0, 0.2, 3e-7)
-    assert agrees not in said(record, held_out_places=(one,))
+    assert agrees not in said(record, held_out_places=(WORSE,))
     assert agrees not in said(record, held_out_places=None)  # of an earlier release

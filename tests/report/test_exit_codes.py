@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from barpc.ba.robust.consensus import TwoGroups
 from barpc.report.measures.views import measure_views
 from barpc.report.quality_checks import PASSED_STATUS
 from barpc.report.summary.words import STATUS_WORDS
@@ -50,85 +49,18 @@ def test_a_file_that_was_left_out_never_passes(kind, verdict):
     assert found["reasons"] == ["bad.tif was left out: has no RPC"]
 
 
-def rejected(run):
+def test_a_rejected_gcp_of_unknown_error_needs_a_look(block_run):
+    run = block_run.run
     tested = run.adjustment.control
     used = np.arange(len(tested.used)) != 2
-    return replace(run, adjustment=replace(run.adjustment, control=replace(tested, used=used)))
-
-
-def rejected_unseen(run):
-    run = rejected(run)
-    tested = run.adjustment.control
-    nothing = np.where(tested.used, tested.w, np.nan)
-    residual = np.where(tested.used[:, None], tested.residual, np.nan)
-    changed = replace(tested, w=nothing, residual=residual)
-    return replace(run, adjustment=replace(run.adjustment, control=changed))
-
-
-def contradicted(run):
-    tested = run.adjustment.control
-    w = np.where(np.arange(len(tested.w)) == 2, 4.5, tested.w)
-    return replace(run, adjustment=replace(run.adjustment, control=replace(tested, w=w)))
-
-
-def gcps_of_strangers(run):
-    return replace(run, gcps=replace(run.gcps, left_out=("a.csv: names unknown.tif",)))
-
-
-def check_points_of_strangers(run):
-    return replace(run, check_points=replace(run.gcps, left_out=("a.csv: names unknown.tif",)))
-
-
-@pytest.mark.few(2)
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        (rejected, "1 GCP rejected"),
-        (rejected_unseen, "too few images"),
-        (contradicted, "w = 4.5"),
-        (gcps_of_strangers, "unknown.tif"),
-        (check_points_of_strangers, "unknown.tif"),
-    ],
-)
-def test_ground_points_with_a_reservation_need_a_look(change, word, block_run):
-    summary = summarize(change(block_run.run))
-    assert summary["status"] == "look"
-    assert not summary["passed"]
+    unknown = np.where(used[:, None], tested.residual, np.nan)
+    control = replace(tested, used=used, w=np.where(used, tested.w, np.nan), residual=unknown)
+    summary = summarize(replace(run, adjustment=replace(run.adjustment, control=control)))
+    assert (summary["status"], summary["passed"]) == ("look", False)
     assert summary["headline"] == "All 9 images are adjusted; ground points need review."
-    assert len(summary["reasons"]) == 1
-    assert word in summary["reasons"][0]
-
-
-def in_the_image(adjustment):
-    motion = np.append(adjustment.gauge.motion_sigma[:3], np.full(7, 900.0))  # and tilts of the scene nearly open
-    return replace(adjustment, in_space_rms=0.95, gauge=replace(adjustment.gauge, motion_sigma=motion))
-
-
-def between_two_groups(adjustment):
-    return replace(adjustment, two_groups=(TwoGroups((1, 4), 0.31, 0.42),))
-
-
-def scattered(adjustment):
-    return replace(adjustment, noise=2.6)
-
-
-@pytest.mark.few(1)
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (in_the_image, ("leave 0.950 px", "affine", "no image was resampled", "The scene may be tilted")),
-        (between_two_groups, ("{1} and {4} form two groups", "31 %", "0.42 px", "between them")),
-        (scattered, ("scatter 2.6 times",)),
-    ],
-)
-def test_what_the_adjustment_says_of_the_block_needs_a_look(change, words, block_run):
-    run = block_run.run
-    summary = summarize(replace(run, adjustment=change(run.adjustment)))
-    assert summary["status"] == "look"
-    assert summary["headline"] == "All 9 images are adjusted; the block needs review."
-    reason = " ".join(summary["reasons"])
-    for word in words:
-        assert word.format(*run.adjustment.names) in reason
+    (reason,) = summary["reasons"]
+    assert reason.startswith("1 GCP rejected")
+    assert "too few images" in reason
 
 
 @pytest.mark.few(1)
@@ -167,8 +99,3 @@ def test_images_held_by_control_points_alone_are_not_weak(block_run):
     summary = summarize(replace(run, tracks=tracks, adjustment=adjustment))
     assert {view["status"] for view in summary["views"] if view["num_gcps"] >= 3} == {"adjusted"}
     assert {view["status"] for view in summary["views"] if view["num_gcps"] < 3} <= {"weak"}
-
-
-def test_passed_is_status_good(block_run, check_run):
-    for summary in (block_run.summary, check_run.summary):
-        assert summary["passed"] == (summary["status"] == "good") == (not summary["reasons"])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.ba.evidence.scan import CheckTies, worst_regions
+from barpc.ba.evidence.scan import CheckTies, Interval, worst_regions
 from barpc.base.statistics import CRITICAL
 from barpc.report import Run, summarize
 from barpc.report.outcome import MANY_REJECTED, SMOOTH_LEFT
@@ -64,20 +64,8 @@ def test_rows_that_only_they_contradict_are_named_and_need_a_look(run: Run, move
 
 def test_rows_that_stand_out_among_all_are_not_said_twice(run: Run) -> None:
     changed = moved(run, 1, (0.0, 0.25), (0.5, 0.0))
-    first = SimpleNamespace(
-        view=1,
-        axis=1,
-        start=0.0,
-        stop=900.0,
-        gain=50.0,
-        share=0.8,
-        off=0.1,
-        by_share=True,
-        apart=0.5,
-        moves=False,
-        part=0.25,
-    )
-    found: Any = replace(changed.adjustment, left=(first,))  # type: ignore[arg-type, type-var]
+    first = Interval(1, 1, 0.0, 900.0, 50.0, 0.8, 0.1, True, 0.5, part=0.25)
+    found: Any = replace(changed.adjustment, left=(first,))  # type: ignore[type-var]
     reasons = summarize(replace(changed, adjustment=found)).reasons
     assert len(reasons) == 1
     assert "disagree with the rest" in reasons[0]

@@ -17,18 +17,7 @@ from barpc.report.maps import Plane, ground_map, residual_cells, residual_panels
 from barpc.report.summary.block import ExplanationEntry
 from barpc.report.summary.ground_points import CheckPointEntry
 
-from .made import (
-    Drawing,
-    a_gcp,
-    a_pair,
-    a_square,
-    a_summary,
-    a_view,
-    corners,
-    files_of,
-    section,
-    seen,
-)
+from .made import Drawing, a_gcp, a_pair, a_square, a_summary, a_view, corners, files_of, section, seen
 
 jinja2 = pytest.importorskip("jinja2")
 
@@ -170,6 +159,18 @@ def test_no_number_of_the_graticule_stands_at_the_sheet_s_edge():
         assert len(down) >= 1
 
 
+@pytest.mark.parametrize(
+    ("axis", "at", "shown"),
+    [(0, 50.5, True), (0, 49.5, False), (0, 375.5, True), (0, 376.5, False), (0, 410.0, False),
+     (1, 16.5, True), (1, 15.5, False), (1, 255.5, True), (1, 256.5, False), (1, 270.0, False)],
+)  # fmt: skip
+def test_a_meridian_or_parallel_has_room_for_its_number(axis, at, shown):
+    place = (10.25, (at - 150) / 200) if axis else (10.0 - (at - 210) / 200, 0.25)
+    lines = drawn_graticule(Plane(*place, np.array([200.0, 200.0]), 300.0, 1e-3)).lines("grid")
+    found = [line for line in lines if line[axis] == pytest.approx(at, abs=0.006) and line[axis] == line[axis + 2]]
+    assert bool(found) == shown
+
+
 @pytest.mark.parametrize(("lon", "words"), [(180.0, "180° W"), (181.0, "179° W"), (179.0, "179° E"), (-1.0, "1° W")])
 def test_degrees_are_east_or_west_of_greenwich(lon, words):
     found = Plane(lon, 0.0, np.array([130.0, 130.0]), 300.0, 1e-3)
@@ -179,23 +180,20 @@ def test_degrees_are_east_or_west_of_greenwich(lon, words):
 # --- images on the ground ---------------------------------------------------------------------------------
 
 
-def scene():
-    """Two images over each other, and one a tenth of a degree to the east."""
-    views = [a_view("A", num_observations=5), a_view("B", status="weak"), a_view("C", status="failed")]
-    outlines = [a_square(10.0, 0.0), a_square(10.001, 0.001), a_square(10.1, 0.0)]
-    pairs = [a_pair("A", "B", 900), a_pair("A", "C", 30), a_pair("B", "C", 70)]
-    return views, outlines, pairs
+# two images over each other, and one a tenth of a degree to the east
+VIEWS = [a_view("A", num_observations=5), a_view("B", status="weak"), a_view("C", status="failed")]
+OUTLINES = [a_square(10.0, 0.0), a_square(10.001, 0.001), a_square(10.1, 0.0)]
+PAIRS = [a_pair("A", "B", 900), a_pair("A", "C", 30), a_pair("B", "C", 70)]
 
 
 def test_the_ground_map_has_outlines_dots_lines_and_points():
-    views, outlines, pairs = scene()
     known = CheckPointEntry("Q", 10.05, -0.01, 0.0, (None, None, None), ())
-    summary = a_summary(views, pairs, gcps=(a_gcp("P", 10.05, 0.005),), check_points=(known,))
+    summary = a_summary(VIEWS, PAIRS, gcps=(a_gcp("P", 10.05, 0.005),), check_points=(known,))
     points = [(10.0, 0.0, 5.0, 0.1), (10.1, 0.005, 5.0, 0.1)]
-    drawn = Drawing(ground_map(files_of(summary, outlines, points)))
-    at, tall = sheet(np.concatenate([*[*chain(*outlines)], np.array(points)[:, :2]]))
+    drawn = Drawing(ground_map(files_of(summary, OUTLINES, points)))
+    at, tall = sheet(np.concatenate([*[*chain(*OUTLINES)], np.array(points)[:, :2]]))
     assert drawn.box == (420, pytest.approx(tall, abs=0.006))
-    for status, outline in zip(("adjusted", "weak", "failed"), outlines, strict=True):
+    for status, outline in zip(("adjusted", "weak", "failed"), OUTLINES, strict=True):
         (found,) = drawn.points(f"outline {status}")
         assert np.array(found) == pytest.approx(at(outline[0][:-1]), abs=0.006)
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "1", "2"]
@@ -205,7 +203,7 @@ def test_the_ground_map_has_outlines_dots_lines_and_points():
     assert drawn.titles("tie") == [
         f"{pair} tie points used" for pair in ("A - C: 30", "B - C: 70", "A - B: 900")
     ]  # strongest on top
-    middle = [at(outline[0][:-1]).mean(axis=0) for outline in outlines]
+    middle = [at(outline[0][:-1]).mean(axis=0) for outline in OUTLINES]
     assert drawn.lines("tie")[0] == pytest.approx(np.concatenate([middle[0], middle[2]]), abs=0.006)
     (*_, widest) = drawn.of("line", "tie", "stroke-width", "stroke-opacity")
     assert widest == (3.0, 0.9)
@@ -251,7 +249,6 @@ def test_rows_with_few_tie_points_are_shaded_in_their_image_and_on_the_ground():
 
 
 def test_the_caption_names_what_is_on_the_map_and_nothing_else():
-    views, outlines, pairs = scene()
     moving = ExplanationEntry("moving_objects", "a cloud", None, 50.0, 40.0, box=(9.996, -0.004, 10.004, -0.001))
     rows = ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0)
     point = a_gcp("P", 10.0, 0.0)
@@ -266,13 +263,13 @@ def test_the_caption_names_what_is_on_the_map_and_nothing_else():
     for known in (set(), {"dots"}, {"triangles"}, {"inverted triangles"}, {"thicker lines"}, {"dashed"}, set(words)):
         found = (moving, rows) if "dashed" in known else (rows,)
         summary = a_summary(
-            views,
-            pairs if "thicker lines" in known else pairs[:1],
+            VIEWS,
+            PAIRS if "thicker lines" in known else PAIRS[:1],
             gcps=(point,) * ("triangles" in known),
             check_points=(check,) * ("inverted triangles" in known),
             scene=SimpleNamespace(explanations=found, left=(), held_out_places=()),
         )
-        files = files_of(summary, outlines, [(10.0, 0.0, 0.0, 0.0)] * ("dots" in known))
+        files = files_of(summary, OUTLINES, [(10.0, 0.0, 0.0, 0.0)] * ("dots" in known))
         _, *told = caption(files).rstrip(".").split("; ")
         told = [one for one in told if one != "those that need review on top"]
         assert told == [f"{key}: {word}" for key, word in words.items() if key in known]
@@ -283,23 +280,21 @@ def test_the_caption_names_what_is_on_the_map_and_nothing_else():
 
 @pytest.mark.parametrize("status", ["used", "not seen", "contradicts", "rejected", "undecided"])
 def test_a_gcp_that_contradicts_others_is_red_and_the_caption_says_so(status):
-    views, outlines, _ = scene()
-    summary = a_summary(views, gcps=(a_gcp("P", 10.0, 0.0, status=status), a_gcp("Q", 10.001, 0.0)))
-    drawn, wrong = Drawing(ground_map(files_of(summary, outlines))), status not in ("used", "not seen")
+    summary = a_summary(VIEWS, gcps=(a_gcp("P", 10.0, 0.0, status=status), a_gcp("Q", 10.001, 0.0)))
+    drawn, wrong = Drawing(ground_map(files_of(summary, OUTLINES))), status not in ("used", "not seen")
     classes = [mark.get("class") for mark in drawn.all("path") if "gcps" in (mark.get("class") or "").split()]
     assert classes == ["gcps doubted" if wrong else "gcps", "gcps"]
-    told = caption(files_of(summary, outlines))
+    told = caption(files_of(summary, OUTLINES))
     assert ("triangles: GCPs, red where they contradict others." in told) == wrong
     assert told.endswith("triangles: GCPs.") != wrong
 
 
 def test_residuals_of_gcps_are_named_arrows_in_plan_and_the_longest_is_said():
-    views, outlines, _ = scene()
     east, north = a_gcp("E", 10.0, 0.0), a_gcp("N", 10.002, 0.001)
     east, north = replace(east, residual_enu_m=(2.0, 0.0, 9.0)), replace(north, residual_enu_m=(0.0, -1.0, None))
-    files = files_of(a_summary(views, gcps=(east, north, a_gcp("unknown", 10.001, 0.002))), outlines)
+    files = files_of(a_summary(VIEWS, gcps=(east, north, a_gcp("unknown", 10.001, 0.002))), OUTLINES)
     drawn = Drawing(ground_map(files))
-    at, _ = sheet(np.concatenate([*chain(*outlines)]))
+    at, _ = sheet(np.concatenate([*chain(*OUTLINES)]))
     shafts = [corners(path.get("d")) for path in drawn.all("path", "miss")][::2]
     for shaft, (lon, lat), (right, down) in zip(
         shafts, ((10.0, 0.0), (10.002, 0.001)), ((40.0, 0.0), (0.0, 20.0)), strict=True
@@ -310,18 +305,17 @@ def test_residuals_of_gcps_are_named_arrows_in_plan_and_the_longest_is_said():
     assert "arrows: their residuals in plan (predicted minus given), the longest 2.0 m" in caption(files)
     assert {text[0] for text in drawn.texts("label")} <= {"E", "N", "unknown"}
     assert drawn.texts("label")
-    assert "arrows" not in caption(files_of(a_summary(views, gcps=(a_gcp("P", 10.0, 0.0),)), outlines))
+    assert "arrows" not in caption(files_of(a_summary(VIEWS, gcps=(a_gcp("P", 10.0, 0.0),)), OUTLINES))
 
 
 def test_where_tie_points_move_is_outlined_and_says_so():
-    views, outlines, pairs = scene()
     box = (9.996, -0.004, 10.004, -0.001)
     groups = (
         ExplanationEntry("moving_objects", "a <group> & more", None, 50.0, 40.0, box=box),
         ExplanationEntry("step", "rows lie off", "A", 9.0, 9.0),
     )
-    drawn = Drawing(ground_map(files_of(a_summary(views, pairs, scene=SimpleNamespace(explanations=groups)), outlines)))
-    at, _ = sheet(np.concatenate([*chain(*outlines)]))
+    drawn = Drawing(ground_map(files_of(a_summary(VIEWS, PAIRS, scene=SimpleNamespace(explanations=groups)), OUTLINES)))
+    at, _ = sheet(np.concatenate([*chain(*OUTLINES)]))
     assert drawn.titles("group") == ["a <group> & more"]
     (outline,) = drawn.rects("group")
     assert outline[:2] == pytest.approx(at(np.array([box[0], box[3]])), abs=0.006)
@@ -374,19 +368,17 @@ def test_a_name_tells_how_many_images_have_their_middle_in_the_same_place():
 
 
 def test_a_point_outside_of_all_images_is_on_the_map_too():
-    views, outlines, _ = scene()
-    drawn = Drawing(ground_map(files_of(a_summary(views, gcps=(a_gcp("P", 10.3, 0.0),)), outlines)))
+    drawn = Drawing(ground_map(files_of(a_summary(VIEWS, gcps=(a_gcp("P", 10.3, 0.0),)), OUTLINES)))
     assert max(x for x, _ in drawn.points("gcps")[0]) < 420
     assert drawn.points("point") == [[(0.0, 0.0)]]  # no tie point, and a path all the same
 
 
 def test_of_many_tie_points_and_images_some_are_drawn(sized):
-    views, outlines, _ = scene()
     points = [(10.0 + 1e-6 * k, 0.0, 0.0, 0.0) for k in range(1501)]
-    assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points))).points("point")[0]) == 751
-    assert len(Drawing(ground_map(files_of(a_summary(views), outlines, points[:1500]))).points("point")[0]) == 1500
+    assert len(Drawing(ground_map(files_of(a_summary(VIEWS), OUTLINES, points))).points("point")[0]) == 751
+    assert len(Drawing(ground_map(files_of(a_summary(VIEWS), OUTLINES, points[:1500]))).points("point")[0]) == 1500
     sized(shown=2)
-    drawn = Drawing(ground_map(files_of(a_summary(views), outlines)))
+    drawn = Drawing(ground_map(files_of(a_summary(VIEWS), OUTLINES)))
     assert [e.get("data-v") for e in drawn.all("g") if e.get("data-v")] == ["0", "2"]
 
 
@@ -447,10 +439,7 @@ def test_the_scale_of_residuals_is_written_without_powers_of_ten(size, said):
 def test_a_panel_draws_residuals_cells_and_arrows_to_one_length():
     views = [a_view("A", size=(900, 450)), a_view("B", size=(900, 450))]
     pushed = [(0, k, (60.0 + k % 2, 60.0), (0.0, 0.0), (0.3, 0.02 * (-1) ** k), True) for k in range(40)]
-    one = [
-        (1, 99, (899.5, 449.5), (0.0, 0.0), (0.0, 0.6), True),
-        (1, 98, (5.0, 5.0), (0, 0), (9.0, 9.0), False),
-    ]
+    one = [(1, 99, (899.5, 449.5), (0.0, 0.0), (0.0, 0.6), True), (1, 98, (5.0, 5.0), (0, 0), (9.0, 9.0), False)]
     charts_of, shares, key = panels([*pushed, *one], views)
     longest = float(np.quantile([math.hypot(0.3, 0.02)] * 40 + [0.6], 0.95))
     assert key == ""
@@ -561,17 +550,3 @@ def test_before_and_after_are_two_and_what_is_not_known_or_used_is_left_out():
     none = panels([(0, 1, (5, 5), (0, 0), (0.0, 0.0), True)], [a_view()])
     bars = [[text for text, *_ in Drawing(found[0][0][0]).texts("name")] for found in (after, before, none)]
     assert bars == [["0.5 px"], ["2.9 px"], ["1 px"]]
-
-
-@pytest.mark.parametrize(("x", "shown"), [(50.5, True), (49.5, False), (375.5, True), (376.5, False), (410.0, False)])
-def test_a_meridian_has_room_for_its_number(x, shown):
-    found = Plane(10.0 - (x - 210) / 200, 0.25, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_graticule(found).lines("grid")
-    assert (any(line[0] == pytest.approx(x, abs=0.006) and line[0] == line[2] for line in lines)) == shown
-
-
-@pytest.mark.parametrize(("y", "shown"), [(16.5, True), (15.5, False), (255.5, True), (256.5, False), (270.0, False)])
-def test_a_parallel_has_room_for_its_number(y, shown):
-    found = Plane(10.25, (y - 150) / 200, np.array([200.0, 200.0]), 300.0, 1e-3)
-    lines = drawn_graticule(found).lines("grid")
-    assert (any(line[1] == pytest.approx(y, abs=0.006) and line[1] == line[3] for line in lines)) == shown

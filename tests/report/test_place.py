@@ -12,20 +12,11 @@ from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import ecef_from_ground, metres_per_unit
 from barpc.report import Run
 from barpc.report.measures.views import ce90, measure_views, moved_in_space, stated_ce90
-from barpc.report.runfiles import read_tables
 from barpc.sensor.pushbroom import Pushbroom
 from barpc.sensor.rpc import RPC
 from barpc.simulate import simulate_block
-from tests.lanes import rest_slow
 
 MODELS = ("rotation+translation", "rotation", "translation")
-
-
-@pytest.mark.parametrize("minor", [1.0, 0.8, 0.5, 0.21, 0.05, 0.0])
-def test_nine_of_ten_points_lie_within_ce90(minor):
-    points = np.random.default_rng(3).normal(size=(400_000, 2)) * [2.0, 2.0 * minor]
-    assert np.mean(np.hypot(*points.T) < ce90(2.0, 2.0 * minor)) == pytest.approx(0.9, abs=0.0015)
-    assert ce90(0.0, 0.0) == 0.0
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -53,7 +44,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     covariance[: len(root), : len(root)] = root @ root.T
     shift, sigma, found = moved_in_space(sensor, covariance, model, middle)
     in_image = np.array(by_image).T @ root
-    assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=2e-3)
+    assert sigma == pytest.approx(np.sqrt((in_image**2).sum(axis=1)), rel=1e-4)
     assert shift == pytest.approx(pixel - sensor.sensor.project(middle), abs=1e-5)
     # an error that images have in common moves the unknowns, and the image besides: what is left of it counts
     response = root @ np.random.default_rng(5).normal(0.0, 0.3, (6, 2))
@@ -63,7 +54,6 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
     alone = np.array(by_image).T @ (root @ root.T - response @ response.T) @ np.array(by_image)
     _, shared, _ = moved_in_space(sensor, covariance, model, middle, None, (padded, beside))
     assert shared**2 == pytest.approx(np.diag(alone + left @ left.T), rel=5e-3)
-    _, _, found = moved_in_space(sensor, covariance, model, middle)
     values, axes = np.linalg.eigh(np.array(by_ground).T @ root @ root.T @ np.array(by_ground))
     assert [found.minor_m, found.major_m] == pytest.approx(np.sqrt(values), rel=2e-3)
     azimuth = np.degrees(np.arctan2(*axes[:, 1])) % 180.0
@@ -73,7 +63,7 @@ def test_the_ellipse_and_the_shift_are_what_each_unknown_does(block_run, model):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("model", rest_slow(MODELS, mark=pytest.mark.nightly))
+@pytest.mark.parametrize("model", MODELS)
 def test_the_ellipse_is_that_of_cameras_drawn_from_the_covariance(block_run, model):
     run = block_run.run
     adjustment = adjust_tracks(run.views, run.tracks, AdjustOptions(model=model, drift=0))
@@ -138,17 +128,3 @@ def test_what_is_stated_is_taken_from_where_the_priors_take_it(block_run):
     physical = Pushbroom.__new__(Pushbroom)
     object.__setattr__(physical, "accuracy", (3.0, 4.0))
     assert stated_ce90(replace(view, sensor=physical)) == pytest.approx(per_axis * 5.0, rel=1e-4)
-
-
-def files_of(finished, **change):
-    views = tuple(replace(view, **change) for view in finished.record.views)
-    return read_tables(replace(finished.record, views=views), finished.folder)
-
-
-def test_without_an_adjustment_in_space_there_are_none(check_run, block_run):
-    run = block_run.run
-    shifted = adjust_tracks(run.views, run.tracks, AdjustOptions(model="shift"))
-    from tests.report.conftest import summarize
-
-    summary = summarize(Run("adjust", run.views, (), run.tracks, adjustment=shifted))
-    assert "ellipse" not in summary["views"][0]["correction"]

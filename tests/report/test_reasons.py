@@ -25,7 +25,6 @@ from barpc.report.summary.words import CAUSES, STATUS_WORDS
 from barpc.scene import Tracks
 
 from .made import a_view
-from .test_causes import adjustment as found_by_judge
 from .test_causes import interval
 from .test_sentences import adjusted, run_of
 
@@ -84,9 +83,11 @@ def test_most_tie_points_rejected_is_a_contradiction_and_no_lack_of_overlap():
     assert reason(anywhere, num_observations=60, num_rejected=290) == (None, "")
 
 
+NOISY = {"held_out_noise": np.array([9.0, 1.0, 1.0]), "held_out_rms": np.array([4.5, 0.1, 0.1])}
+
+
 def test_wrong_matches_are_told_from_what_is_off_together():
-    noisy = {"held_out_noise": np.array([9.0, 1.0, 1.0]), "held_out_rms": np.array([4.5, 0.1, 0.1])}
-    anywhere = run_of(adjusted(alike=np.array([5.0, 9.0, 9.0]), **noisy))
+    anywhere = run_of(adjusted(alike=np.array([5.0, 9.0, 9.0]), **NOISY))
     cause, advice = reason(anywhere, num_observations=60, num_rejected=290)
     assert cause == "wrong_matches"
     assert "83 % of its tie points were rejected; neighbours err in random directions" in advice
@@ -95,39 +96,34 @@ def test_wrong_matches_are_told_from_what_is_off_together():
 
 
 def test_an_image_beside_one_that_contradicts_is_sent_to_it():
-    noisy = {"held_out_noise": np.array([9.0, 1.0, 1.0]), "held_out_rms": np.array([4.5, 0.1, 0.1])}
-    cause, advice = reason(run_of(adjusted(**noisy), beside={0: 2}))
+    cause, advice = reason(run_of(adjusted(**NOISY), beside={0: 2}))
     assert cause == "beside"
     assert "seen in C, too" in advice
 
 
 def test_where_tie_points_contradict_is_said_of_the_image_and_not_again_of_the_block():
-    judged = found_by_judge(left=[interval(0, 0.8, 0.0)])
-    names = tuple(judged.names)
-    run = run_of(adjusted(left=judged.left, names=names), number={name: k for k, name in enumerate(names)})
-    name = names[interval(0, 0.8, 0.0).view]
-    cause, advice = reason(run, name=name)
+    run = run_of(adjusted(left=[interval(0, 0.8, 0.0)]))
+    cause, advice = reason(run)
     assert cause == "place"
     assert advice.startswith(
         "In rows 100-399 80 % of the tie points disagree with the rest of the image, typically by "
     )
-    cause, advice = reason(run, name=name, num_observations=60, num_rejected=90)
+    cause, advice = reason(run, num_observations=60, num_rejected=90)
     assert cause == "rejected"  # it is a part of the image that is off, and so its RPC is its own
     assert "same direction, so it is no noise; most in rows 100-399 (80 %, typically by 2.5 px)" in advice
 
 
 def test_columns_that_lie_off_over_all_rows_are_no_clouds():
     columns = Interval(0, 0, 100.0, 400.0, 30.0, 0.02, 0.16, False, 0.0)
-    names = tuple(found_by_judge(left=[]).names)
     for one, told in (
         (columns, "In columns 100-399, over all rows the tie points share a residual of 0.16 px. Check for "
          "detectors or resampling"),
         (replace(columns, share=0.8, by_share=True, apart=2.5), "Check for clouds, water, change there"),
         (replace(columns, axis=1), "Check for clouds, water, change there"),
     ):  # fmt: skip
-        run = run_of(adjusted(left=[one], names=names), number={name: k for k, name in enumerate(names)})
-        assert reason(run, name=names[0])[0] == "place"
-        assert reason(run, name=names[0])[1].endswith(told)
+        cause, advice = reason(run_of(adjusted(left=[one])))
+        assert cause == "place"
+        assert advice.endswith(told)
 
 
 @pytest.mark.parametrize(

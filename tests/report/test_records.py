@@ -14,18 +14,7 @@ from barpc.ba.constraints.gauge import MOTIONS
 from barpc.ba.select.foreign_camera import FOREIGN_CAMERA
 from barpc.ba.terms import TERMS
 from barpc.base.errors import listed
-from barpc.report.records import (
-    Cell,
-    Column,
-    Number,
-    Record,
-    cell_of,
-    column,
-    column_of,
-    json_form,
-    table,
-    value_of,
-)
+from barpc.report.records import Cell, Column, Number, Record, cell_of, column, column_of, json_form, table, value_of
 from barpc.report.summary import SCHEMA, published_schema
 from barpc.report.summary.block import EXPLANATIONS, MODES
 from barpc.report.summary.pairs import OffsetEntry, PairEntry
@@ -125,6 +114,8 @@ def test_the_version_of_the_file_is_three():
 def test_kinds_of_the_file_are_those_of_the_adjustment():
     """Records name them of their own: reading a run loads no adjustment."""
     assert list(MODES) == list(MOTIONS)
+    told = [words.format("25 cm") for words in MODES.values()]
+    assert all("25 cm" in words and len(words) > 30 for words in told)
     assert list(EXPLANATIONS) == [*TERMS, FOREIGN_CAMERA]
 
 
@@ -181,6 +172,9 @@ def test_small_words():
         (0.0001, "0.1 mm"),
         (-3.0, "-3.0 m"),
         (0.001, "1.0 mm"),
+        (1234.5, "1200 m"),
+        (-0.02, "-2.0 cm"),
+        (0.0, "0.0 mm"),
     ],
 )
 def test_lengths_change_their_unit_at_one(value, text):

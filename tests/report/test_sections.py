@@ -57,20 +57,7 @@ def test_a_row_of_the_table_of_images_is_in_percent_and_pixels():
     )  # fmt: skip
     (table,) = asked("images", [view]).tables
     assert texts(table) == [
-        [
-            "A",
-            "needs review",
-            "60",
-            "0",
-            "25.0",
-            "25%",
-            "1.234",
-            "0.100",
-            "0.120",
-            "+1.00, -2.00",
-            "0.51",
-            "12.3",
-        ]
+        ["A", "needs review", "60", "0", "25.0", "25%", "1.234", "0.100", "0.120", "+1.00, -2.00", "0.51", "12.3"]
     ]
     assert [cell.key for cell in table.rows[0]][1:6] == [4, 60, 0, 25.0, 0.254]
     assert table.rows[0][1].kind == "status doubtful"
@@ -205,14 +192,6 @@ def test_pairs_are_told_by_the_worst_offset():
     assert asked("pairs") is None
 
 
-def test_pairs_without_an_angle_say_nothing_of_heights():
-    for field in ("height_m_per_px", "convergence_deg"):
-        unknown = asked("pairs", pairs=[a_pair(**{field: None})])
-        assert unknown.answer.endswith(
-            "No pair of images that passed has 30 matches and a convergence angle that determines heights."
-        )
-
-
 def test_corrections_are_told_by_the_farthest_move():
     ellipse = EllipseEntry(3.0, 1.0, 45.0, 5.0)
     views = [
@@ -295,6 +274,8 @@ def test_check_points_are_shown():
         a_check("R", (4.0, 0.0, 0.3)),
     )
     section = asked("accuracy", check_points=points)
+    assert section.question == "How accurate is it on the ground?"
+    assert [table.key for table in section.tables] == ["check-points"]
     assert section.answer == "The verdict has the RMS of 3 check points, which the adjustment did not use."
     assert texts(section.tables[0]) == [
         ["P", "1", "5.000", "+3.000", "0", "-0.400"], ["Q", "1", "0", "-", "+1.000", "+1.000"],
@@ -375,11 +356,12 @@ def test_images_that_need_a_look_are_first_by_verdict_then_by_what_is_wrong():
     assert table.columns[2] == "reservation"
 
 
-def test_heights_need_images_without_reservation_and_thirty_matches():
+def test_heights_need_images_without_reservation_thirty_matches_and_an_angle():
     none = "No pair of images that passed has 30 matches and a convergence angle that determines heights."
     best, doubted = a_pair("A", "B", 30, height_m_per_px=0.5), [VIEWS[0], a_view("B", **BAD), VIEWS[2]]
     assert none not in asked("pairs", pairs=[best]).answer
-    assert asked("pairs", pairs=[replace(best, num_matches=29)]).answer.endswith(none)
+    for lacking in ({"num_matches": 29}, {"height_m_per_px": None}, {"convergence_deg": None}):
+        assert asked("pairs", pairs=[replace(best, **lacking)]).answer.endswith(none)
     assert asked("pairs", doubted, pairs=[best]).answer.endswith(none)
 
 

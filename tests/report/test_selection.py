@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-from html import escape, unescape
-from pathlib import Path
-
 import pytest
 
-from .test_chromium import CHROMIUM, FLAGS
+from .test_chromium import CHROMIUM, page, probe
 
 pytestmark = [
     pytest.mark.slow,
@@ -17,22 +12,10 @@ pytestmark = [
 ]
 pytest.importorskip("jinja2")
 
-DRIVER = Path(__file__).with_name("selection.js").read_text(encoding="utf-8")
-
 
 @pytest.fixture(scope="module")
 def found(block_run, tmp_path_factory) -> dict:
-    folder = tmp_path_factory.mktemp("driver")
-    html = (block_run.folder / "report.html").read_text(encoding="utf-8")
-    page = folder / "driver.html"
-    page.write_text(
-        f'<!doctype html><meta charset="utf-8"><body><iframe style="width:1200px;height:900px" '
-        f'srcdoc="{escape(html)}"></iframe><script>{DRIVER}</script></body>'
-    )
-    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", page.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-    body = done.stdout[done.stdout.index("<body>") + 6 : done.stdout.rindex("</body>")]
-    return json.loads(unescape(body))
+    return probe(page(block_run), 1200, tmp_path_factory.mktemp("driver"), by="selection.js")
 
 
 @pytest.fixture(scope="module")

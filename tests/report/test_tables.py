@@ -23,36 +23,41 @@ from barpc.report.tables import TABLES, gcps_geojson, map_layers
 from .made import a_pair, a_summary, a_view, without_points
 
 
-def rows_of(path):
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file)
-    return header, rows
+def rows_of(finished, name: str = "residuals.csv") -> list[dict[str, str]]:
+    """The rows of a table of a run, by column."""
+    with (finished.folder / "tables" / name).open(newline="", encoding="utf-8") as file:
+        rows = [*csv.DictReader(file)]
+    assert not [row for row in rows if None in row or None in row.values()]  # of another number of cells
+    return rows
 
 
 def test_residuals_have_the_column_names_of_asp(block_run):
-    header, _ = rows_of(block_run.folder / "tables/residuals.csv")
-    assert header[:5] == ["lon", "lat", "height_above_datum", "mean_residual", "num_observations"]
+    names = [*rows_of(block_run)[0]]
+    assert names[:5] == ["lon", "lat", "height_above_datum", "mean_residual", "num_observations"]
 
 
 def test_a_row_of_residuals_is_a_track_where_the_new_cameras_see_it(block_run):
-    run = block_run.run
-    _, rows = rows_of(block_run.folder / "tables/residuals.csv")
-    table = np.array(rows, dtype=float)
+    """With its errors before and after in the observations that count."""
+    run, rows = block_run.run, rows_of(block_run)
+    places = np.array([[row[name] for name in ("lon", "lat", "height_above_datum")] for row in rows], dtype=float)
     usable = np.flatnonzero(np.isfinite(run.ground).all(axis=1))
-    assert len(table) == len(usable)
-    assert np.abs(table[:, :2] - run.ground[usable, :2]).max() < 1e-9
-    assert np.abs(table[:, 2] - run.ground[usable, 2]).max() < 1e-4
-    track = usable[7]
-    seen = np.flatnonzero((run.tracks.point == track) & run.adjustment.inlier)
-    ecef = run.ground[track]
-    errors = [np.hypot(*(run.after[run.tracks.view[k]].project(ecef) - run.tracks.xy[k])) for k in seen]
-    assert table[7, 3] == pytest.approx(np.mean(errors), abs=1e-4)
-    assert table[7, 4] == len(seen)
+    assert [int(row["track"]) for row in rows] == usable.tolist()
+    np.testing.assert_allclose(places[:, :2], run.ground[usable, :2], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(places[:, 2], run.ground[usable, 2], rtol=0, atol=1e-4)
+    for row in rows[:40]:
+        own = np.flatnonzero((run.tracks.point == int(row["track"])) & run.adjustment.inlier)
+        place = run.ground[int(row["track"])]
+        for key, cameras in (("mean_residual", run.after), ("mean_residual_before", None)):
+            residuals = run.ties_before.residuals[own]
+            if cameras:
+                residuals = [cameras[run.tracks.view[k]].project(place) - run.tracks.xy[k] for k in own]
+            assert float(row[key]) == pytest.approx(np.hypot(*np.transpose(residuals)).mean(), abs=6e-5)
+        assert int(row["num_observations"]) == len(own)
 
 
 def test_observations_give_the_errors_of_the_summary_back(block_run):
-    header, rows = rows_of(block_run.folder / "tables/observations.csv")
-    assert tuple(header) == OBSERVATION_COLUMNS
+    rows = [[*row.values()] for row in rows_of(block_run, "observations.csv")]
+    assert tuple(rows_of(block_run, "observations.csv")[0]) == OBSERVATION_COLUMNS
     for view in block_run.summary["views"]:
         own = [row for row in rows if row[0] == view["name"] and row[8] == "1"]
         assert len(own) == view["num_observations"]
@@ -72,9 +77,9 @@ def test_outliers_are_in_the_table_with_the_residual_that_had_them_cut(block_run
 
 
 def test_pairs_hold_the_figures_of_the_summary(block_run):
-    header, rows = rows_of(block_run.folder / "tables/pairs.csv")
-    assert len(rows) == len(block_run.summary["pairs"])
-    row, pair = dict(zip(header, rows[0], strict=True)), block_run.summary["pairs"][0]
+    rows, pairs = rows_of(block_run, "pairs.csv"), block_run.summary["pairs"]
+    assert len(rows) == len(pairs)
+    row, pair = rows[0], pairs[0]
     assert (row["a"], row["b"], int(row["num_matches"])) == (pair["a"], pair["b"], pair["num_matches"])
     assert float(row["convergence_deg"]) == pytest.approx(pair["convergence_deg"], abs=1e-5)
     assert float(row["epipolar_after_rms_px"]) == pytest.approx(pair["epipolar_after"]["rms"], abs=1e-5)
@@ -129,13 +134,13 @@ def test_names_with_commas_and_quotes_come_back(antimeridian_run):
     tracks = antimeridian_run.run.tracks
     usable = np.isfinite(antimeridian_run.run.ground).all(axis=1)[tracks.point]
     assert (files.observations.view == tracks.view[usable]).all()
-    _, pairs = rows_of(antimeridian_run.folder / "tables/pairs.csv")
-    assert pairs[0][0] == antimeridian_run.views[0].name
+    assert rows_of(antimeridian_run, "pairs.csv")[0]["a"] == antimeridian_run.views[0].name
 
 
-def test_a_check_leaves_the_columns_of_new_cameras_empty(check_run):
-    _, rows = rows_of(check_run.folder / "tables/observations.csv")
-    assert {tuple(row[6:8]) for row in rows} == {("", "")}
+def test_a_check_has_the_errors_of_the_cameras_as_they_are_and_none_of_new_ones(check_run):
+    assert {(*row.values(),)[6:8] for row in rows_of(check_run, "observations.csv")} == {("", "")}
+    first = rows_of(check_run)[0]
+    assert first["mean_residual"] == first["mean_residual_before"] != ""
 
 
 # --- read back --------------------------------------------------------------------------------------------
@@ -241,9 +246,6 @@ def test_a_table_with_other_columns_is_refused(read, text, said):
         read(residuals=text)
 
 
-TIE = {"kind": "worst", "a": "A", "b": "B", "offset_px": [1.5, 0.5], "patches": ["QUJD", "QUJD", "QUJDQQ=="]}
-
-
 def test_numbers_of_a_table():
     pair = a_pair("a,b", "c", 7, convergence_deg=0.123456, base_to_height=float("nan"), epipolar_after=None)
     head, row = b"".join(TABLES["pairs.csv"](None, a_summary([], [pair]))).decode().splitlines()
@@ -252,40 +254,18 @@ def test_numbers_of_a_table():
     assert (found["convergence_deg"], found["base_to_height"], found["epipolar_after_rms_px"]) == ("0.12346", "", "")
 
 
-def test_as_many_outlines_as_images_are_needed(block_run, tmp_path):
-    shutil.copytree(block_run.folder / "tables", tables := tmp_path / "tables")
-    collection = json.loads((tables / "footprints.geojson").read_text())
-    del collection["features"][0]
-    (tables / "footprints.geojson").write_text(json.dumps(collection))
-    with pytest.raises(InputError, match="8 outlines of 9 images"):
-        read_tables(block_run.record, tmp_path)
+def test_as_many_outlines_as_images_are_needed(read):
+    with pytest.raises(InputError, match="1 outlines of 2 images"):
+        read(footprints=outlines(None))
 
 
 # --- written ----------------------------------------------------------------------------------------------
 
 
-def test_a_track_s_errors_are_those_of_what_counts_before_and_after(block_run):
-    run = block_run.run
-    header, rows = rows_of(block_run.folder / "tables/residuals.csv")
-    for row in rows[:40]:
-        named = dict(zip(header, row, strict=True))
-        own = (run.tracks.point == int(named["track"])) & run.keep
-        for key, ties in (("mean_residual", run.ties_after), ("mean_residual_before", run.ties_before)):
-            assert float(named[key]) == pytest.approx(np.hypot(*ties.residuals[own].T).mean(), abs=6e-5)
-        assert int(named["num_observations"]) == own.sum()
-
-
-def test_a_check_s_errors_are_those_of_the_cameras_as_they_are(check_run):
-    header, rows = rows_of(check_run.folder / "tables/residuals.csv")
-    first = dict(zip(header, rows[0], strict=True))
-    assert first["mean_residual"] == first["mean_residual_before"] != ""
-
-
 def test_an_observation_s_numbers_have_three_and_four_decimals(block_run, check_run):
-    for finished, filled in ((block_run, 6), (check_run, 4)):
-        _, rows = rows_of(finished.folder / "tables/observations.csv")
-        digits = [len(cell.partition(".")[2]) for cell in rows[0][2:8]]
-        assert digits[:filled] == ([3, 3, 4, 4, 4, 4] if filled == 6 else [4, 4, 4, 4])
+    for finished, wanted in ((block_run, [3, 3, 4, 4, 4, 4]), (check_run, [4, 4, 4, 4])):
+        cells = [*rows_of(finished, "observations.csv")[0].values()][2:8]
+        assert [len(cell.partition(".")[2]) for cell in cells][: len(wanted)] == wanted
 
 
 def test_points_of_a_reference_are_written_as_control_is_read():
@@ -300,12 +280,7 @@ def test_points_of_a_reference_are_written_as_control_is_read():
         views=[SimpleNamespace(path="/a/x.tif"), SimpleNamespace(path="/b/y.tif")],
     )
     first, second = json.loads(gcps_geojson(run))["features"]
-    assert first["properties"] == {
-        "id": "P",
-        "filename": "y.tif",
-        "ji": [1.0, 2.0],
-        "sigma_m": [1.0, 1.0, 2.0],
-    }
+    assert first["properties"] == {"id": "P", "filename": "y.tif", "ji": [1.0, 2.0], "sigma_m": [1.0, 1.0, 2.0]}
     assert first["geometry"] == {"type": "Point", "coordinates": [10.0, 20.0, 30.0]}
     assert (second["properties"]["id"], second["properties"]["ji"]) == ("Q", [5.0, 6.0])
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 
+import click
 import pytest
 from click.testing import CliRunner
 from hypothesis import given
@@ -59,21 +59,15 @@ def test_in_a_pipe_a_row_is_one_line_and_columns_line_up(table):
     assert len(ends) == 1
 
 
-def shown(finished, width, monkeypatch, verbose=True):
-    import click
-
-    @click.command()
-    def command():
-        print_summary(finished.record)
-
+def shown(summary, width, monkeypatch, verbose=True):
     monkeypatch.setattr(terminal, "output_width", lambda: width)
     monkeypatch.setattr(terminal, "_general", lambda name: verbose and name == "verbose")
-    return CliRunner().invoke(command).output
+    return CliRunner().invoke(click.command()(lambda: print_summary(summary))).output
 
 
 @pytest.mark.parametrize("width", [None, 200, 100, 80, 60, 40])
 def test_the_summary_keeps_every_column_at_every_width(block_run, width, monkeypatch):
-    text = shown(block_run, width, monkeypatch)
+    text = shown(block_run.record, width, monkeypatch)
     if width is not None:
         assert max(map(len, text.splitlines())) <= width
     squeezed = " ".join(text.split())
@@ -84,7 +78,7 @@ def test_the_summary_keeps_every_column_at_every_width(block_run, width, monkeyp
 
 
 def test_a_check_shows_no_columns_of_new_cameras(check_run, monkeypatch):
-    text = shown(check_run, None, monkeypatch)
+    text = shown(check_run.record, None, monkeypatch)
     assert text.count("now [px]") == 2
     assert "before" not in text
     assert "after" not in text
@@ -92,8 +86,7 @@ def test_a_check_shows_no_columns_of_new_cameras(check_run, monkeypatch):
 
 @pytest.mark.parametrize("width", [None, 200, 80, 60, 40])
 def test_few_pairs_keep_every_column_at_every_width(width, monkeypatch):
-    finished = SimpleNamespace(record=a_summary([a_view("A"), a_view("B")], [a_pair("A", "B")]))
-    squeezed = " ".join(shown(finished, width, monkeypatch).split())
+    squeezed = " ".join(shown(a_summary([a_view("A"), a_view("B")], [a_pair("A", "B")]), width, monkeypatch).split())
     for word in ("used", "angle", "[deg]", "B/H", "before", "after", "+0.300 ± 0.200"):
         assert word in squeezed
 
@@ -110,28 +103,11 @@ def a_large_run(bad: int, torn: int = 40, num: int = 300, **fields):
         advice = CAUSES[cause].advice(error=1.0 + k, noise=9.0, share=90.0, few=k)
         of_bad = {"status": CAUSES[cause].status, "advice": advice, "cause": cause, "rmse_after": 1.0 + k}
         views.append(a_view(f"view_{k:04d}", **(of_bad if k < bad else {})))
-    pairs = [
-        a_pair(f"view_{k:04d}", f"view_{k + 1:04d}", epipolar_after=OffsetEntry(0.0, 0.1, 0.6 + k, 50))
-        if k < torn
-        else a_pair(f"view_{k:04d}", f"view_{k + 1:04d}")
-        for k in range(num - 1)
-    ]
-    verdict = (
-        "It rests on this.",
-        *(view.reservation for view in views if view.advice),
-        *fields.pop("more", ()),
-    )
-    return a_summary(
-        views,
-        pairs,
-        status="bad",
-        headline="Look.",
-        verdict=verdict,
-        reasons=verdict[1:],
-        passed=False,
-        out_dir="out",
-        **fields,
-    )
+    offsets = [{"epipolar_after": OffsetEntry(0.0, 0.1, 0.6 + k, 50)} if k < torn else {} for k in range(num - 1)]
+    pairs = [a_pair(f"view_{k:04d}", f"view_{k + 1:04d}", **offset) for k, offset in enumerate(offsets)]
+    verdict = ("It rests on this.", *(view.reservation for view in views if view.advice), *fields.pop("more", ()))
+    reserved = {"status": "bad", "headline": "Look.", "reasons": verdict[1:], "passed": False}
+    return a_summary(views, pairs, verdict=verdict, out_dir="out", **reserved, **fields)
 
 
 @pytest.mark.few(2)
@@ -142,7 +118,7 @@ def test_a_summary_is_fourteen_lines_whatever_its_size(bad, width, monkeypatch):
     files = tuple(LeftOutEntry(f"{n}.tif", f"{n}.tif: no RPC") for n in range(90))
     use = StepEntry("use", "Use A.vrt.", tuple(f"barpc {verb} . -o {'long ' * 20}" for verb in ("dsm", "ortho")))
     for fields in ({}, {"more": many}, {"left_out": files, "more": tuple(one.reason_text for one in files)}):
-        text = shown(SimpleNamespace(record=a_large_run(bad, next=(use,), **fields)), width, monkeypatch, False)
+        text = shown(a_large_run(bad, next=(use,), **fields), width, monkeypatch, False)
         lines = text.splitlines()
         assert len(lines) <= 14
         assert lines[0].startswith("Look (exit code 3).")
@@ -158,14 +134,14 @@ def test_a_summary_is_fourteen_lines_whatever_its_size(bad, width, monkeypatch):
 
 def test_what_there_is_no_room_for_is_counted(monkeypatch):
     many = tuple(f"Reason {n}." for n in range(60))
-    lines = shown(SimpleNamespace(record=a_large_run(0, more=many)), 80, monkeypatch, False).splitlines()
+    lines = shown(a_large_run(0, more=many), 80, monkeypatch, False).splitlines()
     assert (lines[0], lines[1], len(lines)) == ("Look (exit code 3).", "It rests on this.", 14)
     assert lines[-2] == "And 50 more: -v, or report.html."
     assert lines[2:-2] == [f"Reason {n}." for n in range(10)]
 
 
 def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(monkeypatch):
-    lines = shown(SimpleNamespace(record=a_large_run(299)), None, monkeypatch).splitlines()
+    lines = shown(a_large_run(299), None, monkeypatch).splitlines()
     rows = [line.split()[0] for line in lines[2:12]]
     assert rows == [f"view_{k:04d}" for k in range(298, 268, -3)]  # those that contradict the others, by their error
     assert "290 more in summary.json" in lines
@@ -182,7 +158,7 @@ def test_of_three_hundred_images_the_worst_are_shown_and_the_rest_is_counted(mon
 
 
 def test_of_a_large_run_that_is_good_only_counts_are_shown(monkeypatch):
-    text = shown(SimpleNamespace(record=a_large_run(0, torn=0)), None, monkeypatch)
+    text = shown(a_large_run(0, torn=0), None, monkeypatch)
     assert text.splitlines() == [
         "300 images, none with a reservation: all in summary.json",
         "",
@@ -196,7 +172,7 @@ def test_of_a_large_run_that_is_good_only_counts_are_shown(monkeypatch):
 
 def test_few_images_keep_their_order_and_a_sentence_each(monkeypatch):
     summary = a_large_run(3, torn=1, num=4)
-    lines = shown(SimpleNamespace(record=summary), None, monkeypatch).splitlines()
+    lines = shown(summary, None, monkeypatch).splitlines()
     assert [line.split()[0] for line in lines[2:6]] == [f"view_{k:04d}" for k in range(4)]
     assert [line for line in lines if line.startswith("view_000") and ": " in line] == [
         summary.views[k].reservation for k in (1, 0, 2)

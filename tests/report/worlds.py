@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from barpc.ba import AdjustOptions, adjust_tracks, block_prior
-from barpc.base.geodesy import DEFAULT, HeightDatum, metres_per_unit
+from barpc.base.geodesy import DEFAULT, Array, HeightDatum, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.fit import fit_rpc
 from barpc.report import Run
 from barpc.report.outcome import Added
-from barpc.scene import Altimetry, GroundPoints, Reference, Tracks
+from barpc.scene import Altimetry, GroundPoints, IntArray, Reference, Tracks
 from barpc.sensor.corrected import Corrected
 from barpc.simulate import SimulatedBlock, simulate_block
 from barpc.tie.reference import ReferenceControl, ViewMatch
@@ -30,19 +30,33 @@ def relief(lonlat: np.ndarray) -> np.ndarray:
     )
 
 
+def exact_cameras(block: SimulatedBlock) -> list[Corrected]:
+    return [Corrected(view.sensor, one) for view, one in zip(block.views, block.truth.corrections, strict=True)]
+
+
+def seen_by(cameras: Sequence[Corrected], ground: Array, point: IntArray, view: IntArray) -> Array:
+    """Where cameras see points: observations (n, 2)."""
+    xy = np.empty((len(view), 2))
+    for v, camera in enumerate(cameras):
+        xy[view == v] = camera.project(ground[point[view == v]])
+    return xy
+
+
+def on_terrain(block: SimulatedBlock, heights: Array, rng: np.random.Generator) -> SimulatedBlock:
+    """The block with its points at these altitudes, seen to 0.1 px."""
+    ground, tracks = block.truth.ground.copy(), block.tracks
+    ground[:, 2] = heights
+    xy = seen_by(exact_cameras(block), ground, tracks.point, tracks.view)
+    xy += rng.normal(0.0, 0.1, xy.shape)
+    return replace(block, tracks=replace(tracks, xy=xy), truth=replace(block.truth, ground=ground))
+
+
 def world(num: int = 3, points: int = 300, *, on_relief: bool = False, seed: int = 5, **options: Any) -> SimulatedBlock:
     """A block; with `on_relief` its points lie on the hills."""
     block = simulate_block(num, points, seed=seed, lon=5.0, lat=43.0, **{"size": SIZE, "attitude": 3e-6, **options})
     if not on_relief:
         return block
-    ground, tracks = block.truth.ground.copy(), block.tracks
-    ground[:, 2] = relief(ground[:, :2])
-    xy = np.empty_like(tracks.xy)
-    for v, (view, correction) in enumerate(zip(block.views, block.truth.corrections, strict=True)):
-        rows = tracks.view == v
-        xy[rows] = Corrected(view.sensor, correction).project(ground[tracks.point[rows]])
-    xy += np.random.default_rng(seed).normal(0.0, 0.1, xy.shape)
-    return replace(block, tracks=replace(tracks, xy=xy), truth=replace(block.truth, ground=ground))
+    return on_terrain(block, relief(block.truth.ground[:, :2]), np.random.default_rng(seed))
 
 
 def run_of(block: SimulatedBlock, *, refit: bool = True, run: dict[str, Any] | None = None, **given: Any) -> Run:
