@@ -257,8 +257,3 @@ def test_old_images_that_are_given_are_written_and_no_flag_is_asked_for(eleven: 
         ground = read_rpc(eleven / f"{name}.tif").localize(np.array([[0.0, 0.0], [1999.0, 1999.0]]), np.full(2, 300.0))
         one, other = (read_rpc(eleven / run / f"{name}.vrt").project(ground) for run in ("given", "first"))
         np.testing.assert_allclose(one, other, atol=1e-4)
-
-
-def test_an_update_is_of_a_run() -> None:
-    with pytest.raises(InputError, match="update is given without add_to"):
-        RunOptions(update=True)

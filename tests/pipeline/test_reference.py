@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import InputError, TiePointError
+from barpc.base.errors import TiePointError
 from barpc.base.options import RunOptions
 from barpc.cli import main
 from barpc.pipeline import adjust
@@ -252,10 +252,3 @@ def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, 
 def test_one_image_that_a_reference_does_not_show_is_told_so_and_not_to_loosen_the_matching(quickbird):
     with pytest.raises(TiePointError, match=r"the reference does not show what the images show \(its highest peak"):
         quickbird(60.0)
-
-
-def test_without_a_terrain_it_is_refused():
-    with pytest.raises(InputError, match="reference is given without dem"):
-        RunOptions(reference=("ortho.tif",))
-    with pytest.raises(InputError, match="reference_sigma is given without reference"):
-        RunOptions(reference_sigma=1.0)
