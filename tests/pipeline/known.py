@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis
+from barpc.rpcio import read_rpc
 from barpc.sensor.triangulation import triangulate
 from tests.everywhere import rows_of
 from tests.reliability.trials import SAMPLES, crop
@@ -71,6 +72,11 @@ def exact(truth: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     assert len(points) > (100 if len(truth["check_points"]) > 100 else 5)
     ground = np.array([point["ground"] for point in points])
     return ground, np.array([[point["image"][name] for name in names] for point in points])
+
+
+def errors_of_run(out: Path, truth: dict[str, Any]) -> tuple[float, np.ndarray]:
+    """`errors_at_check_points` of the cameras that a run wrote into a folder."""
+    return errors_at_check_points([read_rpc(out / f"{view['name']}.vrt") for view in truth["views"]], truth)
 
 
 def errors_at_check_points(sensors: Any, truth: dict[str, Any]) -> tuple[float, np.ndarray]:

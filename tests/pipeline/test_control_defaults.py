@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import barpc
@@ -16,6 +15,7 @@ from barpc.pipeline.run import AdjustResult
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import write_matches
 from barpc.scene import View
+from tests.geotiffs import write_blank
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
@@ -115,14 +115,7 @@ def test_pointing_errors_are_no_geoid(adjusted, tmp_path: Path) -> None:
 
 
 def test_height_default_is_the_altitude_where_none_is_given(shared_data: Path, tmp_path: Path) -> None:
-    import rasterio
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with rasterio.open(
-            tmp_path / "a.tif", "w", driver="GTiff", width=1000, height=1000, count=1, dtype="uint8"
-        ) as image:
-            image.write(np.zeros((1000, 1000), np.uint8), 1)
+    write_blank(tmp_path / "a.tif", (1000, 1000))
     (tmp_path / "a.tif.aux.xml").write_bytes((shared_data / "field_cases/height_default.tif.aux.xml").read_bytes())
     assert barpc.localize(tmp_path / "a.tif", [500, 500])[2] == 123.5
     barpc.convert(tmp_path / "a.tif", tmp_path / "b.vrt")

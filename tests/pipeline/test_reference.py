@@ -16,7 +16,7 @@ from barpc.pointio.gcps import read_gcps
 from barpc.rpcio import read_rpc
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
-from tests.pipeline.known import errors_at_check_points, part, whole
+from tests.pipeline.known import errors_of_run, part, whole
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -65,14 +65,9 @@ def held(shown, place, options):
     return adjust(shown.images, place / "held", options)
 
 
-def place_of(out, result, truth) -> np.ndarray:
-    """Mean error of the scene, east, north, up (3,) [m]."""
-    return errors_at_check_points([read_rpc(out / f"{v.name}.vrt") for v in result.run.views], truth)[1]
-
-
 @pytest.mark.slow
 def test_the_scene_stands_where_the_reference_says(held, place, truth):
-    error, sigma = place_of(place / "held", held, truth), np.array(held.summary["scene"]["sigma_enu_m"])
+    error, sigma = errors_of_run(place / "held", truth)[1], np.array(held.summary["scene"]["sigma_enu_m"])
     assert np.hypot(*error[:2]) < 1.0
     assert abs(error[2]) < DEM_BIAS + 2.0  # of the terrain's own noise, a metre
     assert (np.abs(error) <= 3 * sigma).all()
