@@ -16,9 +16,8 @@ from barpc.pipeline.loading import load_views
 from barpc.sensor.rpc import RPC
 from barpc.simulate import simulate_block
 from tests.geotiffs import write_image
+from tests.pipeline.known import SAMPLES as VIEWS
 
-ROOT = Path(__file__).resolve().parents[2]
-VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
 GRID = np.stack(np.meshgrid(np.linspace(0, 249, 6), np.linspace(0, 249, 6)), axis=-1).reshape(-1, 2)
 
 

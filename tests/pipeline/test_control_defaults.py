@@ -16,10 +16,10 @@ from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import write_matches
 from barpc.scene import View
 from tests.geotiffs import write_blank
+from tests.pipeline.known import FOLDER
+from tests.pipeline.known import SAMPLES as VIEWS
 
-ROOT = Path(__file__).resolve().parents[2]
-VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
-POINTS = read_gcps(ROOT / "data_samples/gcps.geojson", [view.stem for view in VIEWS])
+POINTS = read_gcps(FOLDER / "gcps.geojson", [view.stem for view in VIEWS])
 GEOID = 48.98
 
 

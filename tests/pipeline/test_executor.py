@@ -25,8 +25,7 @@ from barpc.base.options import RunOptions, TieOptions
 from barpc.base.safe_io import MB
 from barpc.pipeline.executor import BATCH_SECONDS, CachingExecutor, Spilled, run_batch, worker_count
 from barpc.workspace import Workspace
-
-SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
+from tests.pipeline.known import SAMPLES
 
 
 def square(number):
@@ -395,7 +394,7 @@ def test_a_worker_that_comes_later_with_another_version_works_on_nothing() -> No
 @pytest.mark.filterwarnings("ignore")
 def test_workers_close_and_come_during_a_run_and_the_bytes_are_the_same(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
-    images = sorted(SAMPLES.glob("*.tif"))[:2]
+    images = SAMPLES[:2]
     options = RunOptions(images="none", tie=TieOptions(tile=256, points_per_image=600))
     barpc.adjust(images, tmp_path / "alone", options)
     seen: list[str] = []

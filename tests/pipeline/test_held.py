@@ -11,10 +11,10 @@ import pytest
 import barpc
 from barpc.pipeline.run import AdjustResult
 from barpc.rpcio import write_rpc
+from tests.pipeline.known import SAMPLES as VIEWS
 from tests.scenes.files import write_scene
 from tests.scenes.images import ImageOptions
 
-VIEWS = sorted(Path(__file__).resolve().parents[2].glob("data_samples/view_0*.tif"))
 GRID = np.stack(np.meshgrid(np.linspace(0, 999, 7), np.linspace(0, 999, 7)), axis=-1).reshape(-1, 2)
 
 

@@ -23,9 +23,8 @@ from barpc.pipeline import AdjustResult
 from barpc.report import summarize
 from barpc.report.overview import COLUMNS
 from barpc.report.runfiles import OBSERVATION_COLUMNS
+from tests.pipeline.known import SAMPLES
 from tests.report.conftest import run_of_block, written
-
-SAMPLES = sorted((Path(__file__).parents[2] / "data_samples").glob("view_*.tif"))
 
 
 @pytest.fixture(scope="module")

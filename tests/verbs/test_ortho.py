@@ -18,12 +18,12 @@ from barpc.rpcio import write_rpc_copy
 from tests.cli.test_images import run
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
+from tests.pipeline.known import SAMPLES
 from tests.rasters.test_dem import write_geoid
 from tests.scenes.files import write_scene
 from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.season import write_dem as write_ground
 
-SAMPLES = Path(__file__).parents[2] / "data_samples"
 SIDE = 400
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # of raw images
 UTM = pyproj.Transformer.from_crs(32631, 4979, always_xy=True)
@@ -50,7 +50,7 @@ def ramp(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("ramp")
     pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
     raw = write_image(folder / "raw.tif", pixels)
-    write_rpc_copy(barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300), raw, folder / "ramp.tif")
+    write_rpc_copy(barpc.read_rpc(SAMPLES[2]).crop(300, 300), raw, folder / "ramp.tif")
     return folder / "ramp.tif"
 
 
@@ -89,7 +89,7 @@ def test_every_pixel_is_where_the_camera_sees_it_on_the_dem(crs, start, ramp, tm
 @pytest.mark.parametrize("middle", rest_slow([180.0, 179.9995, -180.0, -179.9995]))
 def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
     """On DEMs that begin on either side of it; the camera's longitudes go on beyond 180 degrees."""
-    rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
+    rpc = barpc.read_rpc(SAMPLES[2]).crop(300, 300)
     east = middle - rpc.localize([SIDE / 2, SIDE / 2], 150.0)[0]
     rpc = replace(rpc, ground_offset=rpc.ground_offset + [east, 0.0, 0.0])
     pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
@@ -147,7 +147,7 @@ def test_where_the_dem_has_a_void_there_are_no_pixels_and_beyond_it_no_map(ramp,
 def test_numbers_keep_their_type_and_what_meant_nothing_still_does(tmp_path):
     pixels = np.full((1, SIDE, SIDE), 7, np.uint16)
     pixels[:, :, : SIDE // 2] = 65535
-    rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
+    rpc = barpc.read_rpc(SAMPLES[2]).crop(300, 300)
     write_rpc_copy(rpc, write_image(tmp_path / "raw.tif", pixels, nodata=65535), tmp_path / "a.tif")
     with rasterio.open(tmp_path / "a.tif") as image:
         (made,) = barpc.ortho(image, tmp_path / "maps", alt=150, crs="EPSG:2154", gsd=1)
