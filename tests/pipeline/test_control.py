@@ -35,15 +35,7 @@ def table(points: GroundPoints, head: str, sign: str = ",") -> str:
     """A CSV with named columns."""
     lines = [head.replace(",", sign)]
     for name, (lon, lat, alt), sigma, image, (col, row) in rows(points):
-        known = {
-            "id": name,
-            "lon": lon,
-            "lat": lat,
-            "alt": alt,
-            "image": image + ".tif",
-            "col": col,
-            "row": row,
-        }
+        known = {"id": name, "lon": lon, "lat": lat, "alt": alt, "image": image + ".tif", "col": col, "row": row}
         known |= {"e": sigma[0], "n": sigma[1], "u": sigma[2], "px": 0.4, "": "remark"}
         order = [MEANING.get(word.strip().lower(), "") for word in head.split(",")]
         lines.append(sign.join(str(known[key]) for key in order))
@@ -95,9 +87,13 @@ TEXTS = {
 }
 
 
-def load(path, text: str, **options) -> GroundPoints:
+def load(path, text: str, views=VIEWS, dem=None, **options) -> GroundPoints:
     path.write_text(text)
-    found = load_gcps([str(path)], VIEWS, RunOptions(**options))
+    return load_all([path], views, dem, **options)
+
+
+def load_all(paths, views=VIEWS, dem=None, **options) -> GroundPoints:
+    found = load_gcps(list(map(str, paths)), views, RunOptions(**options), dem)
     assert found is not None
     return found
 
@@ -200,24 +196,19 @@ def test_a_position_in_the_image_that_is_none_is_refused(tmp_path, value):
 
 def test_latitudes_beyond_the_pole_are_recognised_as_longitudes(tmp_path):
     block = simulate_block(2, 4, num_gcps=5, seed=3, lon=139.7, lat=35.7)
-    path = tmp_path / "p.csv"
     lines = ["lon,lat,alt,image,col,row"]
     for g, v, (col, row) in zip(block.gcps.point, block.gcps.view, block.gcps.xy, strict=True):
         lon, lat, alt = block.gcps.lonlatalt[g]
         lines.append(f"{lat},{lon},{alt},{block.views[v].name},{col},{row}")
-    path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"5 of 5 points .*exchanged"):
-        load_gcps([str(path)], block.views, RunOptions())
+        load(tmp_path / "p.csv", "\n".join(lines), block.views)
 
 
 def test_cameras_that_are_hundreds_of_metres_off_and_heights_above_the_geoid_are_no_fault(tmp_path):
     move = Correction(np.zeros(3), np.array([300.0, -250.0, 200.0]), np.array([7e6, 0.0, 0.0]))
     off = [View(v.name, v.path, v.size, Corrected(v.sensor, move), v.alt_range) for v in VIEWS]
-    path = tmp_path / "p.gcp"
-    path.write_text(asp(moved(list(range(6)), lambda lon, lat, alt: (lon, lat, alt - 100.0))))
-    found = load_gcps([str(path)], off, RunOptions())
-    assert found is not None
-    assert found.names == POINTS.names
+    above_geoid = asp(moved(list(range(6)), lambda lon, lat, alt: (lon, lat, alt - 100.0)))
+    assert load(tmp_path / "p.gcp", above_geoid, off).names == POINTS.names
 
 
 @pytest.mark.parametrize("only", [False, True])
@@ -239,10 +230,7 @@ def test_images_that_are_not_in_the_run_are_refused_or_left_out(tmp_path, only):
 def test_of_a_file_of_one_image_no_image_is_asked(tmp_path):
     one = POINTS.select(np.bincount(POINTS.point[POINTS.view == 0], minlength=6) > 0)
     one = replace(one, **{name: getattr(one, name)[one.view == 0] for name in ("point", "view", "xy", "xy_sigma")})
-    path = tmp_path / "p.csv"
-    path.write_text(table(one, "id,lon,lat,h,col,row"))
-    found = load_gcps([str(path)], VIEWS[:1], RunOptions())
-    assert found is not None
+    found = load(tmp_path / "p.csv", table(one, "id,lon,lat,h,col,row"), VIEWS[:1])
     np.testing.assert_array_equal(found.xy, one.xy)
 
 
@@ -274,11 +262,10 @@ def test_how_far_a_camera_may_be_wrong_is_a_kilometre_or_what_is_searched(tmp_pa
 def test_several_files_are_one_and_each_is_left_out_alone(tmp_path):
     for name, text in (("a.gcp", asp(POINTS)), ("b.csv", "nothing\n"), ("c.csv", TEXTS["a.csv"])):
         (tmp_path / name).write_text(text)
-    paths = [str(tmp_path / name) for name in ("a.gcp", "b.csv", "c.csv")]
+    paths = [tmp_path / name for name in ("a.gcp", "b.csv", "c.csv")]
     with pytest.raises(InputError, match=r"b\.csv"):
-        load_gcps(paths, VIEWS, RunOptions())
-    found = load_gcps(paths, VIEWS, RunOptions(keep_going=True))
-    assert found is not None
+        load_all(paths)
+    found = load_all(paths, keep_going=True)
     assert found.names == POINTS.names * 2
     assert len(found.left_out) == 1
     assert "b.csv" in found.left_out[0]
@@ -436,8 +423,7 @@ def test_of_several_files_each_observation_keeps_its_point_and_strangers_are_nam
     for n, path in enumerate(paths):
         some = POINTS.select(np.arange(6) % 3 == n)
         path.write_text(asp(some).replace(f"/{VIEWS[2].name}.tif", "/else.tif"))
-    found = load_gcps([str(path) for path in paths], VIEWS, RunOptions(keep_going=True))
-    assert found is not None
+    found = load_all(paths, keep_going=True)
     order = [0, 3, 1, 4, 2, 5]
     assert found.names == tuple(POINTS.names[g] for g in order)
     np.testing.assert_array_equal(found.lonlatalt, POINTS.lonlatalt[order])
@@ -487,19 +473,15 @@ def test_an_altitude_of_zero_is_none_and_holds_an_image_sideways_alone(tmp_path,
 
 
 def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path) -> None:
-    path = tmp_path / "p.gcp"
-    path.write_text(asp(at_zero(POINTS, np.arange(6) != 1)))
-    options = RunOptions()
-    found = load_gcps([str(path)], VIEWS, options, Plane())  # type: ignore[arg-type]
-    assert found is not None
+    text = asp(at_zero(POINTS, np.arange(6) != 1))
+    found = load(tmp_path / "p.gcp", text, dem=Plane())
     assert found.lonlatalt[:, 2].tolist() == [321.0, POINTS.lonlatalt[1, 2], *[321.0] * 4]
-    np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(options.adjust.dem_sigma, 5.0 * 5**0.5))
+    np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(RunOptions().adjust.dem_sigma, 5.0 * 5**0.5))
     assert found.sigma[1, 2] == 0.3
     assert found.left_out == ()
     assert "5 of 6 points have no altitude, or a default (0, or one for all): the DEM's are" in " ".join(found.said)
     east = float(np.median(POINTS.lonlatalt[:, 0]))
-    found = load_gcps([str(path)], VIEWS, options, Plane(east))  # type: ignore[arg-type]
-    assert found is not None
+    found = load(tmp_path / "p.gcp", text, dem=Plane(east))
     beyond = (POINTS.lonlatalt[:, 0] >= east) & (np.arange(6) != 1)
     np.testing.assert_array_equal(found.lonlatalt[:, 2] == 321.0, ~beyond & (np.arange(6) != 1))
     assert f"; {beyond.sum()} of them constrain the images horizontally only" in found.left_out[0]
@@ -513,8 +495,7 @@ def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_
     for g, v, (col, row) in zip(gcps.point, gcps.view, gcps.xy.tolist(), strict=True):
         lon, lat, _ = gcps.lonlatalt[g].tolist()
         lines[g] = f"g{g} {lat} {lon} 0 1 1 1 {block.views[v].name} {col} {row} 1 1\n"
-    (path := tmp_path / "p.gcp").write_text("".join(lines.values()))
-    gcps = load_gcps([str(path)], block.views, RunOptions())
+    gcps = load(tmp_path / "p.gcp", "".join(lines.values()), block.views)
     found = adjust_tracks(block.views, block.tracks, gcps=gcps)
     off = ground_from_ecef(found.points) - block.truth.ground
     metres = np.nanmean(off, axis=0) * [111e3 * np.cos(np.radians(43.3)), 111e3, 1.0]
@@ -523,15 +504,11 @@ def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_
 
 
 def test_points_without_a_column_of_altitudes_are_as_those_of_zero(tmp_path) -> None:
-    (path := tmp_path / "p.csv").write_text(table(POINTS, "id,lon,lat,image,col,row"))
-    found = load_gcps([str(path)], VIEWS, RunOptions())
-    assert found is not None
+    path, text = tmp_path / "p.csv", table(POINTS, "id,lon,lat,image,col,row")
+    found = load(path, text)
     assert found.said == (f"{path}: CSV; no altitudes",)
-    assert found.left_out[0].endswith(
-        "and constrain the images horizontally only: give their altitudes, or --dem; left out"
-    ) or (found.left_out[0].endswith("and constrain the images horizontally only: give their altitudes, or --dem"))
-    found = load_gcps([str(path)], VIEWS, RunOptions(), Plane())  # type: ignore[arg-type]
-    assert found is not None
+    assert found.left_out[0].endswith("and constrain the images horizontally only: give their altitudes, or --dem")
+    found = load(path, text, dem=Plane())
     assert found.lonlatalt[:, 2].tolist() == [321.0] * 6
     assert found.left_out == ()
 
@@ -552,8 +529,7 @@ def test_a_map_and_degrees_are_the_same_points_ground_and_image_apart_too(tmp_pa
     (first := tmp_path / "ground.xml").write_text(f"<Global>{ground}</Global>")
     (second := tmp_path / "seen.xml").write_text(f"<SetOfMesureAppuisFlottants>{seen}</SetOfMesureAppuisFlottants>")
     for paths in ([first], [first, second], [second, first]):
-        found = load_gcps(list(map(str, paths)), VIEWS, RunOptions(gcp_crs="EPSG:32631"))
-        assert found is not None
+        found = load_all(paths, gcp_crs="EPSG:32631")
         assert sorted(found.names) == sorted(POINTS.names)
         assert len(found.view) == len(POINTS.view)
         order = [found.names.index(name) for name in POINTS.names]
