@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyproj
@@ -286,11 +286,18 @@ def test_ten_names_are_listed_and_the_others_counted() -> None:
     assert [control.listed(names[:count]) for count in (11, 13)] == [f"{ten} and {n} more" for n in (1, 3)]
 
 
+@dataclass(frozen=True)
 class Plain:
-    """A camera that looks straight down: column and row are hundredths of a degree; the pixel is said by its row."""
+    """A camera that looks straight down: column and row are hundredths of a degree, or another part of it."""
+
+    degrees: float = 0.01
+    size: float = 1.0  # NaN: what a pixel measures is not known
 
     def localize(self, image, alt):
-        return np.column_stack([np.asarray(image) / 100.0, alt])
+        return np.column_stack([np.asarray(image) * self.degrees, alt])
+
+    def project_jacobian(self, ground):
+        return None, np.broadcast_to(self.size * np.eye(2, 3) / self.degrees, (len(ground), 2, 3))
 
 
 def made(*rows: tuple[int, int, float, float], lonlatalt) -> GroundPoints:
@@ -306,13 +313,7 @@ def flat(count: int = 2) -> tuple[View, ...]:
     return tuple(View(f"v{n}", f"v{n}.tif", (9000, 9000), Plain(), ends[n]) for n in range(count))  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def pixel(monkeypatch):
-    """Ground sample distances of `Plain`: a metre."""
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.ones(len(ground))))
-
-
-def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[list[int], str]]:
+def told(points: GroundPoints, search: float = 0.5, views=None) -> list[tuple[list[int], str]]:
     """Which points cannot be meant, and how the reason begins; reasons of none are left out."""
     found = control._implausible(points, views or flat(), search)
     return [(np.flatnonzero(wrong).tolist(), what) for wrong, what in found if wrong.any()]
@@ -326,14 +327,14 @@ def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[li
         (40.0, -30.0, "as far as"), (31.0, 40.0, "as far as"),
     ],
 )  # fmt: skip
-def test_each_mistake_is_recognised_by_itself(pixel, lon, lat, says) -> None:
+def test_each_mistake_is_recognised_by_itself(lon, lat, says) -> None:
     """The image shows 30 east, 40 north."""
     found = told(made((0, 0, 3000.0, 4000.0), lonlatalt=[lon, lat, 10.0]))
     assert [which for which, _ in found] == ([[0]] if says else [])
     assert not says or found[0][1].startswith(says)
 
 
-def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_them(pixel) -> None:
+def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_them() -> None:
     """A degree of longitude is 109.6 km at ten degrees north, of latitude 110.6."""
     points = made(
         (0, 0, 30e2, 10e2), (0, 1, 32e2, 10e2), (1, 0, 33e2, 10e2), (1, 1, 33e2, 10e2), (2, 1, 30e2, 11e2),
@@ -344,7 +345,7 @@ def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_the
     assert what == "as far as 219 km from where the images show it, by their cameras"
 
 
-def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be(pixel) -> None:
+def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be() -> None:
     """90.001 north is 111 m from the pole, nearer than a camera is wrong by."""
     for lat, wrong in ((90.0, False), (90.001, True)):
         found = told(made((0, 0, 0.0, 9000.0), lonlatalt=[0.0, lat, 10.0]))
@@ -358,14 +359,14 @@ def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be(pixel) -> Non
         (1, 500.0, True), (1, 499.0, False), (1, 2500.0, True), (1, 2501.0, False),
     ],
 )  # fmt: skip
-def test_altitudes_belong_to_the_image_that_shows_the_point(pixel, view, alt, fine) -> None:
+def test_altitudes_belong_to_the_image_that_shows_the_point(view, alt, fine) -> None:
     points = made((0, 0, 0.0, 0.0), (1, view, 100.0, 100.0), lonlatalt=[[0, 0, 100.0], [1, 1, alt]])
     ends = "0 to 300 m" if view == 0 else "0 to 2000 m"
     says = f"altitudes far outside {ends}, where the cameras are used: metres above the ellipsoid are needed"
     assert told(points) == ([] if fine else [([1], says)])
 
 
-def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs(pixel) -> None:
+def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs() -> None:
     """At an altitude beyond the camera's, height makes no distance."""
     points = made((0, 0, 0.0, 0.0), (1, 1, 0.0, 0.0), lonlatalt=[[0, 0, 790.0], [0, 0, 510.0]])
     assert told(points) == []
@@ -380,24 +381,30 @@ def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs(
     assert seen == [300.0, 1000.0]
 
 
-@pytest.mark.parametrize(("search", "reach"), [(1.0, 1000.0), (499.0, 1000.0), (3000.0, 6000.0)])
-def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(monkeypatch, search, reach) -> None:
-    sizes = lambda sensor, ground: (None, np.full(len(ground), 2.0))  # noqa: E731
-    monkeypatch.setattr(control, "ground_sample_distance", sizes)
-    degree = 110574.0  # m of latitude at the equator
+@pytest.mark.parametrize(("search", "reach"), [(0.5, 1000.0), (0.9, 1000.0), (6.0, 6657.0)])
+def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(search, reach) -> None:
+    """A pixel is 1109.5 m: at the equator a degree of longitude is 111.3 km, of latitude 110.6."""
     for share, fine in ((0.99, True), (1.01, False)):
-        points = made((0, 0, 0.0, 0.0), lonlatalt=[0.0, share * reach / degree, 0.0])
+        points = made((0, 0, 0.0, 0.0), lonlatalt=[0.0, share * reach / 110574.0, 10.0])
         assert (told(points, search) == []) == fine
 
 
-def test_each_image_is_asked_for_its_own_observations(monkeypatch) -> None:
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, 10.0 * ground[:, 0]))
-    points = made((0, 1, 300.0, 1.0), (1, 0, 100.0, 2.0), (0, 0, 200.0, 3.0), lonlatalt=np.zeros((2, 3)))
-    ground, pixel = control._image_positions(points, flat(), np.array([5.0, 6.0, 7.0]))
-    np.testing.assert_allclose(ground, [[3.0, 0.01, 5.0], [1.0, 0.02, 6.0], [2.0, 0.03, 7.0]])
-    np.testing.assert_allclose(pixel, [30.0, 10.0, 20.0])
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan)))
-    assert control._image_positions(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
+@pytest.mark.parametrize(("view", "far"), [(0, True), (1, False)])
+def test_each_image_is_asked_for_its_own_observations(view, far) -> None:
+    """Of two points one lies nine hundredths of a degree off: six pixels of the coarser camera, not of the other."""
+    degrees = (0.01, 0.02)
+    views = [replace(flat()[0], sensor=Plain(step)) for step in degrees]
+    points = made(
+        (0, 1, 3.0 / 0.02, 1.0 / 0.02), (1, view, 2.0 / degrees[view], 1.0 / degrees[view]), (0, 0, 300.0, 100.0),
+        lonlatalt=[[3.0, 1.0, 10.0], [2.0, 1.09, 10.0]],
+    )  # fmt: skip
+    assert [which for which, _ in told(points, 6.0, views)] == [[1]] * far
+
+
+def test_where_a_pixel_has_no_size_the_reach_is_a_kilometre() -> None:
+    views = [replace(flat()[0], sensor=Plain(0.01, size=np.nan))]
+    assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.008, 10.0]), 6.0, views) == []
+    assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.010, 10.0]), 6.0, views) != []
 
 
 def test_several_faults_are_several_lines_and_a_point_has_the_first_that_fits(tmp_path) -> None:
