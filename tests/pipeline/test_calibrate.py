@@ -22,18 +22,15 @@ from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
 from barpc.pipeline.calibrate import _FinishedRun, _OnLine, _refuse_unsure, _row_direction
-from barpc.pipeline.calibrations import _may_be_covariance, calibrations_of, common_errors, read_calibration
+from barpc.pipeline.calibrations import calibrations_of, common_errors, read_calibration
 from barpc.pipeline.proof import PASSED_STATES, prove
-from barpc.pointio.matches import write_matches
 from barpc.report import Run
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.rpcio.images import put_tag
 from barpc.scene import Camera
-from barpc.sensor.rpc import RPC
 from barpc.sensor.sentinel1 import RangeDoppler, read_annotation
 from barpc.simulate import Look
 from benchmarks.calibrate import Scene, Sensor, any_looks, parts, scene
-from tests.geotiffs import write_blank
+from tests.pipeline.known import write_block
 from tests.sensor.s1_product import Product
 
 SIZE = (4000, 3000)
@@ -44,17 +41,10 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 def files(made: Scene, folder: Path, sensor: str = "SIM1") -> list[Path]:
     """Write a scene's images, with their metadata, and its tie points."""
     folder.mkdir(parents=True)
-    names = []
-    for view in made.views:
-        path = write_blank(folder / f"{view.name}.tif", view.size)
-        assert isinstance(view.sensor, RPC)
-        put_tag(path, view.sensor)
-        if sensor:
-            said = {"satellite_id": sensor, "instrument": "PAN", "acquired": "2020-01-01T10:00:00Z"}
-            path.with_name(f"{view.name}_metadata.json").write_text(json.dumps(said))
-        names.append(path)
-    write_matches(folder / "ties.npz", made.tracks, [view.name for view in made.views])
-    return names
+    said = {"satellite_id": sensor, "instrument": "PAN", "acquired": "2020-01-01T10:00:00Z"}
+    for view in made.views if sensor else ():
+        (folder / f"{view.name}_metadata.json").write_text(json.dumps(said))
+    return write_block(folder, made.views, made.tracks)
 
 
 def run(paths: list[Path], out: str = "adjusted", **given: Any) -> AdjustResult:
@@ -354,14 +344,23 @@ def test_a_calibration_is_read_as_it_stands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("edges", [0, 1, 40, 64])
-def test_a_covariance_of_curves_without_constant_and_slope_is_one_with_the_digits_that_are_written(edges: int) -> None:
+def test_a_covariance_of_curves_without_constant_and_slope_is_one_with_the_digits_that_are_written(
+    edges: int, tmp_path: Path
+) -> None:
     curve = LineCurve(SIZE[0], np.linspace(100.5, 3900.5, edges))
     root = curve.bent @ np.random.default_rng(edges).normal(0, 0.1, (2 * curve.size, 20))
+
+    def read(matrix: np.ndarray) -> Calibration:
+        steps, lower = [[0.0, 0.0]] * edges, matrix[np.tril_indices(len(matrix))].tolist()
+        path = written(tmp_path / "a.cal", edges=curve.edges.tolist(), steps_px=steps, covariance_px2=lower)
+        return read_calibration(path)
+
     for scale in (1e-4, 1.0, 100.0):
         matrix = np.vectorize(lambda value: float(f"{value:.5g}"))(scale * root @ root.T)
-        assert _may_be_covariance(matrix)
+        np.testing.assert_array_equal(read(matrix).covariance, matrix)
         matrix[0, 1] = matrix[1, 0] = 1.1 * np.sqrt(matrix[0, 0] * matrix[1, 1])
-        assert not _may_be_covariance(matrix)
+        with pytest.raises(InputError, match="damaged"):
+            read(matrix)
 
 
 def test_an_image_takes_the_calibration_of_its_sensor_or_of_none(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from tests.fit.cameras import synthetic
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc, write_image
 
-from .test_growth import write_block
+from .test_growth import small_block
 
 SIZE, ALTS = (1500, 2200), (0.0, 600.0)
 ENDS = (GRID_SUFFIX, CORRECTION)
@@ -386,7 +386,7 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
 @pytest.fixture(scope="module")
 def block(tmp_path_factory):
     folder = tmp_path_factory.mktemp("block")
-    return write_block(folder, 3)[1], str(folder / "matches.npz")
+    return small_block(folder, 3)[1], str(folder / "ties.npz")
 
 
 @pytest.mark.nightly

@@ -14,28 +14,23 @@ from barpc.base.errors import BarpcError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import RunOptions
 from barpc.pipeline import adjust, load_views, outputs, run
-from barpc.pointio.matches import write_matches
 from barpc.report import Run, verdict
 from barpc.rpcio import formats
-from barpc.rpcio.images import put_tag
 from barpc.sensor.geometry import Several
 from barpc.sensor.rpc import RPC
 from barpc.sensor.triangulation import epipolar_offset
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.geotiffs import write_image
+from tests.pipeline.known import write_block
 
 SIDE = 256
 LAYOUT = {"size": (SIDE, SIDE), "gsd": 40.0, "attitude": 5e-5}
 
 
-def write_block(folder: Path, num: int) -> tuple[SimulatedBlock, list[Path]]:
+def small_block(folder: Path, num: int) -> tuple[SimulatedBlock, list[Path]]:
     """A block with small images, which differ."""
     block = simulate_block(num, 40 * num, seed=3, num_checks=0, **LAYOUT)
-    paths = [folder / f"{view.name}.tif" for view in block.views]
-    for n, (path, view) in enumerate(zip(paths, block.views, strict=True)):
-        ramp = (np.add.outer(np.arange(SIDE), np.arange(SIDE)) + n).astype(np.uint16)
-        put_tag(write_image(path, ramp, compress="deflate"), view.sensor)
-    write_matches(folder / "matches.npz", block.tracks, [view.name for view in block.views])
+    ramp = np.add.outer(np.arange(SIDE), np.arange(SIDE)).astype(np.uint16)
+    paths = write_block(folder, block.views, block.tracks, lambda number: ramp + np.uint16(number))
     os.utime(folder, (1e9, 1e9))  # nothing was written there for long
     return block, paths
 
@@ -47,7 +42,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def block(folder) -> tuple[SimulatedBlock, list[Path]]:
-    return write_block(folder, 12)
+    return small_block(folder, 12)
 
 
 def counted(monkeypatch, owner: object, name: str, counts: Counter[str]) -> None:
@@ -140,7 +135,7 @@ def test_a_run_that_was_stopped_in_writing_goes_on_after_the_fits(block, folder,
     counts: Counter[str] = Counter()
     for name in ("fit_rpc", "write_views"):
         counted(monkeypatch, run, name, counts)
-    options = RunOptions(matches=str(folder / "matches.npz"), matches_only=True)
+    options = RunOptions(matches=str(folder / "ties.npz"), matches_only=True)
 
     def stop(*_):
         raise KeyboardInterrupt

@@ -334,27 +334,6 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
         stages._fitted(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), HERE)
 
 
-@pytest.mark.parametrize(
-    ("images", "stop_after", "asked"), [("vrt", "all", True), ("copy", "all", False), ("vrt", "adjustment", False)]
-)
-def test_only_a_vrt_that_will_be_written_asks_for_images_that_it_can_point_at(
-    images, stop_after, asked, tmp_path, monkeypatch
-) -> None:
-    seen: list[str] = []
-    monkeypatch.setattr(stages, "local_image", seen.append)
-    run, options = Run("adjust", views(2), (), NONE), RunOptions(images=images, stop_after=stop_after)
-    names, keep = stages._planned_files(run, options, tmp_path)
-    assert seen == (["/x/v0.tif", "/x/v1.tif"] if asked else [])
-    assert names == output_names(run.views, options, tmp_path)
-    assert {Path("/x/v0.tif"), Path("/x/v1.tif")} <= set(keep)
-
-
-def a_record(run: Run, **more: Any) -> Any:
-    """A summary with what a result prints."""
-    tracks = SimpleNamespace(num_tracks=0, num_observations=0)
-    return SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None, **more)
-
-
 def test_a_check_has_the_images_as_they_were_given_and_adjusts_nothing(corner) -> None:
     given, told = [corner.images[k] for k in (2, 0, 1)], set()
     result = stages.check([*given, "no.tif"], RunOptions(keep_going=True), progress=lambda *now: told.add(now[0]))
@@ -367,13 +346,13 @@ def test_a_check_has_the_images_as_they_were_given_and_adjusts_nothing(corner) -
 
 
 def test_a_result_prints_its_folder_if_it_has_one_and_of_a_long_name_the_end() -> None:
-    run = Run("check", views(), (), NONE)
-    result = stages.AdjustResult((), run, a_record(run))
+    run, tracks = Run("check", views(), (), NONE), SimpleNamespace(num_tracks=0, num_observations=0)
+    record: Any = SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None)
+    result = stages.AdjustResult((), run, record)
     assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
     for length, shown in ((50, "/" * 50), (51, "..." + "/" * 47)):
-        result.record.out_dir = "/" * length  # type: ignore[misc]
-        wrote = stages.AdjustResult((), run, result.record)
-        assert repr(wrote).endswith(f", in {shown})")
+        record.out_dir = "/" * length
+        assert repr(stages.AdjustResult((), run, record)).endswith(f", in {shown})")
 
 
 @pytest.mark.slow
