@@ -104,10 +104,6 @@ def run(scene: Path, tmp_path: Path, shared: Run) -> Run:
     return Run(scene, tmp_path, shared)
 
 
-def _names(path: Path) -> set[str]:
-    return {p.suffix if p.name.startswith("view") else p.name for p in path.iterdir()}
-
-
 def stop_after(run: Run, out: Path, scene: Path) -> None:
     matched = Path(run.matched.run.out_dir)
     assert (matched / "matches.csv").exists()

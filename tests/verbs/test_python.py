@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import json
+import os
 import re
 import subprocess
 import sys
@@ -30,7 +32,10 @@ from barpc.verbs.python import in_keywords
 from tests.docs.test_pages import script
 from tests.pipeline.known import FOLDER as SAMPLES
 from tests.pipeline.known import SAMPLES as VIEWS
+from tests.rasters.test_dem import write_dem
+from tests.report.conftest import run_of_block, written
 from tests.rpcio.conftest import make_rpc
+from tests.sealing import seal
 
 GROUND = [5.4, 43.3, 120.0]
 PUBLIC = [name for name in barpc.__all__ if name != "__version__"]
@@ -223,11 +228,8 @@ class Place:
 
 
 def test_open_datasets_and_other_peoples_paths_are_files_everywhere(tmp_path):
-    profile = {"driver": "GTiff", "width": 8, "height": 8, "count": 1, "dtype": "float32", "crs": "EPSG:4326+4979"}
-    with rasterio.open(
-        tmp_path / "dem.tif", "w", **profile, transform=rasterio.Affine(0.01, 0, 5.36, 0, -0.01, 43.34)
-    ) as file:
-        file.write(np.full((1, 8, 8), 120.0, np.float32))
+    where = rasterio.Affine(0.01, 0, 5.36, 0, -0.01, 43.34)
+    write_dem(tmp_path / "dem.tif", "EPSG:4326+4979", np.full((8, 8), 120.0, np.float32), transform=where)
     expected = barpc.localize(VIEWS[0], [[500, 500]], 120.0)
     with rasterio.open(VIEWS[0]) as image, rasterio.open(tmp_path / "dem.tif") as dem:
         for given, terrain in ((image, dem), (Place(VIEWS[0]), Place(tmp_path / "dem.tif")), (VIEWS[0], [dem])):
@@ -239,13 +241,8 @@ def test_open_datasets_and_other_peoples_paths_are_files_everywhere(tmp_path):
             barpc.write_rpc(barpc.read_rpc(given), Place(tmp_path / "a.RPB"), overwrite=True)
         assert barpc.fit(image, Place(tmp_path / "f_RPC.TXT"), dem=[dem], geoid="none").max_ckp.max() < 0.01
     assert barpc.convert(Place(VIEWS[0]), Place(tmp_path / "b.RPB")).passed
-    assert run_options(Place(write(tmp_path / "o.toml", "[tie]\nband = 2\n"))).tie.band == 2
-
-
-def write(path: Path, text: str) -> Path:
-    """A file with a text."""
-    path.write_text(text)
-    return path
+    (tmp_path / "o.toml").write_text("[tie]\nband = 2\n")
+    assert run_options(Place(tmp_path / "o.toml")).tie.band == 2
 
 
 def test_a_dataset_in_memory_has_no_file_that_can_be_read():
@@ -389,12 +386,6 @@ def test_an_altitude_that_is_assumed_is_said_and_two_contradict():
 
 def test_a_run_adjusted_again_has_its_new_altitude(tmp_path):
     """The altitude beside an image is that of its run as it is now, not as it was."""
-    import json
-    import os
-
-    from tests.report.conftest import run_of_block, written
-    from tests.sealing import seal
-
     folder = tmp_path / "run"
     written(run_of_block(3, 60, size=(900, 700)), folder)
     summary = json.loads((folder / "summary.json").read_text())
