@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import barpc
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, ReservationError
 from barpc.pipeline.run import AdjustResult
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import write_matches
@@ -57,7 +57,11 @@ def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., AdjustRe
 @pytest.mark.few(1)
 @pytest.mark.parametrize("level", [1.0, 200.0, -3.5])
 def test_altitudes_that_are_all_the_same_are_a_default(level: float, adjusted, tmp_path: Path) -> None:
-    found = adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path)
+    with pytest.raises(ReservationError) as caught:  # which has the result
+        adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path, check=True)
+    found = caught.value.result
+    said = " ".join([found.record.headline, *found.record.reasons])
+    assert str(caught.value) == said.replace("--dem", "dem")  # keywords
     assert found.record.status == "look"
     assert any("5 of 5 points have no altitude, or a default" in reason for reason in found.record.reasons)
     assert found.adjustment.gauge.sigma[2] > 30.0
@@ -111,7 +115,7 @@ def test_control_that_moves_right_cameras_by_the_geoid_is_named(
 
 def test_pointing_errors_are_no_geoid(adjusted, tmp_path: Path) -> None:
     """The delivered cameras put the scene 89 m too low, and 7 m aside."""
-    assert adjusted(VIEWS, written(tmp_path / "g.csv", float), tmp_path).record.status == "good"
+    assert adjusted(VIEWS, written(tmp_path / "g.csv", float), tmp_path, check=True).record.status == "good"
 
 
 def test_height_default_is_the_altitude_where_none_is_given(shared_data: Path, tmp_path: Path) -> None:
