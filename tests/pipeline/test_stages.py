@@ -345,6 +345,11 @@ def test_a_check_has_the_images_as_they_were_given_and_adjusts_nothing(corner) -
     assert {"cameras", "detect", "match"} <= told
 
 
+def test_a_check_of_one_image_has_no_tie_points_to_cut(corner) -> None:
+    result = stages.check(corner.images[:1], RunOptions(gcp=(str(corner.gcps),)))
+    assert (len(result.views), len(result.tracks), result.run.agreeing) == (1, 0, None)
+
+
 def test_a_result_prints_its_folder_if_it_has_one_and_of_a_long_name_the_end() -> None:
     run, tracks = Run("check", views(), (), NONE), SimpleNamespace(num_tracks=0, num_observations=0)
     record: Any = SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None)
