@@ -38,6 +38,17 @@ class Rendered:
     def paths(self) -> list[str]:
         return [str(self.folder / f"{shot.name}.tif") for shot in self.scene.shots]
 
+    @property
+    def alts(self) -> tuple[float, float]:
+        """Altitudes [m] of what the images show, and 10 m around them."""
+        shown = np.concatenate([one.altitude.ravel() for one in self.pictures])
+        return float(np.nanmin(shown)) - 10.0, float(np.nanmax(shown)) + 10.0
+
+    def missed(self, path: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of the heights of a file, NaN where there is none, and their sigma [m]."""
+        with rasterio.open(path) as file:
+            return file.read(1) - self.truth(path), file.read(4)
+
     def truth(self, path: Path) -> np.ndarray:
         """Median altitude of what the images show in each cell of a file; through the exact pushbroom cameras."""
         with rasterio.open(path) as file:

@@ -12,13 +12,13 @@ from barpc.ba import adjust_tracks, block_prior
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.base.verb_options import DsmOptions
-from barpc.cli import main
 from barpc.dsm.stereo import CameraErrors
 from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.sensor.corrected import Corrected
 from barpc.sensor.triangulation import triangulate
 from barpc.simulate import simulate_block
+from tests.cli.test_main import run
 from tests.everywhere import rows_of
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
@@ -92,19 +92,7 @@ def tallest(after, before):
 @pytest.mark.nightly
 def test_a_building_that_grew_is_the_change_and_the_rest_is_none(two_dates, tmp_path):
     scene, folder, chosen = two_dates
-    with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "-q",
-                "dsm",
-                str(folder / "both"),
-                "-o",
-                str(tmp_path / "change.tif"),
-                "--minus",
-                str(folder / "first"),
-            ]
-        )
-    assert not stop.value.code
+    assert run("-q", "dsm", folder / "both", "-o", tmp_path / "change.tif", "--minus", folder / "first") == 0
     with rasterio.open(tmp_path / "change.tif") as file:
         bands, place, crs, tags = file.read(), file.transform, file.crs, file.tags()
         assert file.descriptions[0].startswith("height minus")
@@ -121,14 +109,3 @@ def test_a_building_that_grew_is_the_change_and_the_rest_is_none(two_dates, tmp_
     assert 0.55 < np.mean(np.abs(bands[0][known]) < sigma) < 0.90
     whole = make_dsm(folder / "both", tmp_path / "whole.tif", DsmOptions())
     assert shared < whole.datum / 3.0
-
-
-@pytest.mark.nightly
-def test_runs_that_are_not_one_block_are_refused(two_dates, tmp_path, capsys):
-    folder = two_dates[1]
-    for one, other in (("first", "both"), ("both", "both")):
-        with pytest.raises(SystemExit) as stop:
-            main(["dsm", str(folder / one), "-o", str(tmp_path / "x.tif"), "--minus", str(folder / other)])
-        assert stop.value.code == 1
-        assert "is told by a run with at least two images of each" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

@@ -243,10 +243,8 @@ def test_few_cells_are_grossly_wrong_and_hardly_any_is_lost(kind, tmp_path, monk
     if changed is not None:
         changed(scene)
     found = Rendered(scene, tmp_path).write()
-    shown = np.concatenate([one.altitude.ravel() for one in found.pictures])
-    alts = float(np.nanmin(shown)) - 10.0, float(np.nanmax(shown)) + 10.0
-    block = block_of_images(found.paths, alts, 1)
-    ((_, tile, (group,)),) = Grid(block, DsmOptions(alt=alts)).tiles
+    block = block_of_images(found.paths, found.alts, 1)
+    ((_, tile, (group,)),) = Grid(block, DsmOptions(alt=found.alts)).tiles
     truth = found.truth_in(tile)
     low = minimum_filter(np.where(np.isfinite(truth), truth, np.inf), 3)
     high = maximum_filter(np.where(np.isfinite(truth), truth, -np.inf), 3)

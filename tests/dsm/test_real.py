@@ -13,12 +13,12 @@ from barpc.ba.result import pair_heights
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.base.verb_options import DsmOptions
-from barpc.cli import main
 from barpc.dsm.stereo import block_of_run
 from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.report.runfiles import read_summary, read_tables
 from barpc.report.summary.words import metres
+from tests.cli.test_main import run as command
 
 pytestmark = pytest.mark.slow
 
@@ -68,22 +68,7 @@ def test_pairs_of_the_triplet_agree_to_a_third_of_a_metre(surface):
 
 @pytest.mark.nightly  # before: of rendered images, in test_surface
 def test_the_command_says_what_it_made(copied, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "-q",
-                "dsm",
-                str(copied),
-                "-o",
-                str(tmp_path / "dsm.tif"),
-                "--pairs",
-                "1",
-                "--gsd",
-                "2",
-                "--json",
-            ]
-        )
-    assert not stop.value.code
+    assert command("-q", "dsm", copied, "-o", tmp_path / "dsm.tif", "--pairs", 1, "--gsd", 2, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["gsd"] == 2.0
     assert told["pairs"] == ["img_01 - img_03"]

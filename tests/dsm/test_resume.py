@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from barpc.base.options import RunOptions
 from barpc.base.verb_options import DsmOptions
-from barpc.cli import main
 from barpc.dsm.surface import make_dsm
 from barpc.pipeline import adjust
 from barpc.report.runfiles import SURFACE
+from tests.cli.test_main import run
 from tests.dsm.conftest import ALTS
 from tests.lanes import rest_slow
 
@@ -45,12 +46,6 @@ def killed(call: list[str], when) -> bool:
             os.kill(work.pid, signal.SIGKILL)
         work.wait()
     return work.returncode == -signal.SIGKILL
-
-
-def run(*args: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(["-q", *map(str, args)])
-    return int(stop.value.code or 0)
 
 
 @pytest.mark.nightly
@@ -82,7 +77,7 @@ def test_a_killed_command_goes_on_and_gives_the_same_bytes(rendered, tmp_path, t
         )
         before = found
     if not (folder / "dsm.tif").exists():
-        assert run(*call) == 0
+        assert run("-q", *call) == 0
     assert (folder / "dsm.tif").read_bytes() == whole.read_bytes()
 
 
@@ -95,20 +90,14 @@ def test_a_finished_run_whose_surface_was_killed_stays_finished(rendered, tmp_pa
     assert killed(call, (folder / "dsm.tif.unfinished").exists)
     assert not (folder / "dsm.tif").exists()
     assert (folder / "report.html").read_bytes() == page
-    assert run("adjust", *rendered.paths[1:], "-o", folder) == 1
+    assert run("-q", "adjust", *rendered.paths[1:], "-o", folder) == 1
     assert "exists and is not empty; give --overwrite" in capsys.readouterr().err
-    assert run(*call) == 0
+    assert run("-q", *call) == 0
     assert not (folder / "dsm.tif.unfinished").exists()
     # another run in the same folder does not show it
     old = (folder / "tables" / SURFACE).read_bytes()
-    adjust(rendered.paths[1:], folder, overwritten())
+    adjust(rendered.paths[1:], folder, RunOptions(overwrite=True))
     assert "Which ground do they reconstruct?" not in (folder / "report.html").read_text(encoding="utf-8")
     (folder / "tables" / SURFACE).write_bytes(old)
-    assert run("report", folder) == 1
+    assert run("-q", "report", folder) == 1
     assert "was changed since the run wrote it" in capsys.readouterr().err
-
-
-def overwritten():
-    from barpc.base.options import RunOptions
-
-    return RunOptions(overwrite=True)

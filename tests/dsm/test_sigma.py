@@ -77,12 +77,18 @@ def ecef_up():
     return step / np.linalg.norm(step)
 
 
-def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
+@pytest.fixture(scope="module")
+def framed(views):
+    """The frame of two views, and the places in either of 75 ground points that it is made of."""
     lon, lat = np.meshgrid(np.linspace(5.3995, 5.4005, 5), np.linspace(43.2997, 43.3003, 5))
     alt = np.repeat(np.linspace(*ALTS, 3), lon.size)
     ground = np.column_stack([np.tile(lon.ravel(), 3), np.tile(lat.ravel(), 3), alt])
-    a, b = (view.sensor.project(ground) for view in views[:2])
-    frame = epipolar_frame(a, b, alt)
+    places = [view.sensor.project(ground) for view in views[:2]]
+    return epipolar_frame(*places, alt), places
+
+
+def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views, framed):
+    frame, places = framed
     assert frame.across < 0.02
     other = np.array([[5.40021, 43.29991, 260.0], [5.39972, 43.30022, 215.0]])
     first, second = (
@@ -93,7 +99,7 @@ def test_rows_of_the_frame_are_epipolar_lines_and_disparity_tells_height(views):
     assert ((disparity > 0) & (disparity < frame.num)).all()
     told = np.column_stack([first, disparity, np.ones(2)]) @ frame.altitude
     np.testing.assert_allclose(told, other[:, 2], atol=0.2)
-    for one, points in zip(frame.maps, (a, b), strict=True):
+    for one, points in zip(frame.maps, places, strict=True):
         scale = np.linalg.norm(one[:, :2], axis=1)
         np.testing.assert_allclose(scale, [2.0, 1.0], rtol=0.1)  # two columns and one row a pixel
         assert len(points) == 75
@@ -122,12 +128,9 @@ class Wobbly:
 
 @pytest.mark.parametrize(("amplitude", "few"), [(0.0, True), (0.1, False)])
 def test_matches_are_intersected_to_a_millimetre_and_one_by_one_where_a_camera_swings(
-    amplitude, few, views, monkeypatch
+    amplitude, few, views, framed, monkeypatch
 ):
-    lon, lat = np.meshgrid(np.linspace(5.3995, 5.4005, 5), np.linspace(43.2997, 43.3003, 5))
-    alt = np.repeat(np.linspace(*ALTS, 3), lon.size)
-    ground = np.column_stack([np.tile(lon.ravel(), 3), np.tile(lat.ravel(), 3), alt])
-    frame = epipolar_frame(*(view.sensor.project(ground) for view in views[:2]), alt)
+    frame = framed[0]
     col, row = (part.ravel() for part in np.meshgrid(np.arange(-100.0, 100.0), np.arange(-60.0, 60.0)))
     disparity = frame.num / 2 + np.random.default_rng(3).normal(0.0, frame.num / 8, len(col))
     found = DenseMatches(frame, np.stack([col, row, disparity]), np.ones(len(col)), 1.0)

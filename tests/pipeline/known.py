@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis
+from barpc.pointio.matches import write_matches
+from barpc.rpcio import read_rpc
+from barpc.rpcio.images import put_tag
+from barpc.scene import Tracks, View
+from barpc.sensor.rpc import RPC
 from barpc.sensor.triangulation import triangulate
 from tests.everywhere import rows_of
+from tests.geotiffs import write_blank, write_image
 from tests.reliability.trials import SAMPLES, crop
 
 FOLDER = SAMPLES[0].parent
@@ -44,6 +51,22 @@ def part(folder: Path, side: int = SIDE, start: int = START, gcps: int = 5) -> K
     return Known(images, {**truth, "check_points": points[gcps:]}, folder / "gcps.geojson", False)
 
 
+def write_block(
+    folder: Path, views: Sequence[View], tracks: Tracks, pixels: Callable[[int], np.ndarray] | None = None
+) -> list[Path]:
+    """Images of simulated views with their RPCs, blank or of the pixels of each number, and ties.npz."""
+    paths = [folder / f"{view.name}.tif" for view in views]
+    for number, (path, view) in enumerate(zip(paths, views, strict=True)):
+        assert isinstance(view.sensor, RPC)
+        if pixels is None:
+            write_blank(path, view.size)
+        else:
+            write_image(path, pixels(number), compress="deflate")
+        put_tag(path, view.sensor)
+    write_matches(folder / "ties.npz", tracks, [view.name for view in views])
+    return paths
+
+
 def _moved(point: dict[str, Any], start: int, side: int) -> dict[str, Any]:
     """A check point in the windows that show it."""
     image = {name: [value - start for value in xy] for name, xy in point["image"].items()}
@@ -71,6 +94,11 @@ def exact(truth: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     assert len(points) > (100 if len(truth["check_points"]) > 100 else 5)
     ground = np.array([point["ground"] for point in points])
     return ground, np.array([[point["image"][name] for name in names] for point in points])
+
+
+def errors_of_run(out: Path, truth: dict[str, Any]) -> tuple[float, np.ndarray]:
+    """`errors_at_check_points` of the cameras that a run wrote into a folder."""
+    return errors_at_check_points([read_rpc(out / f"{view['name']}.vrt") for view in truth["views"]], truth)
 
 
 def errors_at_check_points(sensors: Any, truth: dict[str, Any]) -> tuple[float, np.ndarray]:

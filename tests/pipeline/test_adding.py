@@ -22,9 +22,8 @@ from barpc.pointio.matches import write_matches
 from barpc.rpcio import read_rpc
 from barpc.rpcio.images import put_tag
 from barpc.scene import Tracks
-from barpc.sensor.rpc import RPC
 from barpc.simulate import SimulatedBlock, simulate_block
-from tests.geotiffs import write_image
+from tests.pipeline.known import write_block
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*constrained in height")
 COUNT = 12  # four sites in a square, three views each
@@ -39,12 +38,8 @@ def made() -> SimulatedBlock:
 def archive(made: SimulatedBlock, tmp_path_factory) -> Path:
     """The block's images, of noise, with their RPCs, and its tie points."""
     folder, rng = tmp_path_factory.mktemp("archive"), np.random.default_rng(0)
-    for view in made.views:
-        width, height = view.size
-        pixels = np.tile(rng.integers(0, 255, (20, 20), dtype=np.uint8), (height // 20, width // 20))
-        assert isinstance(view.sensor, RPC)
-        put_tag(write_image(folder / f"{view.name}.tif", pixels, compress="deflate"), view.sensor)
-    write_matches(folder / "ties.npz", made.tracks, [view.name for view in made.views])
+    noise = rng.integers(0, 255, (COUNT, 20, 20), dtype=np.uint8)
+    write_block(folder, made.views, made.tracks, lambda number: np.tile(noise[number], (100, 100)))
     return folder
 
 
@@ -257,8 +252,3 @@ def test_old_images_that_are_given_are_written_and_no_flag_is_asked_for(eleven: 
         ground = read_rpc(eleven / f"{name}.tif").localize(np.array([[0.0, 0.0], [1999.0, 1999.0]]), np.full(2, 300.0))
         one, other = (read_rpc(eleven / run / f"{name}.vrt").project(ground) for run in ("given", "first"))
         np.testing.assert_allclose(one, other, atol=1e-4)
-
-
-def test_an_update_is_of_a_run() -> None:
-    with pytest.raises(InputError, match="update is given without add_to"):
-        RunOptions(update=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyproj
@@ -35,15 +35,7 @@ def table(points: GroundPoints, head: str, sign: str = ",") -> str:
     """A CSV with named columns."""
     lines = [head.replace(",", sign)]
     for name, (lon, lat, alt), sigma, image, (col, row) in rows(points):
-        known = {
-            "id": name,
-            "lon": lon,
-            "lat": lat,
-            "alt": alt,
-            "image": image + ".tif",
-            "col": col,
-            "row": row,
-        }
+        known = {"id": name, "lon": lon, "lat": lat, "alt": alt, "image": image + ".tif", "col": col, "row": row}
         known |= {"e": sigma[0], "n": sigma[1], "u": sigma[2], "px": 0.4, "": "remark"}
         order = [MEANING.get(word.strip().lower(), "") for word in head.split(",")]
         lines.append(sign.join(str(known[key]) for key in order))
@@ -95,9 +87,13 @@ TEXTS = {
 }
 
 
-def load(path, text: str, **options) -> GroundPoints:
+def load(path, text: str, views=VIEWS, dem=None, **options) -> GroundPoints:
     path.write_text(text)
-    found = load_gcps([str(path)], VIEWS, RunOptions(**options))
+    return load_all([path], views, dem, **options)
+
+
+def load_all(paths, views=VIEWS, dem=None, **options) -> GroundPoints:
+    found = load_gcps(list(map(str, paths)), views, RunOptions(**options), dem)
     assert found is not None
     return found
 
@@ -200,24 +196,19 @@ def test_a_position_in_the_image_that_is_none_is_refused(tmp_path, value):
 
 def test_latitudes_beyond_the_pole_are_recognised_as_longitudes(tmp_path):
     block = simulate_block(2, 4, num_gcps=5, seed=3, lon=139.7, lat=35.7)
-    path = tmp_path / "p.csv"
     lines = ["lon,lat,alt,image,col,row"]
     for g, v, (col, row) in zip(block.gcps.point, block.gcps.view, block.gcps.xy, strict=True):
         lon, lat, alt = block.gcps.lonlatalt[g]
         lines.append(f"{lat},{lon},{alt},{block.views[v].name},{col},{row}")
-    path.write_text("\n".join(lines))
     with pytest.raises(InputError, match=r"5 of 5 points .*exchanged"):
-        load_gcps([str(path)], block.views, RunOptions())
+        load(tmp_path / "p.csv", "\n".join(lines), block.views)
 
 
 def test_cameras_that_are_hundreds_of_metres_off_and_heights_above_the_geoid_are_no_fault(tmp_path):
     move = Correction(np.zeros(3), np.array([300.0, -250.0, 200.0]), np.array([7e6, 0.0, 0.0]))
     off = [View(v.name, v.path, v.size, Corrected(v.sensor, move), v.alt_range) for v in VIEWS]
-    path = tmp_path / "p.gcp"
-    path.write_text(asp(moved(list(range(6)), lambda lon, lat, alt: (lon, lat, alt - 100.0))))
-    found = load_gcps([str(path)], off, RunOptions())
-    assert found is not None
-    assert found.names == POINTS.names
+    above_geoid = asp(moved(list(range(6)), lambda lon, lat, alt: (lon, lat, alt - 100.0)))
+    assert load(tmp_path / "p.gcp", above_geoid, off).names == POINTS.names
 
 
 @pytest.mark.parametrize("only", [False, True])
@@ -239,10 +230,7 @@ def test_images_that_are_not_in_the_run_are_refused_or_left_out(tmp_path, only):
 def test_of_a_file_of_one_image_no_image_is_asked(tmp_path):
     one = POINTS.select(np.bincount(POINTS.point[POINTS.view == 0], minlength=6) > 0)
     one = replace(one, **{name: getattr(one, name)[one.view == 0] for name in ("point", "view", "xy", "xy_sigma")})
-    path = tmp_path / "p.csv"
-    path.write_text(table(one, "id,lon,lat,h,col,row"))
-    found = load_gcps([str(path)], VIEWS[:1], RunOptions())
-    assert found is not None
+    found = load(tmp_path / "p.csv", table(one, "id,lon,lat,h,col,row"), VIEWS[:1])
     np.testing.assert_array_equal(found.xy, one.xy)
 
 
@@ -274,11 +262,10 @@ def test_how_far_a_camera_may_be_wrong_is_a_kilometre_or_what_is_searched(tmp_pa
 def test_several_files_are_one_and_each_is_left_out_alone(tmp_path):
     for name, text in (("a.gcp", asp(POINTS)), ("b.csv", "nothing\n"), ("c.csv", TEXTS["a.csv"])):
         (tmp_path / name).write_text(text)
-    paths = [str(tmp_path / name) for name in ("a.gcp", "b.csv", "c.csv")]
+    paths = [tmp_path / name for name in ("a.gcp", "b.csv", "c.csv")]
     with pytest.raises(InputError, match=r"b\.csv"):
-        load_gcps(paths, VIEWS, RunOptions())
-    found = load_gcps(paths, VIEWS, RunOptions(keep_going=True))
-    assert found is not None
+        load_all(paths)
+    found = load_all(paths, keep_going=True)
     assert found.names == POINTS.names * 2
     assert len(found.left_out) == 1
     assert "b.csv" in found.left_out[0]
@@ -299,11 +286,18 @@ def test_ten_names_are_listed_and_the_others_counted() -> None:
     assert [control.listed(names[:count]) for count in (11, 13)] == [f"{ten} and {n} more" for n in (1, 3)]
 
 
+@dataclass(frozen=True)
 class Plain:
-    """A camera that looks straight down: column and row are hundredths of a degree; the pixel is said by its row."""
+    """A camera that looks straight down: column and row are hundredths of a degree, or another part of it."""
+
+    degrees: float = 0.01
+    size: float = 1.0  # NaN: what a pixel measures is not known
 
     def localize(self, image, alt):
-        return np.column_stack([np.asarray(image) / 100.0, alt])
+        return np.column_stack([np.asarray(image) * self.degrees, alt])
+
+    def project_jacobian(self, ground):
+        return None, np.broadcast_to(self.size * np.eye(2, 3) / self.degrees, (len(ground), 2, 3))
 
 
 def made(*rows: tuple[int, int, float, float], lonlatalt) -> GroundPoints:
@@ -319,13 +313,7 @@ def flat(count: int = 2) -> tuple[View, ...]:
     return tuple(View(f"v{n}", f"v{n}.tif", (9000, 9000), Plain(), ends[n]) for n in range(count))  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def pixel(monkeypatch):
-    """Ground sample distances of `Plain`: a metre."""
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.ones(len(ground))))
-
-
-def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[list[int], str]]:
+def told(points: GroundPoints, search: float = 0.5, views=None) -> list[tuple[list[int], str]]:
     """Which points cannot be meant, and how the reason begins; reasons of none are left out."""
     found = control._implausible(points, views or flat(), search)
     return [(np.flatnonzero(wrong).tolist(), what) for wrong, what in found if wrong.any()]
@@ -339,14 +327,14 @@ def told(points: GroundPoints, search: float = 1.0, views=None) -> list[tuple[li
         (40.0, -30.0, "as far as"), (31.0, 40.0, "as far as"),
     ],
 )  # fmt: skip
-def test_each_mistake_is_recognised_by_itself(pixel, lon, lat, says) -> None:
+def test_each_mistake_is_recognised_by_itself(lon, lat, says) -> None:
     """The image shows 30 east, 40 north."""
     found = told(made((0, 0, 3000.0, 4000.0), lonlatalt=[lon, lat, 10.0]))
     assert [which for which, _ in found] == ([[0]] if says else [])
     assert not says or found[0][1].startswith(says)
 
 
-def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_them(pixel) -> None:
+def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_them() -> None:
     """A degree of longitude is 109.6 km at ten degrees north, of latitude 110.6."""
     points = made(
         (0, 0, 30e2, 10e2), (0, 1, 32e2, 10e2), (1, 0, 33e2, 10e2), (1, 1, 33e2, 10e2), (2, 1, 30e2, 11e2),
@@ -357,7 +345,7 @@ def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_the
     assert what == "as far as 219 km from where the images show it, by their cameras"
 
 
-def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be(pixel) -> None:
+def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be() -> None:
     """90.001 north is 111 m from the pole, nearer than a camera is wrong by."""
     for lat, wrong in ((90.0, False), (90.001, True)):
         found = told(made((0, 0, 0.0, 9000.0), lonlatalt=[0.0, lat, 10.0]))
@@ -371,14 +359,14 @@ def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be(pixel) -> Non
         (1, 500.0, True), (1, 499.0, False), (1, 2500.0, True), (1, 2501.0, False),
     ],
 )  # fmt: skip
-def test_altitudes_belong_to_the_image_that_shows_the_point(pixel, view, alt, fine) -> None:
+def test_altitudes_belong_to_the_image_that_shows_the_point(view, alt, fine) -> None:
     points = made((0, 0, 0.0, 0.0), (1, view, 100.0, 100.0), lonlatalt=[[0, 0, 100.0], [1, 1, alt]])
     ends = "0 to 300 m" if view == 0 else "0 to 2000 m"
     says = f"altitudes far outside {ends}, where the cameras are used: metres above the ellipsoid are needed"
     assert told(points) == ([] if fine else [([1], says)])
 
 
-def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs(pixel) -> None:
+def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs() -> None:
     """At an altitude beyond the camera's, height makes no distance."""
     points = made((0, 0, 0.0, 0.0), (1, 1, 0.0, 0.0), lonlatalt=[[0, 0, 790.0], [0, 0, 510.0]])
     assert told(points) == []
@@ -393,24 +381,30 @@ def test_points_are_sought_at_the_altitude_of_the_camera_that_is_nearest_theirs(
     assert seen == [300.0, 1000.0]
 
 
-@pytest.mark.parametrize(("search", "reach"), [(1.0, 1000.0), (499.0, 1000.0), (3000.0, 6000.0)])
-def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(monkeypatch, search, reach) -> None:
-    sizes = lambda sensor, ground: (None, np.full(len(ground), 2.0))  # noqa: E731
-    monkeypatch.setattr(control, "ground_sample_distance", sizes)
-    degree = 110574.0  # m of latitude at the equator
+@pytest.mark.parametrize(("search", "reach"), [(0.5, 1000.0), (0.9, 1000.0), (6.0, 6657.0)])
+def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(search, reach) -> None:
+    """A pixel is 1109.5 m: at the equator a degree of longitude is 111.3 km, of latitude 110.6."""
     for share, fine in ((0.99, True), (1.01, False)):
-        points = made((0, 0, 0.0, 0.0), lonlatalt=[0.0, share * reach / degree, 0.0])
+        points = made((0, 0, 0.0, 0.0), lonlatalt=[0.0, share * reach / 110574.0, 10.0])
         assert (told(points, search) == []) == fine
 
 
-def test_each_image_is_asked_for_its_own_observations(monkeypatch) -> None:
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, 10.0 * ground[:, 0]))
-    points = made((0, 1, 300.0, 1.0), (1, 0, 100.0, 2.0), (0, 0, 200.0, 3.0), lonlatalt=np.zeros((2, 3)))
-    ground, pixel = control._image_positions(points, flat(), np.array([5.0, 6.0, 7.0]))
-    np.testing.assert_allclose(ground, [[3.0, 0.01, 5.0], [1.0, 0.02, 6.0], [2.0, 0.03, 7.0]])
-    np.testing.assert_allclose(pixel, [30.0, 10.0, 20.0])
-    monkeypatch.setattr(control, "ground_sample_distance", lambda sensor, ground: (None, np.full(len(ground), np.nan)))
-    assert control._image_positions(points, flat(), np.zeros(3))[1].tolist() == [0.0] * 3
+@pytest.mark.parametrize(("view", "far"), [(0, True), (1, False)])
+def test_each_image_is_asked_for_its_own_observations(view, far) -> None:
+    """Of two points one lies nine hundredths of a degree off: six pixels of the coarser camera, not of the other."""
+    degrees = (0.01, 0.02)
+    views = [replace(flat()[0], sensor=Plain(step)) for step in degrees]
+    points = made(
+        (0, 1, 3.0 / 0.02, 1.0 / 0.02), (1, view, 2.0 / degrees[view], 1.0 / degrees[view]), (0, 0, 300.0, 100.0),
+        lonlatalt=[[3.0, 1.0, 10.0], [2.0, 1.09, 10.0]],
+    )  # fmt: skip
+    assert [which for which, _ in told(points, 6.0, views)] == [[1]] * far
+
+
+def test_where_a_pixel_has_no_size_the_reach_is_a_kilometre() -> None:
+    views = [replace(flat()[0], sensor=Plain(0.01, size=np.nan))]
+    assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.008, 10.0]), 6.0, views) == []
+    assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.010, 10.0]), 6.0, views) != []
 
 
 def test_several_faults_are_several_lines_and_a_point_has_the_first_that_fits(tmp_path) -> None:
@@ -436,8 +430,7 @@ def test_of_several_files_each_observation_keeps_its_point_and_strangers_are_nam
     for n, path in enumerate(paths):
         some = POINTS.select(np.arange(6) % 3 == n)
         path.write_text(asp(some).replace(f"/{VIEWS[2].name}.tif", "/else.tif"))
-    found = load_gcps([str(path) for path in paths], VIEWS, RunOptions(keep_going=True))
-    assert found is not None
+    found = load_all(paths, keep_going=True)
     order = [0, 3, 1, 4, 2, 5]
     assert found.names == tuple(POINTS.names[g] for g in order)
     np.testing.assert_array_equal(found.lonlatalt, POINTS.lonlatalt[order])
@@ -487,19 +480,15 @@ def test_an_altitude_of_zero_is_none_and_holds_an_image_sideways_alone(tmp_path,
 
 
 def test_a_dem_knows_the_altitudes_that_are_zero_where_it_reaches(tmp_path) -> None:
-    path = tmp_path / "p.gcp"
-    path.write_text(asp(at_zero(POINTS, np.arange(6) != 1)))
-    options = RunOptions()
-    found = load_gcps([str(path)], VIEWS, options, Plane())  # type: ignore[arg-type]
-    assert found is not None
+    text = asp(at_zero(POINTS, np.arange(6) != 1))
+    found = load(tmp_path / "p.gcp", text, dem=Plane())
     assert found.lonlatalt[:, 2].tolist() == [321.0, POINTS.lonlatalt[1, 2], *[321.0] * 4]
-    np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(options.adjust.dem_sigma, 5.0 * 5**0.5))
+    np.testing.assert_allclose(found.sigma[[0, 2], 2], np.hypot(RunOptions().adjust.dem_sigma, 5.0 * 5**0.5))
     assert found.sigma[1, 2] == 0.3
     assert found.left_out == ()
     assert "5 of 6 points have no altitude, or a default (0, or one for all): the DEM's are" in " ".join(found.said)
     east = float(np.median(POINTS.lonlatalt[:, 0]))
-    found = load_gcps([str(path)], VIEWS, options, Plane(east))  # type: ignore[arg-type]
-    assert found is not None
+    found = load(tmp_path / "p.gcp", text, dem=Plane(east))
     beyond = (POINTS.lonlatalt[:, 0] >= east) & (np.arange(6) != 1)
     np.testing.assert_array_equal(found.lonlatalt[:, 2] == 321.0, ~beyond & (np.arange(6) != 1))
     assert f"; {beyond.sum()} of them constrain the images horizontally only" in found.left_out[0]
@@ -513,8 +502,7 @@ def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_
     for g, v, (col, row) in zip(gcps.point, gcps.view, gcps.xy.tolist(), strict=True):
         lon, lat, _ = gcps.lonlatalt[g].tolist()
         lines[g] = f"g{g} {lat} {lon} 0 1 1 1 {block.views[v].name} {col} {row} 1 1\n"
-    (path := tmp_path / "p.gcp").write_text("".join(lines.values()))
-    gcps = load_gcps([str(path)], block.views, RunOptions())
+    gcps = load(tmp_path / "p.gcp", "".join(lines.values()), block.views)
     found = adjust_tracks(block.views, block.tracks, gcps=gcps)
     off = ground_from_ecef(found.points) - block.truth.ground
     metres = np.nanmean(off, axis=0) * [111e3 * np.cos(np.radians(43.3)), 111e3, 1.0]
@@ -523,15 +511,11 @@ def test_control_without_altitudes_says_no_more_of_the_height_than_it_knows(tmp_
 
 
 def test_points_without_a_column_of_altitudes_are_as_those_of_zero(tmp_path) -> None:
-    (path := tmp_path / "p.csv").write_text(table(POINTS, "id,lon,lat,image,col,row"))
-    found = load_gcps([str(path)], VIEWS, RunOptions())
-    assert found is not None
+    path, text = tmp_path / "p.csv", table(POINTS, "id,lon,lat,image,col,row")
+    found = load(path, text)
     assert found.said == (f"{path}: CSV; no altitudes",)
-    assert found.left_out[0].endswith(
-        "and constrain the images horizontally only: give their altitudes, or --dem; left out"
-    ) or (found.left_out[0].endswith("and constrain the images horizontally only: give their altitudes, or --dem"))
-    found = load_gcps([str(path)], VIEWS, RunOptions(), Plane())  # type: ignore[arg-type]
-    assert found is not None
+    assert found.left_out[0].endswith("and constrain the images horizontally only: give their altitudes, or --dem")
+    found = load(path, text, dem=Plane())
     assert found.lonlatalt[:, 2].tolist() == [321.0] * 6
     assert found.left_out == ()
 
@@ -552,8 +536,7 @@ def test_a_map_and_degrees_are_the_same_points_ground_and_image_apart_too(tmp_pa
     (first := tmp_path / "ground.xml").write_text(f"<Global>{ground}</Global>")
     (second := tmp_path / "seen.xml").write_text(f"<SetOfMesureAppuisFlottants>{seen}</SetOfMesureAppuisFlottants>")
     for paths in ([first], [first, second], [second, first]):
-        found = load_gcps(list(map(str, paths)), VIEWS, RunOptions(gcp_crs="EPSG:32631"))
-        assert found is not None
+        found = load_all(paths, gcp_crs="EPSG:32631")
         assert sorted(found.names) == sorted(POINTS.names)
         assert len(found.view) == len(POINTS.view)
         order = [found.names.index(name) for name in POINTS.names]

@@ -7,19 +7,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import barpc
-from barpc.base.errors import InputError
+from barpc.base.errors import InputError, ReservationError
 from barpc.pipeline.run import AdjustResult
 from barpc.pointio.gcps import read_gcps
 from barpc.pointio.matches import write_matches
 from barpc.scene import View
+from tests.geotiffs import write_blank
+from tests.pipeline.known import FOLDER
+from tests.pipeline.known import SAMPLES as VIEWS
 
-ROOT = Path(__file__).resolve().parents[2]
-VIEWS = sorted(ROOT.glob("data_samples/view_0*.tif"))
-POINTS = read_gcps(ROOT / "data_samples/gcps.geojson", [view.stem for view in VIEWS])
+POINTS = read_gcps(FOLDER / "gcps.geojson", [view.stem for view in VIEWS])
 GEOID = 48.98
 
 
@@ -57,7 +57,11 @@ def adjusted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., AdjustRe
 @pytest.mark.few(1)
 @pytest.mark.parametrize("level", [1.0, 200.0, -3.5])
 def test_altitudes_that_are_all_the_same_are_a_default(level: float, adjusted, tmp_path: Path) -> None:
-    found = adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path)
+    with pytest.raises(ReservationError) as caught:  # which has the result
+        adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path, check=True)
+    found = caught.value.result
+    said = " ".join([found.record.headline, *found.record.reasons])
+    assert str(caught.value) == said.replace("--dem", "dem")  # keywords
     assert found.record.status == "look"
     assert any("5 of 5 points have no altitude, or a default" in reason for reason in found.record.reasons)
     assert found.adjustment.gauge.sigma[2] > 30.0
@@ -111,18 +115,11 @@ def test_control_that_moves_right_cameras_by_the_geoid_is_named(
 
 def test_pointing_errors_are_no_geoid(adjusted, tmp_path: Path) -> None:
     """The delivered cameras put the scene 89 m too low, and 7 m aside."""
-    assert adjusted(VIEWS, written(tmp_path / "g.csv", float), tmp_path).record.status == "good"
+    assert adjusted(VIEWS, written(tmp_path / "g.csv", float), tmp_path, check=True).record.status == "good"
 
 
 def test_height_default_is_the_altitude_where_none_is_given(shared_data: Path, tmp_path: Path) -> None:
-    import rasterio
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with rasterio.open(
-            tmp_path / "a.tif", "w", driver="GTiff", width=1000, height=1000, count=1, dtype="uint8"
-        ) as image:
-            image.write(np.zeros((1000, 1000), np.uint8), 1)
+    write_blank(tmp_path / "a.tif", (1000, 1000))
     (tmp_path / "a.tif.aux.xml").write_bytes((shared_data / "field_cases/height_default.tif.aux.xml").read_bytes())
     assert barpc.localize(tmp_path / "a.tif", [500, 500])[2] == 123.5
     barpc.convert(tmp_path / "a.tif", tmp_path / "b.vrt")

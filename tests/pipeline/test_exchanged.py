@@ -15,9 +15,9 @@ from barpc.pipeline import AdjustResult
 from barpc.pipeline.exchanged import exchanged_cameras
 from barpc.scene import View
 from tests.lanes import rest_slow
+from tests.pipeline.known import SAMPLES as VIEWS
 
 ORDERS = [order for order in permutations(range(3)) if order != (0, 1, 2)]
-VIEWS = sorted(Path(__file__).resolve().parents[2].glob("data_samples/view_0*.tif"))
 
 
 def with_cameras_of(views: Sequence[View], order: Sequence[int]) -> list[View]:

@@ -67,22 +67,6 @@ def test_noisy_matches_of_real_images_become_as_exact_as_our_own(shared_data, tm
         assert abs(np.median(across)) <= 0.05
 
 
-@pytest.mark.parametrize("read", [given_matches, given_tracks])
-@pytest.mark.parametrize(("far", "fails"), [(0.4, False), (0.5, False), (0.6, True), (1.5, True), (-1e4, True)])
-def test_points_beyond_their_image_are_said_at_once(tmp_path, read, far, fails) -> None:
-    """Those of the whole image where a crop is given; a pixel more is borne."""
-    views = load_views(IMAGES).views
-    (width, height), names = views[1].size, [view.name for view in views]
-    rows = [f"{names[0]},5,{t},{t}\n{names[1]},{width + far},{t},{t}\n" for t in range(9)]
-    (tmp_path / "m.csv").write_text("image,col,row,track\n" + "".join(rows))
-    if not fails:
-        assert read([tmp_path / "m.csv"], views)
-        return
-    said = f"m.csv: 9 of 18 points lie outside .* in view_01, {width} x {height} pixels"
-    with pytest.raises(InputError, match=said):
-        read([tmp_path / "m.csv"], views)
-
-
 def test_the_old_images_that_have_matches_with_new_ones_are_named(tmp_path) -> None:
     """Matches among old images, or among new ones, link nobody."""
     pairs = [("new_a", "old_b"), ("old_a", "old_c"), ("new_a", "new_b"), ("old_d", "new_b")]

@@ -22,7 +22,7 @@ from barpc.cli import cli
 from barpc.fit import FitOptions, RpcFit, fit_rpc
 from barpc.pipeline import adjust, check
 from barpc.pipeline import grid_outputs as grids
-from barpc.pipeline.grid_outputs import grid_names, write_grids
+from barpc.pipeline.grid_outputs import write_grids
 from barpc.rpcio import read_rpc
 from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.rpcio.grids import read_correction, write_correction
@@ -37,7 +37,7 @@ from tests.fit.cameras import synthetic
 from tests.jitter import scene
 from tests.rpcio.conftest import make_rpc, write_image
 
-from .test_growth import write_block
+from .test_growth import small_block
 
 SIZE, ALTS = (1500, 2200), (0.0, 600.0)
 ENDS = (GRID_SUFFIX, CORRECTION)
@@ -85,10 +85,6 @@ def test_grids_are_written_where_the_rpc_misses_the_camera_and_nowhere_else(tmp_
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".barpc", "a" + GRID_SUFFIX, "a" + CORRECTION}
     (written,) = run_of(tmp_path / "all", (other, easy, camera.sensor), grids=True)
     assert list(written) == ["b" + GRID_SUFFIX, "b" + CORRECTION]
-    near = replace(fit, max_ckp=np.array([0.0119, 0.0159]))  # 0.0199 together
-    assert run_of(tmp_path / "near", (view, near, camera)) == [{}]
-    far = replace(fit, max_ckp=np.array([0.0121, 0.0161]))
-    assert list(run_of(tmp_path / "far", (view, far, camera))[0]) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
 
 
 def test_a_pushbroom_camera_is_written_as_a_state_that_reads_as_it(tmp_path, view):
@@ -131,6 +127,10 @@ def test_no_altitude_changes_what_is_added_to_the_rpc_of_a_correction(once, came
 
 
 def test_a_file_that_does_not_hold_what_was_written_ends_the_run(tmp_path, view, camera, fit):
+    """Also one of a run that died, which is in the way, is written again first."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / ("a" + GRID_SUFFIX)).write_text("half")
+    (tmp_path / "a" / ("a" + CORRECTION)).write_text("half")
     errors = grids.make_grids(view, fit.rpc, camera, grids.GridFiles(grids=True), str(tmp_path))
     assert set(grids.verify_grids(view, camera, errors, str(tmp_path / "a"))) == {"a" + GRID_SUFFIX, "a" + CORRECTION}
     rpc, lacking = read_correction(path := tmp_path / "a" / f"a{CORRECTION}")
@@ -195,16 +195,12 @@ def test_what_steps_leave_is_told(tmp_path, view, camera, fit, caplog):
         assert 0.02 < 0.99 * float(told) <= written["a" + end]["barpc"] < 0.3
 
 
-def test_all_names_are_known_before_the_run(view):
-    assert grid_names(view) == ["a" + GRID_SUFFIX, "a" + CORRECTION]
-
-
 # --- its parts ---------------------------------------------------------------------------------------------
 
 
-def plane(left: float = 0.0, **more) -> SimpleNamespace:
+def plane(*left: float) -> SimpleNamespace:
     """As much of a fit as is looked at: its largest errors."""
-    return SimpleNamespace(max_ckp=np.array([left, 0.0]), rpc="rpc", **more)
+    return SimpleNamespace(max_ckp=np.array(left), rpc="rpc")
 
 
 @pytest.fixture
@@ -222,8 +218,8 @@ def tasks(monkeypatch) -> list:
 
 def test_grids_are_for_cameras_that_their_rpc_misses_by_a_fiftieth_of_a_pixel(tmp_path, view, tasks) -> None:
     """Also where it is not known by how much; the names of the others are kept apart."""
-    misses = {"a": 0.02, "b": 0.0201, "c": np.nan, "d": 0.0}
-    given = [(replace(view, name=name), plane(left), None) for name, left in misses.items()]
+    misses = {"a": (0.02, 0.0), "b": (0.0121, 0.0161), "c": (np.nan, 0.0), "d": (0.0119, 0.0159)}  # d: 0.0199 together
+    given = [(replace(view, name=name), plane(*left), None) for name, left in misses.items()]
     written = run_of(tmp_path / "out", *given)
     assert tasks == [("b", "rpc", True), ("c", "rpc", True)]
     assert written == [{}, {"b.x": {"barpc": 1.0}}, {"c.x": {"barpc": 1.0}}, {}]
@@ -235,7 +231,7 @@ def test_grids_are_for_cameras_that_their_rpc_misses_by_a_fiftieth_of_a_pixel(tm
 def test_a_stage_of_grids_is_only_where_there_are_some(tmp_path, view, tasks) -> None:
     for options, stages in (({}, []), ({"grids": True}, ["grids"])):
         with Workspace(tmp_path / "-".join(["run", *stages])) as run:
-            write_grids(run, [(view, plane(), None)], RunOptions(**options))
+            write_grids(run, [(view, plane(0.0, 0.0), None)], RunOptions(**options))
             assert [stage["stage"] for stage in run.stages] == stages
 
 
@@ -311,6 +307,7 @@ def test_the_larger_of_the_errors_written_and_read_is_told(
         ((0.4, 0.5), (0.2, 0.1), "plain", 2),  # the RMS counts, not the largest
         ((0.5, 0.4), (0.1, 0.2), "given", 2),
         ((0.5, None), (0.3, None), "given", 2),  # one that fails is passed over
+        ((None, None), (None, None), "", 2),  # the last reason is given
     ],
 )
 def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, largest, rms, chosen, tried) -> None:
@@ -331,12 +328,18 @@ def test_the_rpc_that_lacks_least_is_the_one_that_is_added_to(monkeypatch, large
     def between(rpc, model, size, alt):
         assert (model, size, alt) == ("model", (10, 20), 200.0)
         asked.append("given" if rpc is given else "plain")
+        if known[asked[-1]].rms is None:
+            raise FitError("nothing lies there")
         return asked[-1]
 
     monkeypatch.setattr(grids, "fit_only", fit)
     monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
     monkeypatch.setattr(grids, "Displaced", lambda rpc, lacking: SimpleNamespace(project=lacking))
     sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0), compare=known.get)
+    if not chosen:
+        with pytest.raises(FitError, match="no fit"):
+            grids.grid_correction(given, sample)  # type: ignore[arg-type]
+        return
     rpc, lacking, miss = grids.grid_correction(given, sample)  # type: ignore[arg-type]
     assert asked == list(names[:tried])
     assert lacking == chosen
@@ -369,20 +372,6 @@ def test_what_is_added_to_the_rpc_of_a_displaced_camera_is_of_no_altitude(inner)
     assert errors.rms < 0.5 * LINEAR
 
 
-def test_where_no_rpc_can_be_added_to_the_last_reason_is_given(monkeypatch) -> None:
-    def between(rpc, model, size, alt):
-        raise FitError("nothing lies there")
-
-    def fit(model, size, alts):
-        raise FitError("no fit of it")
-
-    monkeypatch.setattr(grids, "CorrectionGrid", SimpleNamespace(between=between))
-    monkeypatch.setattr(grids, "fit_only", fit)
-    sample = SimpleNamespace(model="model", size=(10, 20), alt_range=(100.0, 300.0))
-    with pytest.raises(FitError, match="no fit of it"):
-        grids.grid_correction(make_rpc(), sample)  # type: ignore[arg-type]
-
-
 def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     rpc = make_rpc()
     errors = Scattered.over(rpc, (2000, 1900), (30.0, 300.0), cells=5).compare(rpc.crop(-3.0, 4.0).project)
@@ -391,58 +380,13 @@ def test_a_camera_is_off_by_root_mean_square_and_by_most(view) -> None:
     assert errors.worst.shape[1] == 3
 
 
-def test_what_a_dead_run_left_in_the_room_is_written_again(tmp_path, view, monkeypatch) -> None:
-    """Which file holds what, how far each is off, and that none of an earlier try is in the way."""
-    of_grid, of_both, written = object(), object(), {}
-    compare = {"grid": of_grid}.get
-    alts = grids.widened(view.alt_range)
-
-    def grid(model, size, alt_range):
-        assert (model, size, alt_range) == (rpc, SIZE, alts)
-        return SimpleNamespace(project="grid")
-
-    def correction(given, sample):
-        assert (given, sample) == (rpc, over(rpc, SIZE, alts))
-        return "better", "lacking", of_both
-
-    def recorded(kind):
-        def write(*given, overwrite):
-            written[Path(given[-1]).relative_to(tmp_path).as_posix()] = (kind, *given[:-1], overwrite)
-
-        return write
-
-    def over(model, size, alt_range):
-        return SimpleNamespace(model=model, size=size, alt_range=alt_range, compare=compare)
-
-    rpc = make_rpc()
-    (tmp_path / "a").mkdir()
-    monkeypatch.setattr(grids, "DirectGrid", SimpleNamespace(of=grid))
-    monkeypatch.setattr(grids, "grid_correction", correction)
-    monkeypatch.setattr(grids, "Scattered", SimpleNamespace(over=over))
-    for kind in ("grid", "correction"):
-        monkeypatch.setattr(grids, f"write_{kind}", recorded(kind))
-    errors = grids.make_grids(view, rpc, rpc, grids.GridFiles(grids=True), str(tmp_path))
-    known = {
-        "a" + GRID_SUFFIX: (of_grid, ("grid", SimpleNamespace(project="grid"), True)),
-        "a" + CORRECTION: (of_both, ("correction", "lacking", "better", True)),
-    }
-    assert errors == {name: miss for name, (miss, _) in known.items()}
-    assert written == {f"a/{name}": row for name, (_, row) in known.items()}
-
-
-def test_what_ends_the_work_before_any_file_is_said_itself(tmp_path, view, fit) -> None:
-    """There is no room to clear then."""
-    with pytest.raises(AttributeError, match=r"localize|project"):
-        run_of(tmp_path / "out", (view, fit, object()), grids=True)
-
-
 # --- whole runs -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def block(tmp_path_factory):
     folder = tmp_path_factory.mktemp("block")
-    return write_block(folder, 3)[1], str(folder / "matches.npz")
+    return small_block(folder, 3)[1], str(folder / "ties.npz")
 
 
 @pytest.mark.nightly
@@ -490,19 +434,25 @@ def test_with_grids_a_camera_that_no_rpc_holds_is_no_failure(block, tmp_path):
     assert {view.status for view in result.record.views}.isdisjoint({"failed"})
 
 
+@pytest.fixture(scope="module")
+def gridded(block, tmp_path_factory) -> Path:
+    """The folder of a run with grids; nothing is written there."""
+    folder = tmp_path_factory.mktemp("gridded") / "a"
+    adjust(block[0], folder, RunOptions(matches=block[1], matches_only=True, grids=True))
+    return folder
+
+
 @pytest.mark.slow
-def test_verbs_understand_grids(block, tmp_path):
-    images, matches = block
-    adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
-    name = images[0].stem
-    grid, rpc = str(tmp_path / "a" / f"{name}{GRID_SUFFIX}"), str(tmp_path / "a" / f"{name}.vrt")
+def test_verbs_understand_grids(block, gridded, tmp_path):
+    name = block[0][0].stem
+    grid, rpc = str(gridded / f"{name}{GRID_SUFFIX}"), str(gridded / f"{name}.vrt")
 
     def said(*words):
         found = CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
         assert found.exception is None, found
         return found.return_value, found.stdout
 
-    code, text = said("info", "--json", grid, tmp_path / "a" / f"{name}{CORRECTION}")
+    code, text = said("info", "--json", grid, gridded / f"{name}{CORRECTION}")
     assert [one["size_px"] for one in json.loads(text)] == [[256, 256], [256, 256]]
     assert [one["rpc"].split(" in ")[0] for one in json.loads(text)] == ["grid", "correction"]
     assert said("convert", grid, tmp_path / "b_RPC.TXT")[0] == 0
@@ -516,15 +466,14 @@ def test_verbs_understand_grids(block, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_grid_is_the_camera_of_an_image_and_no_image(block, tmp_path):
+def test_a_grid_is_the_camera_of_an_image_and_no_image(block, gridded):
     images, matches = block
-    adjust(images, tmp_path / "a", RunOptions(matches=matches, matches_only=True, grids=True))
     for end in (GRID_SUFFIX, CORRECTION):
-        given = [f"{path},camera={tmp_path / 'a' / (path.stem + end)}" for path in images]
+        given = [f"{path},camera={gridded / (path.stem + end)}" for path in images]
         found = check(given, RunOptions(matches=matches, matches_only=True))
         assert found.record.views[0].rmse_before < 0.5
         with pytest.raises(ImageError, match="a grid and no image"):
-            check([str(tmp_path / "a" / (images[0].stem + end)), images[1]])
+            check([str(gridded / (images[0].stem + end)), images[1]])
 
 
 @pytest.mark.slow

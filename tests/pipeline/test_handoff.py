@@ -193,12 +193,6 @@ def test_gdal_s_way_with_a_correction_puts_its_nodes_where_barpc_does_and_keeps_
         assert one.max_error < 1e-5, one  # the file holds four-byte numbers
 
 
-def test_a_model_that_sees_nothing_is_an_error():
-    blind = make_rpc().crop(1e12, 1e12)
-    with pytest.raises(OutputError, match="no ground point"):
-        verify([], Sample.grid(blind, SIZE, ALTITUDES))
-
-
 def test_the_consumers_that_are_always_there_need_no_other_package():
     assert {name for name, consumer in CONSUMERS.items() if consumer.installed} >= {
         "gdal",

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -14,7 +16,6 @@ from barpc.base.errors import InputError
 from barpc.base.identity import Stamp, fingerprint
 from barpc.base.options import RunOptions, TieOptions
 from barpc.base.remote import Remote
-from barpc.pipeline import inputs as hashed
 from barpc.pipeline.inputs import hash_inputs
 from tests.rpcio.conftest import write_image
 
@@ -75,32 +76,31 @@ def test_a_file_that_is_another_than_was_read_ends_the_run(files) -> None:
         hash_inputs(run_of(path), RunOptions(), seen)
 
 
-def test_a_file_elsewhere_is_its_version(monkeypatch) -> None:
+def test_a_file_elsewhere_is_its_version() -> None:
     found = hash_inputs(run_of(AT), RunOptions(), {str(AT): Stamp(1, 1, 1, 1, 1, "x")})
     assert found == {str(AT): fingerprint(AT)}
     assert found[str(AT)].stamp is None
 
 
-def test_a_matcher_counts_with_its_files_under_its_name(files, monkeypatch) -> None:
-    code = [files["a.tif"], files["b.tif"], files["c.tif"]]
-    monkeypatch.setattr(hashed, "hook_files", lambda name: code if name == "mine:match" else [])
-    options = RunOptions(tie=TieOptions(matcher="mine:match"))
-    found = hash_inputs(run_of(), options, {})["mine:match"]
+def test_a_matcher_counts_with_its_files_under_its_name(tmp_path, monkeypatch) -> None:
+    code = [tmp_path / "hashed_matcher.py", tmp_path / "weights.bin"]
+    code[0].write_text("def match(a, b, prediction): ...\nmatch.files = ['weights.bin']\n")
+    code[1].write_bytes(b"12")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    name = "hashed_matcher:match"
+    found = hash_inputs(run_of(), RunOptions(tie=TieOptions(matcher=name)), {})[name]
     assert [(one.path, one.sha256) for one in found.every()] == [(str(p), digest(p)) for p in code]
     assert (found.size, found.stamp) == (code[0].stat().st_size, Stamp.of(code[0].stat()))
     assert hash_inputs(run_of(), RunOptions(), {}) == {}
 
 
-def test_the_work_goes_to_the_executor_under_its_stage_in_order(files, monkeypatch) -> None:
-    asked: list[Any] = []
-
-    def ordered(executor: Any, function: Any, tasks: Any, stage: str, progress: Any) -> list[Any]:
-        asked.append((executor, function, stage, progress))
-        return [function(*task) for task in tasks]
-
-    monkeypatch.setattr(hashed, "ordered", ordered)
-    pool, progress = object(), object()
-    found = hash_inputs(run_of(files["b.tif"], files["a.tif"]), RunOptions(), {}, pool, progress)  # type: ignore[arg-type]
-    assert asked == [(pool, hashed.hashed, "hash", progress)]
+def test_the_work_goes_to_the_executor_under_its_stage_in_order(files) -> None:
+    told: list[tuple[str, int, int]] = []
+    with ThreadPoolExecutor(2) as threads:
+        pool = Mock(wraps=threads)
+        run = run_of(files["b.tif"], files["a.tif"])
+        found = hash_inputs(run, RunOptions(), {}, pool, lambda *now: told.append(now))
+    assert pool.submit.call_count == 2
+    assert told == [("hash", 1, 2), ("hash", 2, 2)]
     assert [Path(name).name for name in found] == ["b.tif", "a.tif"]
     assert [one.sha256 for one in found.values()] == [digest(files["b.tif"]), digest(files["a.tif"])]

@@ -8,7 +8,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,16 +15,14 @@ import shapely
 from click.testing import CliRunner
 
 import barpc
-from barpc import pipeline
-from barpc.base.errors import BarpcWarning, InputError, ReservationError
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult
 from barpc.report import summarize
 from barpc.report.overview import RUN_COLUMNS
 from barpc.report.runfiles import OBSERVATION_COLUMNS
+from tests.pipeline.known import SAMPLES
 from tests.report.conftest import run_of_block, written
-
-SAMPLES = sorted((Path(__file__).parents[2] / "data_samples").glob("view_*.tif"))
 
 
 @pytest.fixture(scope="module")
@@ -123,19 +120,6 @@ def test_verify_is_false_where_something_changed(done, tmp_path):
     _edited("view_0000_RPC.TXT")(folder)
     assert not barpc.verify(folder)
     assert "view_0000_RPC.TXT changed" in repr(barpc.verify(folder))
-
-
-def test_check_makes_a_reservation_an_error_that_has_the_result(done, monkeypatch, tmp_path):
-    found = SimpleNamespace(
-        passed=False, record=replace(done[0].record, headline="One needs a look.", reasons=("Why.",))
-    )
-    monkeypatch.setattr(pipeline, "adjust", lambda *_, **__: found)
-    assert barpc.adjust(SAMPLES, tmp_path / "run") is found
-    with pytest.raises(ReservationError, match=r"^One needs a look\. Why\.$") as caught:
-        barpc.adjust(SAMPLES, tmp_path / "run", check=True)
-    assert caught.value.result is found
-    found.passed = True
-    assert barpc.adjust(SAMPLES, tmp_path / "run", check=True) is found
 
 
 def test_runs_are_listed_a_line_each_and_what_is_none_has_its_reason(done, tmp_path):

@@ -16,7 +16,7 @@ from rasterio import Affine
 from scipy.interpolate import NearestNDInterpolator
 
 from barpc.ba import AdjustOptions, BlockPrior
-from barpc.base.errors import BarpcError, FitError, InputError, OutputError
+from barpc.base.errors import FitError, InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.fit import FitOptions
 from barpc.pipeline import AdjustResult, RunOptions, adjust
@@ -104,30 +104,6 @@ def run(scene: Path, tmp_path: Path, shared: Run) -> Run:
     return Run(scene, tmp_path, shared)
 
 
-def _names(path: Path) -> set[str]:
-    return {p.suffix if p.name.startswith("view") else p.name for p in path.iterdir()}
-
-
-def images(run: Run, out: Path, scene: Path) -> None:
-    assert _names(run.folder) & {".vrt", ".tif"} == {".vrt"}
-    for chosen, suffix in (("copy", {".tif"}), ("none", set())):
-        run(chosen, images=chosen)
-        assert _names(out / chosen) & {".vrt", ".tif"} == suffix
-
-
-def grids(run: Run, out: Path, scene: Path) -> None:
-    run("always", grids=True)
-    needed, always = ({p.name[8:] for p in folder.glob("view_00_*.tif")} for folder in (run.folder, out / "always"))
-    assert (needed, always) == (set(), {"grid.tif", "correction.tif"})
-
-
-def rpc_formats(run: Run, out: Path, scene: Path) -> None:
-    run("a", rpc_formats=("rpb", "geom"))
-    assert _names(out / "a") & {".RPB", ".geom", ".TXT"} == {".RPB", ".geom"}
-    with pytest.raises(InputError, match="rpc_formats 'nitf'"):
-        RunOptions(rpc_formats=("nitf",))
-
-
 def stop_after(run: Run, out: Path, scene: Path) -> None:
     matched = Path(run.matched.run.out_dir)
     assert (matched / "matches.csv").exists()
@@ -153,55 +129,12 @@ def keep_going(run: Run, out: Path, scene: Path) -> None:
     assert list((out / "d").glob("*.vrt"))
 
 
-def overwrite(run: Run, out: Path, scene: Path) -> None:
-    run("a", stop_after="matching")
-    with pytest.raises(OutputError):
-        run("a")
-    run("a", overwrite=True, stop_after="matching")
-
-
-def matches(run: Run, out: Path, scene: Path) -> None:
-    """What is given of a pair is verified and registered, the other pairs are matched."""
-    rows = (scene / "first/matches.csv").read_text().splitlines()
-    (scene / "pair.csv").write_text("\n".join(row for row in rows if not row.startswith("view_02")) + "\n")
-    found = run("a", "pair.csv", matches_only=False, stop_after="matching")
-    given = [report for report in found.run.matched if report.names == ("view_00", "view_01")]
-    assert len(found.run.matched) == 3
-    assert given[0].verified <= given[0].keypoints[0] < 600
-    assert len(found.tracks.view[found.tracks.view == 2]) > 100
-
-
 def matches_only(run: Run, out: Path, scene: Path) -> None:
     rows = (scene / "first/matches.csv").read_text().splitlines()
     (scene / "fewer.csv").write_text("\n".join(rows[: len(rows) // 2]) + "\n")
     few, many = run("a", "fewer.csv", stop_after="adjustment"), run.plain
     assert 0 < len(few.tracks) < len(many.tracks)
     assert len(few.run.matched) == 0
-
-
-def overlap_list(run: Run, out: Path, scene: Path) -> None:
-    (out / "pairs.txt").write_text("view_00 view_01\nview_01 view_02\n")
-    listed = str(out / "pairs.txt")
-    some = run("a", None, overlap_list=listed, stop_after="matching")
-    assert (len(some.run.matched), len(run.matched.run.matched)) == (2, 3)
-
-
-def aoi(run: Run, out: Path, scene: Path) -> None:
-    every = run.matched
-    middle = every.run.views[0].sensor.localize(np.full(2, SIDE / 2.0), np.array(230.0))[:2]
-    w, s, e, n = *(middle - [0.01, 0.01]), *(middle + [0.0, 0.01])
-    ring = [[w, s], [e, s], [e, n], [w, n], [w, s]]
-    (out / "a.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
-    half = run("b", None, aoi=str(out / "a.geojson"), stop_after="matching")
-    assert 0.2 < len(half.tracks) / len(every.tracks) < 0.8
-
-
-def gcp(run: Run, out: Path, scene: Path) -> None:
-    free, held = run.plain, run("b", gcp=(str(scene / "gcps.geojson"),), stop_after="adjustment")
-    assert len(held.summary["gcps"]) == 4
-    assert free.summary["gcps"] == []
-    sigmas = [found.summary["scene"]["sigma_enu_m"] for found in (held, free)]
-    assert (np.array(sigmas[0]) < 0.5 * np.array(sigmas[1])).all()
 
 
 def altimetry(run: Run, out: Path, scene: Path) -> None:
@@ -237,27 +170,17 @@ def gcp_crs(run: Run, out: Path, scene: Path) -> None:
         run("d", gcp=(str(path),))
 
 
-def check_points(run: Run, out: Path, scene: Path) -> None:
-    known = (str(scene / "gcps.geojson"),)
-    free, checked = run.plain, run("b", check_points=known, stop_after="adjustment")
-    assert free.summary["check_points"] in (None, [], {})
-    assert checked.summary["check_points"]
-    np.testing.assert_array_equal(free.adjustment.params, checked.adjustment.params)
-
-
 def add_to(run: Run, out: Path, scene: Path) -> None:
     free, held = run.plain, run("b", add_to=str(scene / "earlier"), stop_after="adjustment")
     assert 0 < len(held.tracks) < len(free.tracks)
     before = BlockPrior.load(scene / "earlier/tables/block.npz")
     rows = [held.adjustment.names.index(name) for name in before.names]
     np.testing.assert_array_equal(held.adjustment.params[rows], before.params)
-    together = run("c", add_to=str(scene / "earlier"), update=True, stop_after="adjustment")
-    np.testing.assert_allclose(together.adjustment.params, free.adjustment.params, atol=0.2)
 
 
 def update(run: Run, out: Path, scene: Path) -> None:
-    with pytest.raises(InputError, match="update is given without add_to"):
-        run("c", update=True)
+    together = run("c", add_to=str(scene / "earlier"), update=True, stop_after="adjustment")
+    np.testing.assert_allclose(together.adjustment.params, run.plain.adjustment.params, atol=0.2)
 
 
 def _height(found: AdjustResult) -> float:
@@ -300,8 +223,6 @@ def geoid(run: Run, out: Path, scene: Path) -> None:
     none, own = run("b", geoid="none", **given), run("c", **given)
     assert _height(with_geoid) - _height(none) == pytest.approx(40.0, abs=4.0)
     assert _height(own) - _height(none) == pytest.approx(49.0, abs=4.0)  # EGM96's here, which the terrain names
-    with pytest.raises(InputError, match="geoid is given without dem or ground points"):
-        RunOptions(geoid="g.gtx")
 
 
 def heights(run: Run, out: Path, scene: Path) -> None:
@@ -330,15 +251,11 @@ def reference(run: Run, out: Path, scene: Path) -> None:  # what it does to a bl
     assert found.summary["reference"]["used"] is False
     assert any("does not show" in reason for reason in found.summary["reasons"])
     assert run.plain.summary.get("reference") is None
-    with pytest.raises(InputError, match="reference is given without dem"):
-        RunOptions(reference=("r.tif",))
 
 
 def reference_sigma(run: Run, out: Path, scene: Path) -> None:
     sigmas = [_referred(run, size).summary["reference"]["sigma_m"] for size in (None, 7.0)]
     assert sigmas == [pytest.approx(0.25 * 111.0, rel=0.3), 7.0]  # a quarter of its pixel
-    with pytest.raises(InputError, match="reference_sigma is given without reference"):
-        RunOptions(reference_sigma=1.0)
 
 
 def tie(run: Run, out: Path, scene: Path) -> None:
@@ -354,20 +271,6 @@ def adjust_(run: Run, out: Path, scene: Path) -> None:
 def fit(run: Run, out: Path, scene: Path) -> None:
     found = run("a", fit=FitOptions(grid=(5, 6, 4)))
     assert {fitted.num_cnp for fitted in found.run.fits} == {120}
-
-
-def allow_remote(run: Run, out: Path, scene: Path) -> None:  # what is read so: tests/remote
-    url = "https://127.0.0.1:9/dem.tif"  # nobody answers there
-    said = []
-    for name, hosts in (("a", ()), ("b", ("127.0.0.1:9",))):
-        with pytest.raises(BarpcError) as refused:
-            run(name, dem=url, allow_remote=hosts)
-        said.append(str(refused.value))
-    assert "--allow-remote" in said[0]
-    assert "--allow-remote" not in said[1]
-    assert url in said[1]
-    with pytest.raises(InputError, match="allow_remote 'a b' is no HOST"):
-        RunOptions(allow_remote=("a b",))
 
 
 def calibration(run: Run, out: Path, scene: Path) -> None:  # what it does: test_calibrate
@@ -394,40 +297,42 @@ def calibration(run: Run, out: Path, scene: Path) -> None:  # what it does: test
 
 
 ROWS = {
-    "images": images, "rpc_formats": rpc_formats, "stop_after": stop_after,
-    "grids": grids,
-    "keep_going": keep_going, "overwrite": overwrite, "matches": matches, "matches_only": matches_only,
-    "overlap_list": overlap_list, "aoi": aoi, "gcp": gcp, "gcp_crs": gcp_crs, "altimetry": altimetry,
-    "check_points": check_points,
-    "add_to": add_to, "update": update, "calibration": calibration, "dem": dem, "geoid": geoid, "heights": heights,
-    "reference": reference, "reference_sigma": reference_sigma,
-    "allow_remote": allow_remote, "tie": tie, "adjust": adjust_, "fit": fit,
+    row.__name__.rstrip("_"): row
+    for row in (
+        matches_only, stop_after, keep_going, add_to, update, gcp_crs, heights, dem, geoid, altimetry, calibration,
+        reference_sigma, reference, tie, adjust_, fit,
+    )
 }  # fmt: skip
 
 
-def test_every_option_has_a_row() -> None:
-    assert set(ROWS) == {field.name for field in fields(RunOptions)}
+ELSEWHERE = {
+    "images": "cli/test_adjust.py::test_images_can_be_copied_or_left_out_and_formats_chosen",
+    "rpc_formats": "cli/test_adjust.py::test_images_can_be_copied_or_left_out_and_formats_chosen",
+    "overwrite": "cli/test_adjust.py::test_an_existing_folder_needs_overwrite",
+    "grids": "pipeline/test_grids.py::test_a_run_with_everything_is_told_and_the_same_whatever_the_workers",
+    "matches": "pipeline/test_given.py::test_noisy_matches_of_real_images_become_as_exact_as_our_own",
+    "overlap_list": "pipeline/test_pairs_and_area.py::test_only_the_listed_pairs_are_matched_and_only_in_the_area",
+    "aoi": "pipeline/test_pairs_and_area.py::test_only_the_listed_pairs_are_matched_and_only_in_the_area",
+    "gcp": "pipeline/test_inputs.py::test_control_points_put_the_scene_in_its_place",
+    "check_points": "pipeline/test_inputs.py::test_check_points_are_measured_and_not_used",
+    "allow_remote": "remote/test_remote.py::test_without_leave_nothing_is_asked",
+}
+"""Options of which another test shows all that a row would."""
 
 
-ELSEWHERE = (
-    "overlap_list", "aoi", "gcp", "check_points", "geoid", "grids", "allow_remote", "dem",
-    "keep_going", "images", "matches", "reference", "tie",
-)  # fmt: skip
-"""Options whose fast tests stand in test_pairs_and_area, test_inputs, test_grids, tests/rasters/test_dem, tests/tie,
-tests/remote and tests/reliability, or beside them: matches_only, reference_sigma."""
+def test_every_option_has_a_row_or_a_test_elsewhere() -> None:
+    assert sorted([*ROWS, *ELSEWHERE]) == sorted(field.name for field in fields(RunOptions))
+    for place in ELSEWHERE.values():
+        file, _, test = place.partition("::")
+        assert f"def {test}(" in (Path(__file__).parents[1] / file).read_text(encoding="utf-8"), place
 
 
-SLOW = (
-    "calibration",
-    "gcp_crs",
-    "reference_sigma",
-    "stop_after",
-    "altimetry",
-    "fit",
-    "add_to",
-    "rpc_formats",
-    "overwrite",
-)
+LATER = "geoid", "dem", "keep_going", "reference", "tie"
+"""Options whose fast tests stand in tests/rasters/test_dem, tests/tie and tests/reliability, or beside them:
+matches_only, reference_sigma."""
+
+
+SLOW = "calibration", "gcp_crs", "reference_sigma", "stop_after", "altimetry", "fit", "add_to", "update"
 """Options that take a run or two of their own: the landing check tries them."""
 
 
@@ -435,7 +340,7 @@ SLOW = (
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.nightly] * (name in ELSEWHERE) + [pytest.mark.slow] * (name in SLOW))
+        pytest.param(name, marks=[pytest.mark.nightly] * (name in LATER) + [pytest.mark.slow] * (name in SLOW))
         for name in ROWS
     ],
 )
@@ -444,24 +349,6 @@ def test_an_option_does_what_it_says(name: str, run: Run, tmp_path: Path, scene:
     ROWS[name](run, tmp_path, scene)  # asserts what the option does
     after = {path.name: path.read_bytes() for path in scene.iterdir() if path.is_file()}
     assert {name: after.get(name) for name in before} == before  # and none of them touches an input
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"images": "jpeg"}, "images"),
-        ({"stop_after": "lunch"}, "stop_after"),
-        ({"matches": "a", "matches_only": True, "aoi": "b"}, "aoi is given with matches_only"),
-        (
-            {"matches": "a", "matches_only": True, "overlap_list": "b"},
-            "overlap_list is given with matches_only",
-        ),
-        ({"matches_only": True}, "matches_only is given without matches"),
-    ],
-)
-def test_options_that_contradict_each_other_are_refused(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        RunOptions(**given)
 
 
 @pytest.mark.slow

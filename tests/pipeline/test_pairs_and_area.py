@@ -13,7 +13,7 @@ from barpc.base.errors import DisconnectedError, InputError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.pipeline import RunOptions, adjust
 from barpc.pipeline.earlier import chosen_pairs
-from barpc.pipeline.inputs import input_files, read_pairs
+from barpc.pipeline.inputs import read_pairs
 from barpc.pipeline.loading import load_views
 from barpc.scene import View
 from barpc.sensor.triangulation import triangulate
@@ -50,17 +50,6 @@ def test_a_list_names_images_in_any_way(views, tmp_path, text) -> None:
     assert read_pairs(path, views, [tmp_path / "elsewhere/gone.tif"]) == [(0, 1), (1, 2)]
 
 
-def test_paths_tell_images_of_one_name_apart(views, tmp_path) -> None:
-    copies = []
-    for index, folder in enumerate(("a", "b")):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "img.tif").symlink_to(IMAGES[index])
-        copies.append(tmp_path / folder / "img.tif")
-    path = tmp_path / "pairs.txt"
-    path.write_text("b/img.tif a/img.tif\n")
-    assert read_pairs(path, load_views(copies).views) == [(1, 0)]
-
-
 def test_only_pairs_with_an_image_that_was_left_out_are_passed_over(views, tmp_path) -> None:
     """By path or by name; another name of no view is an error, also beside one that was left out."""
     path, gone = tmp_path / "pairs.txt", [tmp_path / "elsewhere/gone.tif"]
@@ -90,9 +79,11 @@ def test_a_view_goes_before_an_image_of_its_name_that_was_left_out(views, tmp_pa
     ("text", "message"),
     [
         ("view_00 view_07\n", "line 1: the list of pairs: no view is named 'view_07'"),
-        ("view_00 view_01\nview_02\n", "line 2: two image names are expected, found 1"),
+        ("view_00 view_01\nview_02\n", "line 2: two image names are expected, found 1; quote names with spaces"),
         ("view_00 view_01 view_02\n", "line 1: two image names are expected, found 3"),
         ("view_00 view_00.tif\n", "line 1: view_00 is paired with itself"),
+        ("\n# a\nview_01 view_01\n", "line 3: view_01 is paired with itself"),
+        ("view_00 view_01\nview_00 {0}\n", "line 2: view_00 is paired with itself"),
         ("view_00 'view_01\n", "line 1: No closing quotation"),
         ("# nothing\n", "lists no pair"),
         ("", "the file is empty"),
@@ -101,7 +92,7 @@ def test_a_view_goes_before_an_image_of_its_name_that_was_left_out(views, tmp_pa
 )
 def test_a_bad_list_is_refused_in_one_line(views, tmp_path, text, message) -> None:
     path = tmp_path / "pairs.txt"
-    path.write_text(text)
+    path.write_text(text.format(*IMAGES))
     with pytest.raises(InputError, match=message) as caught:
         read_pairs(path, views)
     assert str(path) in str(caught.value)
@@ -115,17 +106,6 @@ def test_a_list_that_cannot_be_read_is_refused(views, tmp_path, content) -> None
         path.write_bytes(content)
     with pytest.raises(InputError, match="a list of pairs"):
         read_pairs(path, views)
-
-
-def test_the_files_are_inputs_that_a_run_never_writes() -> None:
-    options = RunOptions(overlap_list="pairs.txt", aoi="area.json")
-    assert input_files(options) == [Path("pairs.txt"), Path("area.json")]
-
-
-@pytest.mark.parametrize("name", ["overlap_list", "aoi"])
-def test_what_tells_how_to_match_contradicts_given_matches(name) -> None:
-    with pytest.raises(InputError, match=f"{name} is given with matches"):
-        RunOptions(matches="m.csv", matches_only=True, **{name: "file"})
 
 
 def test_new_images_are_matched_with_their_best_partners_and_farther_where_none_is_old() -> None:

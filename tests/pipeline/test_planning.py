@@ -10,10 +10,8 @@ import pytest
 import barpc
 from barpc.base.errors import OutputError
 from barpc.rpcio import read_rpc, write_rpc
+from tests.pipeline.known import SAMPLES as VIEWS
 from tests.reliability.conftest import barpc as command
-
-VIEWS = sorted((Path(__file__).parents[2] / "data_samples").glob("view_*.tif"))
-
 
 GCPS = "a,view_00,510,494,5.4,43.3,120\nb,view_00,610,494,5.4006,43.2999,131\n"
 

@@ -18,6 +18,7 @@ from barpc.pipeline import proof
 from barpc.pipeline.grid_outputs import REOPENED
 from barpc.pipeline.proof import ADDED, CHANGED, LATER, MISSING, MOVED, NOT_ASKED, PASSED_STATES, SAME, Proved
 from barpc.rpcio import write_rpc
+from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from tests.rpcio.conftest import make_rpc
 
 POINTS = [[5.4, 43.2, alt] for alt in (60.0, 120.0, 250.0)]
@@ -324,13 +325,8 @@ def test_what_holds_no_certified_camera_is_not_opened(camera, tmp_path, name, st
     assert prove(tmp_path / "out") == []
 
 
-def test_a_grid_holds_the_camera_of_its_image_and_a_table_does_not() -> None:
-    from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
-
-    for end, holds in (
-        (GRID_SUFFIX, True),
-        (CORRECTION, True),
-        ("_table.csv", False),
-        ("_RPC.TXT", True),
-    ):
-        assert proof._holds_camera(Path(f"view{end}")) is holds, end
+@pytest.mark.parametrize(("end", "holds"), [(GRID_SUFFIX, 1), (CORRECTION, 1), ("_table.csv", 0), ("_RPC.TXT", 1)])
+def test_a_grid_holds_the_camera_of_its_image_and_a_table_does_not(camera, tmp_path, end, holds) -> None:
+    """What holds one is looked for."""
+    camera.outputs = {f"view{end}": {"barpc": 1e-9}}
+    assert [(one.kind, one.file) for one in prove(tmp_path / "out")] == [("camera", f"view{end}")] * holds

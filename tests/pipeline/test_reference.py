@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.base.errors import InputError, TiePointError
+from barpc.base.errors import TiePointError
 from barpc.base.options import RunOptions
 from barpc.cli import main
 from barpc.pipeline import adjust
@@ -16,7 +16,7 @@ from barpc.pointio.gcps import read_gcps
 from barpc.rpcio import read_rpc
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
-from tests.pipeline.known import errors_at_check_points, part, whole
+from tests.pipeline.known import errors_of_run, part, whole
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
 from tests.scenes.terrain import Grid
@@ -65,14 +65,9 @@ def held(shown, place, options):
     return adjust(shown.images, place / "held", options)
 
 
-def place_of(out, result, truth) -> np.ndarray:
-    """Mean error of the scene, east, north, up (3,) [m]."""
-    return errors_at_check_points([read_rpc(out / f"{v.name}.vrt") for v in result.run.views], truth)[1]
-
-
 @pytest.mark.slow
 def test_the_scene_stands_where_the_reference_says(held, place, truth):
-    error, sigma = place_of(place / "held", held, truth), np.array(held.summary["scene"]["sigma_enu_m"])
+    error, sigma = errors_of_run(place / "held", truth)[1], np.array(held.summary["scene"]["sigma_enu_m"])
     assert np.hypot(*error[:2]) < 1.0
     assert abs(error[2]) < DEM_BIAS + 2.0  # of the terrain's own noise, a metre
     assert (np.abs(error) <= 3 * sigma).all()
@@ -252,10 +247,3 @@ def test_heights_of_another_terrain_under_a_reference_are_the_reason(quickbird, 
 def test_one_image_that_a_reference_does_not_show_is_told_so_and_not_to_loosen_the_matching(quickbird):
     with pytest.raises(TiePointError, match=r"the reference does not show what the images show \(its highest peak"):
         quickbird(60.0)
-
-
-def test_without_a_terrain_it_is_refused():
-    with pytest.raises(InputError, match="reference is given without dem"):
-        RunOptions(reference=("ortho.tif",))
-    with pytest.raises(InputError, match="reference_sigma is given without reference"):
-        RunOptions(reference_sigma=1.0)

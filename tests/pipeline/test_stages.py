@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from rasterio import Affine
 
-from barpc.base.errors import BarpcWarning, FitError, InputError
+from barpc.base.errors import BarpcWarning, FitError, ImageError, InputError
 from barpc.base.options import AdjustOptions, RunOptions
 from barpc.base.tasks import HERE, Work
 from barpc.fit import FitOptions, fit_rpc
-from barpc.pipeline import adjusting, inputs
+from barpc.pipeline import adjusting
 from barpc.pipeline import run as stages
 from barpc.pipeline.control import load_altimetry
 from barpc.pipeline.earlier import of_new
@@ -35,9 +35,8 @@ from barpc.pipeline.inputs import (
 from barpc.pipeline.outputs import output_names
 from barpc.report import Run
 from barpc.scene import Tracks, View
-from barpc.simulate import simulate_block
 from barpc.tie.reference import Accuracy
-from tests.rasters.test_dem import write_dem
+from tests.rasters.test_dem import write_dem, write_geoid
 from tests.rpcio.conftest import make_rpc
 
 NONE = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
@@ -92,6 +91,20 @@ def test_a_terrain_covers_a_part_of_the_images_at_least(tmp_path) -> None:
     with pytest.raises(InputError, match=r"has no height at the images' position \(15\.\d+, 43\.\d+\)"):
         side_inputs(options, [there])
     assert side_inputs(RunOptions(), [there]) is None
+
+
+def test_a_terrain_counts_from_what_the_options_say_and_every_reference_is_looked_at(tmp_path) -> None:
+    """One that is none stops the run before any work."""
+    where = Affine(0.001, 0, 5.3, 0, -0.001, 43.3)
+    dem = str(write_dem(tmp_path / "d.tif", "EPSG:4326", np.full((200, 200), 200.0, np.float32), transform=where))
+    geoid = str(write_geoid(tmp_path / "g.gtx", 40.0))
+    for given, height in (({"geoid": geoid}, 240.0), ({"heights": "ellipsoidal"}, 200.0)):
+        found = side_inputs(RunOptions(dem=dem, **given), views(1))
+        assert found is not None
+        assert found(5.4, 43.2) == pytest.approx(height)
+    (tmp_path / "r.tif").write_bytes(b"no image")
+    with pytest.raises(ImageError, match=r"r\.tif"):
+        side_inputs(RunOptions(dem=dem, reference=(dem, str(tmp_path / "r.tif")), heights="ellipsoidal"), views(1))
 
 
 def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:
@@ -181,26 +194,6 @@ def test_of_files_with_nothing_for_a_part_of_the_images_that_is_said(tmp_path, c
         given_matches([tmp_path / "out.csv"], views(), partly=True)
 
 
-# --- lists of pairs ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "number", "says"),
-    [
-        ("v0 v1\nv0\n", 2, "two image names are expected, found 1; quote names with spaces"),
-        ("v0 v1 v2\n", 1, "two image names are expected, found 3"),
-        ("\n# a\nv1 v1\n", 3, "v1 is paired with itself"),
-        ("v0 v1\nv0 /x/v0.tif\n", 2, "v0 is paired with itself"),
-        ("v0 'v1\n", 1, "No closing quotation"), ("v0 v9\n", 1, "v9"),
-    ],
-)  # fmt: skip
-def test_a_line_that_is_no_pair_is_named(tmp_path, text, number, says) -> None:
-    path = tmp_path / "p.txt"
-    path.write_text(text)
-    with pytest.raises(InputError, match=rf"p\.txt, line {number}: .*{says}"):
-        read_pairs(path, views())
-
-
 def test_paths_of_a_list_start_where_it_lies_or_from_here(tmp_path, monkeypatch) -> None:
     """Images of one stem in several folders: only their paths tell them apart."""
     folders = [tmp_path / name for name in ("list", "here", "far")]
@@ -233,21 +226,6 @@ def test_of_each_track_with_something_new_all_observations_are_kept(seed) -> Non
         if (~old[given.view[rows]]).any() and len(rows) > 1:  # one alone is no tie
             wanted += rows.tolist()
     assert of_new(given, old).xy[:, 0].tolist() == wanted
-
-
-# --- what is read before any work -------------------------------------------------------------------------
-
-
-def test_references_are_looked_at(monkeypatch) -> None:
-    """One that is none stops the run here."""
-    read = []
-    monkeypatch.setattr(inputs, "Sheet", SimpleNamespace(read=read.append))
-    monkeypatch.setattr(
-        inputs, "Dem", SimpleNamespace(open=lambda *given: SimpleNamespace(given=given, covering=np.hypot))
-    )
-    with_all = RunOptions(dem="d.tif", geoid="g.gtx", heights="egm96", reference=("r.tif", "s.tif"))
-    assert side_inputs(with_all, views()).given == (("d.tif",), "g.gtx", "egm96")
-    assert read == ["r.tif", "s.tif"]
 
 
 # --- outputs ----------------------------------------------------------------------------------------------
@@ -358,62 +336,30 @@ def test_a_new_rpc_states_the_error_of_the_scene_and_the_noise_of_the_old_one(si
         stages._with_refits(run, RunOptions(fit=FitOptions(grid=(5, 5, 4), tolerance=1e-15)), HERE)
 
 
-def test_a_camera_that_does_not_say_where_it_stands_is_told(caplog) -> None:
-    view = simulate_block(2, 4, seed=1, num_checks=0).views[0]
-    assert adjusting._centers([view], "line")[0].method != "nominal"
-    assert "nominal" not in caplog.text
+def test_a_check_has_the_images_as_they_were_given_and_adjusts_nothing(corner) -> None:
+    given, told = [corner.images[k] for k in (2, 0, 1)], set()
+    result = stages.check([*given, "no.tif"], RunOptions(keep_going=True), progress=lambda *now: told.add(now[0]))
+    assert [Path(view.path) for view in result.views] == given
+    assert len(result.tracks) > 0
+    assert result.run.adjustment is None
+    assert [Path(one.path).name for one in result.record.left_out] == ["no.tif"]
+    assert not result.passed
+    assert {"cameras", "detect", "match"} <= told
 
 
-@pytest.mark.parametrize(
-    ("images", "stop_after", "asked"), [("vrt", "all", True), ("copy", "all", False), ("vrt", "adjustment", False)]
-)
-def test_only_a_vrt_that_will_be_written_asks_for_images_that_it_can_point_at(
-    images, stop_after, asked, tmp_path, monkeypatch
-) -> None:
-    seen: list[str] = []
-    monkeypatch.setattr(stages, "local_image", seen.append)
-    run, options = Run("adjust", views(2), (), NONE), RunOptions(images=images, stop_after=stop_after)
-    names, keep = stages._planned_files(run, options, tmp_path)
-    assert seen == (["/x/v0.tif", "/x/v1.tif"] if asked else [])
-    assert names == output_names(run.views, options, tmp_path)
-    assert {Path("/x/v0.tif"), Path("/x/v1.tif")} <= set(keep)
+def test_a_check_of_one_image_has_no_tie_points_to_cut(corner) -> None:
+    result = stages.check(corner.images[:1], RunOptions(gcp=(str(corner.gcps),)))
+    assert (len(result.views), len(result.tracks), result.run.agreeing) == (1, 0, None)
 
 
-def test_a_check_ties_what_was_loaded_and_adjusts_nothing(monkeypatch) -> None:
-    loaded, tied = Run("check", views()[:2], (), NONE), Run("check", views(), (), NONE)
-    given = ["/x/v2.tif", "/x/v0.tif", "/x/v1.tif"]
-    told = lambda *_: None  # noqa: E731
-
-    def load(kind, images, options, work):
-        assert (kind, images, options, work.progress) == ("check", given, RunOptions(keep_going=True), told)
-        return loaded
-
-    monkeypatch.setattr(stages, "_with_views", load)
-    monkeypatch.setattr(stages, "with_ties", lambda run, work: tied if run is loaded else None)
-    monkeypatch.setattr(stages, "summarize", lambda run: a_record(run, passed=run is tied))
-    result = stages.check(given, RunOptions(keep_going=True), progress=told)
-    assert [view.name for view in result.views] == ["v2", "v0", "v1"]
-    assert result.run is tied
-    assert result.passed
-    assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
-
-
-def a_record(run: Run, **more: Any) -> Any:
-    """A summary with what a result prints."""
-    tracks = SimpleNamespace(num_tracks=0, num_observations=0)
-    return SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None, **more)
-
-
-def test_a_check_has_no_folder_to_make_a_report_of() -> None:
-    run = Run("check", views(), (), NONE)
-    result = stages.AdjustResult((), run, a_record(run))
-    with pytest.raises(InputError, match="a check writes no files"):
-        result.report()
+def test_a_result_prints_its_folder_if_it_has_one_and_of_a_long_name_the_end() -> None:
+    run, tracks = Run("check", views(), (), NONE), SimpleNamespace(num_tracks=0, num_observations=0)
+    record: Any = SimpleNamespace(kind="check", status="good", views=run.views, tracks=tracks, out_dir=None)
+    result = stages.AdjustResult((), run, record)
     assert repr(result) == "AdjustResult(check: 3 views, 0 tie points, 0 observations, good)"
     for length, shown in ((50, "/" * 50), (51, "..." + "/" * 47)):
-        result.record.out_dir = "/" * length  # type: ignore[misc]
-        wrote = stages.AdjustResult((), run, result.record)
-        assert repr(wrote).endswith(f", in {shown})")
+        record.out_dir = "/" * length
+        assert repr(stages.AdjustResult((), run, record)).endswith(f", in {shown})")
 
 
 @pytest.mark.slow

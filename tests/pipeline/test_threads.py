@@ -11,8 +11,8 @@ import pytest
 
 from barpc.base.process import _switches, one_blas_thread
 from barpc.verbs.workers import THREADS
+from tests.pipeline.known import FOLDER, SAMPLES
 
-ROOT = Path(__file__).resolve().parents[2]
 RUN = "import numpy, sys, barpc; barpc.adjust(sys.argv[3:], sys.argv[1], gcp=sys.argv[2])"
 COMMAND = (
     "import sys; from barpc.cli import main; main(['adjust', *sys.argv[3:], '-o', sys.argv[1], '--gcp', sys.argv[2]])"
@@ -37,14 +37,15 @@ def test_blas_is_held_to_one_thread_and_given_back() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="the libraries of a process are told by /proc")
 @pytest.mark.parametrize("code", [RUN, COMMAND], ids=["Python", "command"])
 def test_the_threads_of_a_blas_change_no_byte(code: str, tmp_path: Path) -> None:
-    samples = ROOT / "data_samples"
-    words = [str(samples / "gcps.geojson"), *map(str, sorted(samples.glob("view_*.tif")))]
+    words = [str(FOLDER / "gcps.geojson"), *map(str, SAMPLES)]
     sums = []
     for count in ("1", "4"):
         where = {**os.environ, **dict.fromkeys(THREADS, count)}
         out = tmp_path / count / "out"
         command = [sys.executable, "-W", "ignore", "-c", code, str(out), *words]
-        done = subprocess.run(command, env=where, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
+        done = subprocess.run(
+            command, env=where, cwd=FOLDER.parent, capture_output=True, text=True, check=False, timeout=300
+        )
         assert done.returncode == 0, done.stderr
         sums.append((out / "SHA256SUMS").read_text())
     assert sums[0] == sums[1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,7 +14,7 @@ import pytest
 import rasterio
 from rasterio.windows import Window
 
-from barpc.base.errors import DisconnectedError, ImageError, InputError, RpcError
+from barpc.base.errors import DisconnectedError, ImageError, InputError, MissingRpcError, RpcError
 from barpc.pipeline import RunOptions, adjust, load_views
 from barpc.pipeline import loading as views
 from barpc.pipeline.loading import image_path
@@ -81,6 +80,21 @@ def test_a_bad_file_is_left_out_while_enough_are_left(pair, tmp_path) -> None:
     with pytest.raises(InputError, match="1 of 2 images can be used: at least 2 are needed"):
         load_views(given[1:], keep_going=True)
     assert len(load_views(given[1:], keep_going=True, min_views=1).views) == 1
+
+
+def test_an_image_without_an_rpc_is_told_how_to_get_one_or_be_left_out(pair, tmp_path) -> None:
+    plain = geotiffs.write_image(tmp_path / "plain.tif", pixels_of())
+    with pytest.raises(MissingRpcError) as told:
+        load_views([*pair, plain])
+    assert str(told.value).startswith(f"{plain}: no RPC in the image and none beside it")
+    assert "plain.tif,camera=FILE" in str(told.value)
+    assert "--keep-going" in str(told.value)
+    assert isinstance(told.value, ImageError)
+    found = load_views([*pair, plain], keep_going=True)
+    assert [view.name for view in found.views] == ["a", "b"]
+    ((path, reason),) = found.left_out
+    assert path == str(plain)
+    assert "--keep-going" not in reason  # it was given
 
 
 @pytest.mark.parametrize(("band", "passes"), [(0, False), (1, True), (2, True), (3, False)])
@@ -164,18 +178,31 @@ def test_one_camera_of_images_of_one_size_is_one_image(tmp_path) -> None:
     assert len(load_views([given[0], smaller]).views) == 2
 
 
-def test_the_same_pixels_under_another_rpc_are_one_image_in_any_layout(tmp_path) -> None:
-    first = placed(tmp_path, "a", pixels_of(), 1)
-    for number, how in enumerate(
-        [
-            {"compress": "deflate", "tiled": True, "blockxsize": 64, "blockysize": 32},
-            {"interleave": "pixel"},
-        ]
-    ):
-        twin = placed(tmp_path, f"b{number}", pixels_of(), 2 + number, **how)
-        refused([first, twin], r"b\d\.tif: shows the same pixels as .*a\.tif under another RPC")
-    real = placed(tmp_path, "c", pixels_of().astype(np.float32), 9)
-    refused([first, real], r"c\.tif: shows the same pixels as .*a\.tif under another RPC")
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        (np.uint16, {"compress": "deflate", "tiled": True, "blockxsize": 64, "blockysize": 32}),
+        (np.uint16, {"interleave": "pixel"}), (np.int32, {}), (np.float32, {}), (np.float64, {}), (np.complex64, {}),
+    ],
+)  # fmt: skip
+def test_the_same_pixels_under_another_rpc_are_one_image_in_any_layout_and_type(tmp_path, kind, how) -> None:
+    """Whatever its folder is."""
+    first, complex_ = pixels_of(), kind is np.complex64
+    one = placed(tmp_path, "a", first.astype(kind) if complex_ else first, 1)
+    (tmp_path / "far").mkdir()
+    twin = placed(tmp_path / "far", "z", first.astype(kind), 2, **how)
+    refused([one, twin], r"z\.tif: shows the same pixels as .*a\.tif under another RPC")
+    if complex_:  # both parts count
+        assert len(load_views([one, placed(tmp_path, "c", first * np.complex64(1 + 1j), 3)]).views) == 2
+
+
+def test_zeros_and_pixels_that_are_no_numbers_are_the_same_whatever_their_sign(tmp_path) -> None:
+    given = []
+    for number, sign in enumerate((1.0, -1.0)):
+        shown = pixels_of().astype(np.float32)
+        shown[:, :2] = np.copysign(np.float32([0.0, np.nan]), sign)
+        given.append(placed(tmp_path, "ab"[number], shown, number))
+    refused(given, "same pixels")
 
 
 def test_of_three_twins_the_first_is_kept(tmp_path) -> None:
@@ -252,33 +279,8 @@ def test_an_image_is_hashed_in_whole_blocks_and_each_row_counts(tmp_path, monkey
     assert asked == [(top, min(8, HIGH - top)) for top in range(0, HIGH, 8)]
 
 
-def test_numbers_are_the_same_in_any_type() -> None:
-    row = np.array([[1, 2, 65535]])
-    of = views._as_floats
-    for kind in (np.uint16, np.int32, np.float32, np.float64):
-        np.testing.assert_array_equal(of(row.astype(kind)), row.astype(np.float64))
-    assert of(np.array([-0.0])).tobytes() == np.array([0.0]).tobytes()
-    other = np.array([np.nan, -np.nan])
-    assert of(other)[0].tobytes() == of(other)[1].tobytes()
-    np.testing.assert_array_equal(of(np.array([1 + 2j, 3 - 1j], np.complex64)), [1.0, 2.0, 3.0, -1.0])
-
-
-def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair, tmp_path, monkeypatch, sized) -> None:
-    sizes: list[int] = []
-    real = views.read_group
-
-    def watched(given, *how):
-        sizes.append(len(given))
-        return real(given, *how)
-
-    monkeypatch.setattr(views, "read_group", watched)
-    sized(images_together=2)
-    third = placed(tmp_path, "c", pixels_of(5), 7)
-    told: list[tuple[str, int, int]] = []
-    load_views([*pair, third], progress=lambda *now: told.append(now))
-    assert sizes == [2, 1]
-    assert told == [("cameras", 2, 3), ("cameras", 3, 3)]
-
+@pytest.mark.parametrize(("group", "asked"), [(3, 0), (2, 2)])
+def test_images_are_read_by_other_workers_when_they_are_more_than_a_group(pair, tmp_path, sized, group, asked) -> None:
     class Counting(ThreadPoolExecutor):
         asked = 0
 
@@ -286,18 +288,11 @@ def test_images_are_read_in_groups_and_by_other_workers_when_they_are_many(pair,
             self.asked += 1
             return super().submit(function, *given)
 
-    for group, asked in ((3, 0), (2, 2)):
-        sized(images_together=group)
-        with Counting(1) as pool:
-            load_views([*pair, third], executor=pool)
-        assert pool.asked == asked
-
-
-def test_a_copy_in_another_folder_is_found_whatever_its_name(pair, tmp_path) -> None:
-    (tmp_path / "far").mkdir()
-    copy = shutil.copy(pair[0], tmp_path / "far" / "z.tif")
-    write_rpc(make_rpc().crop(3, 4), tmp_path / "far" / "z_RPC.TXT")
-    refused([pair[0], Path(copy)], r"z\.tif: shows the same pixels as .*a\.tif")
+    sized(images_together=group)
+    third = placed(tmp_path, "c", pixels_of(5), 7)
+    with Counting(1) as pool:
+        load_views([*pair, third], executor=pool)
+    assert pool.asked == asked
 
 
 @pytest.mark.slow

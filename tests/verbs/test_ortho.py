@@ -18,12 +18,12 @@ from barpc.rpcio import write_rpc_copy
 from tests.cli.test_images import run
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
+from tests.pipeline.known import SAMPLES
 from tests.rasters.test_dem import write_geoid
 from tests.scenes.files import write_scene
 from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.season import write_dem as write_ground
 
-SAMPLES = Path(__file__).parents[2] / "data_samples"
 SIDE = 400
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")  # of raw images
 UTM = pyproj.Transformer.from_crs(32631, 4979, always_xy=True)
@@ -44,14 +44,19 @@ def write_hills(path: Path, crs: str = "EPSG:4979", less: float = 0.0, start: fl
     return write_image(path, (hills(lon, lat) - less).astype(np.float32), crs=crs, transform=place, **how)
 
 
+RAMP = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
+CAMERA = barpc.read_rpc(SAMPLES[2]).crop(300, 300)
+
+
+def shot(path: Path, pixels: np.ndarray = RAMP, rpc: barpc.RPC = CAMERA, **profile: object) -> Path:
+    """An image that a camera sees; its pixels are their own columns and rows."""
+    write_rpc_copy(rpc, write_image(path.with_name("raw.tif"), pixels, **profile), path)
+    return path
+
+
 @pytest.fixture(scope="module")
 def ramp(tmp_path_factory) -> Path:
-    """An image whose pixels are their own columns and rows."""
-    folder = tmp_path_factory.mktemp("ramp")
-    pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
-    raw = write_image(folder / "raw.tif", pixels)
-    write_rpc_copy(barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300), raw, folder / "ramp.tif")
-    return folder / "ramp.tif"
+    return shot(tmp_path_factory.mktemp("ramp") / "ramp.tif")
 
 
 def errors(made: Path, ramp: Path, heights: object, least: float = 0.8) -> np.ndarray:
@@ -89,11 +94,8 @@ def test_every_pixel_is_where_the_camera_sees_it_on_the_dem(crs, start, ramp, tm
 @pytest.mark.parametrize("middle", rest_slow([180.0, 179.9995, -180.0, -179.9995]))
 def test_a_scene_across_the_antimeridian_is_whole(middle, start, tmp_path):
     """On DEMs that begin on either side of it; the camera's longitudes go on beyond 180 degrees."""
-    rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
-    east = middle - rpc.localize([SIDE / 2, SIDE / 2], 150.0)[0]
-    rpc = replace(rpc, ground_offset=rpc.ground_offset + [east, 0.0, 0.0])
-    pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE))).astype(np.float32)
-    write_rpc_copy(rpc, write_image(tmp_path / "raw.tif", pixels), image := tmp_path / "ramp.tif")
+    east = middle - CAMERA.localize([SIDE / 2, SIDE / 2], 150.0)[0]
+    image = shot(tmp_path / "ramp.tif", rpc=replace(CAMERA, ground_offset=CAMERA.ground_offset + [east, 0.0, 0.0]))
     dem = write_hills(tmp_path / "dem.tif", start=start)
     (made,) = barpc.ortho(image, tmp_path / "maps", dem=dem)
     off = errors(made.path, image, Dem.open(dem))
@@ -147,9 +149,7 @@ def test_where_the_dem_has_a_void_there_are_no_pixels_and_beyond_it_no_map(ramp,
 def test_numbers_keep_their_type_and_what_meant_nothing_still_does(tmp_path):
     pixels = np.full((1, SIDE, SIDE), 7, np.uint16)
     pixels[:, :, : SIDE // 2] = 65535
-    rpc = barpc.read_rpc(SAMPLES / "view_02.tif").crop(300, 300)
-    write_rpc_copy(rpc, write_image(tmp_path / "raw.tif", pixels, nodata=65535), tmp_path / "a.tif")
-    with rasterio.open(tmp_path / "a.tif") as image:
+    with rasterio.open(shot(tmp_path / "a.tif", pixels, nodata=65535)) as image:
         (made,) = barpc.ortho(image, tmp_path / "maps", alt=150, crs="EPSG:2154", gsd=1)
     assert (made.crs, made.gsd) == ("EPSG:2154", 1.0)
     with rasterio.open(made.path) as file:
@@ -173,10 +173,9 @@ def test_nothing_is_replaced_and_radar_s_complex_pixels_are_named(ramp, tmp_path
     assert (tmp_path / "maps/ramp.tif").read_bytes() == before
     assert run("ortho", ramp, "--alt", 150, "--overwrite", "-o", ramp.parent) == 1
     assert "is an input and is never written" in capsys.readouterr().err
-    write_image(tmp_path / "c.tif", np.ones((SIDE, SIDE), np.complex64))
-    write_rpc_copy(barpc.read_rpc(ramp), tmp_path / "c.tif", tmp_path / "complex.tif")
+    waves = shot(tmp_path / "complex.tif", np.ones((SIDE, SIDE), np.complex64))
     with pytest.raises(InputError, match=r"complex\.tif: complex pixels"):
-        barpc.ortho(tmp_path / "complex.tif", tmp_path / "other", alt=150)
+        barpc.ortho(waves, tmp_path / "other", alt=150)
     assert not list((tmp_path / "other").glob("*.tif"))
     with pytest.raises(InputError, match="gsd must be a number above 0"):
         barpc.ortho(ramp, tmp_path / "other", alt=150, gsd=0)
@@ -186,7 +185,7 @@ def test_nothing_is_replaced_and_radar_s_complex_pixels_are_named(ramp, tmp_path
     with pytest.raises(InputError, match="shows no ground at 9e"):
         barpc.ortho(ramp, tmp_path / "other", alt=9e9)
     with pytest.raises(OutputError):
-        barpc.ortho(ramp, tmp_path / "c.tif", alt=150)
+        barpc.ortho(ramp, waves, alt=150)
 
 
 def test_a_coarse_map_is_the_mean_of_the_image_s_pixels(ramp, tmp_path):
