@@ -14,19 +14,16 @@ from hypothesis import strategies as st
 
 from barpc.base.errors import DisconnectedError, InputError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
-from barpc.rasters.raster import open_raster
-from barpc.scene import Tracks, View
+from barpc.scene import Tracks
 from barpc.sensor.triangulation import triangulate
 from barpc.tie import Scope, TieOptions, find_tracks, read_area
-from barpc.tie.matchers import features
 from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Footprints, shared_tiles
 from barpc.tie.pixels import tiles
 from tests.constants import chosen
-from tests.geotiffs import write_image
 from tests.tie.stages import select_pairs
 
-from .conftest import Rendered
+from .conftest import Rendered, altered
 from .test_pairs import METRE, camera
 from .test_pairs import views as views_of
 
@@ -258,14 +255,6 @@ def corner(scene, share: float) -> dict[str, object]:
     return box(*sorted((west, east))[:1], min(south, north), max(west, east), max(south, north))
 
 
-def in_blocks(view: View, folder: Path) -> View:
-    """The same image in blocks of 64 px."""
-    with open_raster(view.path) as dataset:
-        pixels = dataset.read()
-    path = folder / Path(view.path).name
-    return replace(view, path=str(write_image(path, pixels, tiled=True, blockxsize=64, blockysize=64)))
-
-
 def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) -> None:
     """Tracks are those of a scene that lie in an area."""
     sensors = [view.sensor for view in scene.views]
@@ -277,35 +266,29 @@ def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) 
 
 
 @pytest.mark.slow  # before a commit: tests/pipeline/test_pairs_and_area.py
-def test_all_tie_points_lie_in_the_area(render, tmp_path) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_all_tie_points_lie_in_the_area(scene, tmp_path) -> None:
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.5)))
     all_inside(scene, find_tracks(scene.views, scope=Scope(area=area)).tracks, scene.tied.tracks, area)
 
 
 @pytest.mark.nightly
-def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path, monkeypatch) -> None:
+def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path) -> None:
     scene = render(views=2, size=(450, 450))
-    views = [in_blocks(view, tmp_path) for view in scene.views]  # strips are read whole
+    blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}  # strips are read whole
+    views = [altered(view, tmp_path, lambda d: d, **blocks) for view in scene.views]
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.4)))
-    read: list[tuple[str, tuple[int, ...]]] = []
-    original = features.detect_tile
-    monkeypatch.setattr(
-        features,
-        "detect_tile",
-        lambda path, size, box, *rest: read.append((path, box)) or original(path, size, box, *rest),
+    options, told = TieOptions(tile=150, search=30), []
+    result, everywhere = (
+        find_tracks(views, options, scope, progress=lambda *step: told.append(step))
+        for scope in (Scope(area=area), Scope())
     )
-    options = TieOptions(tile=150, search=30)
-    result = find_tracks(views, options, Scope(area=area))
-    limited = len(read)
-    everywhere = find_tracks(views, options)
-    assert limited < 0.7 * (len(read) - limited)
+    limited, every = (total for stage, done, total in told if stage == "detect" and done == total)
+    assert 0 < limited < 0.7 * every
     all_inside(scene, result.tracks, everywhere.tracks, area)
 
 
 @pytest.mark.slow
-def test_an_area_without_tie_points_is_said(render, tmp_path) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_an_area_without_tie_points_is_said(scene, tmp_path) -> None:
     area = read_area(written(tmp_path / "a.json", corner(scene, 0.004)))
     with pytest.raises(TiePointError, match=r"none of [0-9]+ tie points lies in the area of interest"):
         find_tracks(scene.views, scope=Scope(area=area))
