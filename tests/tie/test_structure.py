@@ -23,7 +23,6 @@ from barpc.tie.matchers.matching import (
     STRUCTURE,
     GroundAltitudes,
     _match_within,
-    better,
     match_pair,
 )
 from barpc.tie.matchers.structural import (
@@ -34,10 +33,10 @@ from barpc.tie.matchers.structural import (
 )
 from barpc.tie.pairing.epipolar import EpipolarSegments, epipolar_segments, robust_affine
 from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register_oriented, resolution
-from barpc.tie.pixels import read_pixels
 from tests.geotiffs import write_image
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
+from tests.tie.conftest import altered
 from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import camera, views
 
@@ -46,10 +45,8 @@ from tests.tie.test_pairs import camera, views
 def winter(render, tmp_path_factory) -> tuple[View, View]:
     """Two views of a scene, the second under half a metre of snow for 40 %, a quarter of its classes turned over."""
     first, second = render(views=2).views
-    pixels, _ = read_pixels(second.path, (0, 0, *second.size), 1)
-    path = tmp_path_factory.mktemp("winter") / "winter.tif"
-    write_image(path, disguised(pixels, 1, *SEASONS["winter"]))
-    return first, replace(second, path=str(path))
+    snow = tmp_path_factory.mktemp("winter")
+    return first, altered(second, snow, lambda d: disguised(d, 1, *SEASONS["winter"]))
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +60,7 @@ def test_what_keypoints_find_too_little_of_is_tied_by_structure(render, winter, 
     report = tied.pairs[0]
     assert report.matcher == STRUCTURE
     assert 0.0 <= report.control_share <= 0.05
-    first, second = common_tracks(tied.tracks, 0, 1)
-    errors = render(views=2).errors(0, 1, first, second)
+    errors = render(views=2).errors_of(tied.tracks)
     assert 200 < len(errors) < 800
     spread = 1.4826 * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
     assert 0.02 < spread.min() < 0.2
@@ -91,9 +87,8 @@ def test_another_place_is_refused(render, winter) -> None:
 def test_as_delivered_it_is_a_tenth_of_a_pixel_off(render) -> None:
     scene = render(views=2)
     found = find_tracks(scene.views, TieOptions(matcher=STRUCTURE))
-    errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
-    spread = 1.4826 * np.median(np.abs(errors), axis=0)
-    assert len(errors) > 500
+    spread = scene.typical(found.tracks)
+    assert len(scene.errors_of(found.tracks)) > 500
     assert 0.01 < spread.min() < 0.1  # across the epipolar lines
     assert 0.01 < spread.max() < 0.25  # along them: a patch sees more than its middle's altitude
     assert found.keypoints == (0, 0)
@@ -141,10 +136,9 @@ def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -
 
 
 @pytest.fixture(scope="module")
-def small(render) -> tuple[View, View]:
+def small(scene) -> tuple[View, ...]:
     """Used for 320 m of altitude about the scene's."""
-    first, second = (replace(view, alt_range=(80.0, 400.0)) for view in render(views=2, size=(300, 300)).views)
-    return first, second
+    return tuple(replace(view, alt_range=(80.0, 400.0)) for view in scene.views)
 
 
 @pytest.fixture(scope="module")
@@ -155,22 +149,16 @@ def matched(small) -> tuple[Matches, PairReport]:
 
 
 @pytest.mark.slow
-def test_terrain_or_other_ties_narrow_the_altitudes(render, small, matched) -> None:
+def test_terrain_or_other_ties_narrow_the_altitudes(scene, small, matched) -> None:
     pair, (found, report) = small, matched
     low, high = pair[0].alt_range
     middle = 0.5 * (low + high)
     flat = GroundAltitudes(lambda lon, lat: np.full(len(lon), middle)).within(pair, (low, low), 150.0)
     assert flat[0].alt_range == flat[1].alt_range == (max(low, middle - 150), min(high, middle + 150))
-    assert GroundAltitudes().within(pair, None, 150.0) == pair
-    assert GroundAltitudes().within(pair, (high + 1e4, high + 2e4), 150.0) == pair
     nowhere = GroundAltitudes(lambda lon, lat: np.full(len(lon), np.nan))
     assert nowhere.within(pair, (low, low), 150.0)[0].alt_range[1] == min(high, low + 150)
-    assert GroundAltitudes().within(pair, (middle, middle), 50.0)[0].alt_range == (
-        max(low, middle - 50),
-        min(high, middle + 50),
-    )
     known = GroundAltitudes(None, [(pair, found)]).altitudes()
-    seen = render(views=2, size=(300, 300)).altitude[0]
+    seen = scene.altitude[0]
     assert known is not None
     assert abs(known[0] - np.nanpercentile(seen, 2)) < 40  # cameras as delivered
     assert abs(known[1] - np.nanpercentile(seen, 98)) < 40
@@ -212,19 +200,6 @@ def test_fewer_altitudes_are_tried_where_all_find_few(small, monkeypatch) -> Non
         )[1]
         assert report.verified == most
         assert asked == [(0.0, 300.0), (100.0, 200.0)][:tries]
-
-
-def test_the_attempt_with_more_verified_matches_counts_and_a_refused_one_never(matched) -> None:
-    found, report = matched
-    few, refused = replace(report, verified=20), replace(report, verified=900, status="too few matches")
-    for attempts, best in (
-        ((few, report, refused), report),
-        ((refused, few), few),
-        ((few, replace(few, loosened=True)), few),
-    ):
-        won = better(*((found, attempt) for attempt in attempts))[1]
-        assert len(won.beaten) == len(attempts) - 1
-        assert replace(won, beaten=()) == best
 
 
 # --- pieces -------------------------------------------------------------------------------------------------
