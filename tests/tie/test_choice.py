@@ -197,7 +197,7 @@ class Looks:
 
     def __init__(self, monkeypatch, alike, neighbours: int = 3) -> None:
         self.alike, self.compared, self.tried = alike, [], []
-        self._options = TieOptions(neighbours=neighbours)
+        self.options = TieOptions(neighbours=neighbours)
         monkeypatch.setattr(tracks, "locate", lambda views, _, work, **rest: [KeypointFiles(work.store)] * len(views))
         monkeypatch.setattr(tracks, "match_pairs", self._match)
         monkeypatch.setattr(tracks, "quick_score", self._score)
@@ -217,8 +217,8 @@ class Looks:
 
     def run(self, row) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
         """The pairs that were tried, and those of them that tie."""
-        trials = tracks._Trials(row, self._options, Scope(), Work(store=Store("", "")))
-        trials.run(pairs_in_a_row(len(row), self._options.neighbours), False)
+        trials = tracks._Trials(row, self.options, Scope(), Work(store=Store("", "")))
+        trials.run(pairs_in_a_row(len(row), self.options.neighbours), False)
         every = sorted(trials.tried)
         assert sorted(pair for some in self.tried for pair in some) == every  # none twice
         return every, [pair for pair, (_, _, report) in sorted(trials.tried.items()) if report.status == "ok"]
@@ -271,7 +271,7 @@ def test_what_fails_is_replaced_though_no_date_tells(monkeypatch, said) -> None:
     first = [pair.views for pair in select_pairs(row, TieOptions(neighbours=3)) if looks.alike(*pair.views)]
     assert len(connected_groups(40, first)) > 5
     tried, tied = looks.run(row)
-    assert [sorted(pair) for pair in looks.tried[0]] == [list(p.views) for p in select_pairs(row, looks._options)]
+    assert [sorted(pair) for pair in looks.tried[0]] == [list(p.views) for p in select_pairs(row, looks.options)]
     assert connected_groups(40, tied) == [list(range(40))]
     assert len(tried) < 40 * 39 / 4
 
