@@ -8,6 +8,7 @@ import pytest
 
 from barpc.tie.pixels import jpeg, thumbnail
 from tests.geotiffs import write_image
+from tests.rasters.test_vrt import band, rects, source, vrt
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -25,13 +26,9 @@ def ramp(tmp_path):
 def test_a_thumbnail_is_the_image_as_it_lies_stretched_with_black_where_nothing_is_known(ramp, tmp_path, kind):
     path = ramp
     if kind == "mosaic":
-        path = tmp_path / "m.vrt"
-        path.write_text(
-            '<VRTDataset rasterXSize="1300" rasterYSize="900"><VRTRasterBand dataType="UInt16" band="1">'
-            '<NoDataValue>7</NoDataValue><SimpleSource><SourceFilename relativeToVRT="1">ramp.tif</SourceFilename>'
-            '<SourceBand>1</SourceBand><SrcRect xOff="0" yOff="0" xSize="1300" ySize="900"/>'
-            '<DstRect xOff="0" yOff="0" xSize="1300" ySize="900"/></SimpleSource></VRTRasterBand></VRTDataset>'
-        )
+        whole = rects((0, 0, 1300, 900), (0, 0, 1300, 900))
+        body = band("<NoDataValue>7</NoDataValue>", source("ramp.tif", whole))
+        path = vrt(tmp_path / "m.vrt", body, size=(1300, 900))
     grey = thumbnail(path, (1300, 900), 2000 if kind == "small" else 130, 1)
     assert grey.shape == ((900, 1300) if kind == "small" else (90, 130))
     shown = cv2.resize(grey, (130, 90), interpolation=cv2.INTER_AREA).astype(float)
