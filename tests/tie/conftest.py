@@ -40,6 +40,12 @@ def altered(view: View, folder: Path, change: Callable[[Any], np.ndarray], **pro
     return replace(view, path=str(path), size=pixels.shape[:-3:-1])
 
 
+def checks(shared_data: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
+    """Independent places in both images (N, 2) [px]: correlation, no camera (`shared/data/README.md`)."""
+    table = np.genfromtxt(shared_data / f"truth/ties/{pair}__ncc_check.csv", delimiter=",", names=True)
+    return tuple(np.column_stack([table[f"col_{end}"], table[f"row_{end}"]]) for end in "ab")  # type: ignore[return-value]
+
+
 @pytest.fixture(scope="session")
 def triplet(shared_data: Path) -> list[View]:
     folder = shared_data / "optical/phr_triplet_north"

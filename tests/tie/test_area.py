@@ -290,12 +290,6 @@ def all_inside(scene: Rendered, tracks: Tracks, everywhere: Tracks, area: Area) 
 
 
 @pytest.mark.slow  # before a commit: tests/pipeline/test_pairs_and_area.py
-def test_all_tie_points_lie_in_the_area(scene, tmp_path) -> None:
-    area = read_area(written(tmp_path / "a.json", corner(scene, 0.5)))
-    all_inside(scene, find_tracks(scene.views, scope=Scope(area=area)).tracks, scene.tied.tracks, area)
-
-
-@pytest.mark.nightly
 def test_all_tie_points_lie_in_the_area_and_other_tiles_are_not_even_read(render, tmp_path) -> None:
     scene = render(views=2, size=(450, 450))
     blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}  # strips are read whole

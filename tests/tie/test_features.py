@@ -13,13 +13,14 @@ from barpc.base.tasks import Work, store_of
 from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions
-from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate
+from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.pixels import survey, tiles
 from barpc.workspace import Workspace
 from tests.constants import Sized, chosen
 from tests.geotiffs import write_image
 from tests.tie.stages import detect
+from tests.tie.test_pairs import camera
 
 
 @pytest.fixture(scope="module")
@@ -110,17 +111,19 @@ def test_every_view_has_the_files_of_its_own_tiles(tmp_path, texture) -> None:
         assert [name for found in coarse for name in found.names if not name.endswith("-coarse")] == []
 
 
-def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, monkeypatch) -> None:
-    """Keypoints wanted of an image are those of its part that is read."""
-    parts: list[float] = []
-    within = KeypointDensity.within
-    monkeypatch.setattr(KeypointDensity, "within", lambda self, part: parts.append(part) or within(self, part))
-    one = view(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:200, :300])), (300, 200))
-    monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, boxes, *_: [boxes[0][:1]])
-    with store_of(None) as store:
-        locate([one], TieOptions(tile=128), Work(store=store))
-        locate([one], TieOptions(tile=128), Work(store=store), pairs=[])
-    assert parts == [1.0, pytest.approx(300 * 128 / (300 * 200))]
+def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, sized: Sized) -> None:
+    """Keypoints wanted of an image are those of its part that is read: of under a half, twice as many a pixel."""
+    sized(keypoints_per_image=40)
+    path = str(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:, :300])))
+    one, north = (
+        View(name, path, (300, 400), camera(0.0).crop(0.0, top), (0.0, 200.0)) for name, top in (("a", 0), ("b", -320))
+    )
+    options, first = TieOptions(tile=150, search=10.0), (0, 0, 300, 192)
+    for pairs, count in ((None, 18), ([Pair((0, 1), 0.2, 0.0)], 38)):
+        with store_of(None) as store:
+            found = locate([one, north], options, Work(store=store), pairs=pairs)[0]
+        assert (found.boxes[0], found.counts[0]) == (first, count)
+        assert len(found.boxes) == (1 if pairs else 3)
 
 
 @pytest.mark.slow

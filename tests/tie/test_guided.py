@@ -14,6 +14,7 @@ from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from barpc.tie.pixels import PIECE, tiles
 from tests.constants import Sized, chosen
+from tests.tie.stages import part_of
 
 ACROSS = 4.0
 LINEAR = np.array([[1.1, 0.2], [-0.1, 0.9]])
@@ -94,7 +95,7 @@ def test_the_matcher_finds_what_a_loop_over_all_pairs_finds(pair, ratio) -> None
 def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are_enough(pair) -> None:
     a, b, where = pair
     chosen = np.linspace(0, 499, 120).astype(int)
-    clear = brute(a.select(chosen), b, where_of(where, chosen))
+    clear = brute(a.select(chosen), b, part_of(where, chosen))
     for ratio, bound in ((0.95, 0.8), (0.6, 0.6)):
         expected = {(int(chosen[i]), j) for (i, j), (_, ambiguity) in clear.items() if ambiguity <= bound}
         found = guided(a, b, where, ratio, probes=120)
@@ -102,16 +103,11 @@ def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are
         assert len(expected) > 10
 
 
-def where_of(where: EpipolarSegments, rows: np.ndarray) -> EpipolarSegments:
-    names = ("along", "across", "slope", "before", "after")
-    return replace(where, **{name: getattr(where, name)[rows] for name in names})
-
-
 def test_without_points_there_are_no_matches(pair) -> None:
     a, b, where = pair
     nobody = np.empty(0, dtype=np.int64)
     assert not len(guided(a, b.select(nobody), where, 1.0))
-    assert not len(guided(a.select(nobody), b, where_of(where, nobody), 1.0))
+    assert not len(guided(a.select(nobody), b, part_of(where, nobody), 1.0))
 
 
 # --- keypoints ---------------------------------------------------------------------------------------------

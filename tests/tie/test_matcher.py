@@ -13,7 +13,6 @@ import pytest
 from barpc.base.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, find_tracks
 from barpc.tie.matchers.matcher import Prediction
-from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pixels import levelled, read_pixels
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
@@ -108,18 +107,6 @@ def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher, 
 def test_a_matcher_that_guesses_is_not_believed(scene, in_table) -> None:
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
         find_tracks(scene.views, TieOptions(matcher=in_table(Guessing)))
-
-
-def test_a_place_along_the_line_has_no_error_across_it(scene) -> None:
-    first, second = scene.views
-    xy = np.random.default_rng(0).uniform(0, 299, (50, 2))
-    where, along = epipolar_segments(first, second, xy), np.linspace(-30, 30, 50)
-    np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
-    np.testing.assert_allclose(
-        where.place(where.after),
-        second.sensor.project(first.sensor.localize(xy, np.full(50, first.alt_range[1]))),
-        atol=1e-6,
-    )
 
 
 class Blocks(Correlated):

@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 
+from barpc import open_camera
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.tasks import HERE
@@ -31,6 +32,7 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
+from barpc.verbs.moving import moved
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
@@ -379,3 +381,25 @@ def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
     assert keep.all()
     assert scatter == pytest.approx([1.4826 * 0.02 * 2.0] * 2)
     np.testing.assert_allclose(fitted, true, atol=1e-9)
+
+
+# --- a real orthoimage --------------------------------------------------------------------------------------
+
+
+@pytest.mark.nightly
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
+@pytest.mark.parametrize("off", [(0.0, 0.0), (150.0, 0.0), (400.0, -300.0), (-700.0, 500.0), (2500.0, -1500.0)])
+def test_cameras_far_off_are_found_on_a_real_orthoimage_which_does_not_show_other_places(shared_data, off):
+    folder = shared_data / "cross_sensor/ngi_2015"
+    camera = open_camera(folder / "ngi_05_0182.tif")
+    (there,) = moved([camera], (*off, 0.0), None)
+    view = View("a", str(folder / "ngi_05_0182.tif"), camera.extent, there.model, camera.alt_range)
+    terrain = Dem.open([str(folder / "dem.tif")], None, None)
+    found = register_views([view], [str(folder / "ortho_05_0182.tif")], terrain, 1)
+    if max(off) > 1000.0:
+        assert found.control is None
+        return
+    (match,) = found.views
+    assert match.peak > 10.0
+    assert match.points > 300
+    np.testing.assert_allclose(match.offset, off, atol=0.5)

@@ -21,7 +21,7 @@ from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import Rendered, view_of
+from .conftest import Rendered, checks, view_of
 from .test_pairs import METRE, camera
 
 RNG = np.random.default_rng(4)
@@ -235,12 +235,6 @@ def test_pairs_that_registered_ones_leave_apart_keep_their_matches_and_no_others
 
 
 # --- real images --------------------------------------------------------------------------------------------
-
-
-def checks(shared_data: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
-    """Independent places in both images (N, 2) [px]: correlation, no camera (`shared/data/README.md`)."""
-    table = np.genfromtxt(shared_data / f"truth/ties/{pair}__ncc_check.csv", delimiter=",", names=True)
-    return tuple(np.column_stack([table[f"col_{end}"], table[f"row_{end}"]]) for end in "ab")  # type: ignore[return-value]
 
 
 def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray, np.ndarray]) -> float:

@@ -36,7 +36,7 @@ from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register
 from tests.geotiffs import write_image
 from tests.scenes.redrawn import redrawn
 from tests.scenes.season import SEASONS, disguised
-from tests.tie.conftest import altered
+from tests.tie.conftest import altered, checks
 from tests.tie.stages import common_tracks, select_pairs
 from tests.tie.test_pairs import camera, views
 
@@ -337,10 +337,7 @@ def test_lines_that_coarser_pictures_lose_tie_a_pair_where_it_lies(shared_data, 
     found = find_tracks(views, TieOptions(matcher=STRUCTURE))
     assert found.pairs[0].matcher == FINE_STRUCTURE
     a, b = common_tracks(found.tracks, 0, 1)
-    table = np.genfromtxt(
-        shared_data / "truth/ties/phr_triplet_north__img_02__img_03__ncc_check.csv", delimiter=",", names=True
-    )
-    at, xy = (np.stack([table[f"col_{k}"], table[f"row_{k}"]], axis=1) for k in "ab")
+    at, xy = checks(shared_data, "phr_triplet_north__img_02__img_03")
     where = epipolar_segments(*views, at)
     true = robust_affine(at, where.errors(xy)[:, 1])
     off = epipolar_segments(*views, a, where.axis).errors(b)[:, 1] - true(a)
