@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from barpc.base.tasks import Work, store_of
-from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions
 from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate
 from barpc.tie.pairing.overlaps import Pair
-from barpc.tie.pixels import survey, tiles
-from barpc.workspace import Workspace
+from barpc.tie.pixels import survey
 from tests.constants import Sized, chosen
 from tests.geotiffs import write_image
 from tests.tie.stages import detect
@@ -124,21 +122,6 @@ def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, 
             found = locate([one, north], options, Work(store=store), pairs=pairs)[0]
         assert (found.boxes[0], found.counts[0]) == (first, count)
         assert len(found.boxes) == (1 if pairs else 3)
-
-
-@pytest.mark.slow
-def test_keypoints_are_kept_for_a_later_pass_with_another_camera_or_threshold(tmp_path, texture) -> None:
-    blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}
-    first = view(write_image(tmp_path / "a.tif", texture, **blocks))
-    options = TieOptions(tile=192)
-    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
-        for sensor, chosen in (
-            (None, options),
-            ("corrected", options),
-            (None, replace(options, ratio=0.7, search=9.0)),
-        ):
-            detect([replace(first, sensor=sensor)], chosen, executor=executor)
-            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options.tile))
 
 
 # --- how many, and how closely an image is looked at ---------------------------------------------------------

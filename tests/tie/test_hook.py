@@ -47,8 +47,6 @@ def everywhere(a, b):
     return RETURN
 def wrong_shape(a, b, prediction):
     return np.zeros((3, 4))
-def not_finite(a, b, prediction):
-    return np.full((3, 2, 2), np.nan)
 def broken(a, b, prediction):
     raise RuntimeError("no weights\\nhere")
 number = 3
@@ -92,7 +90,6 @@ def test_a_function_is_a_matcher_with_and_without_scores(scene, module, returns:
             TiePointError,
             r"view_00 - view_01: .*\(M, 2, 2\) are expected.*\(3, 4\)",
         ),
-        ("users_matcher:not_finite", TiePointError, "not finite"),
         ("users_matcher:broken", TiePointError, "RuntimeError: no weights here"),
     ],
 )

@@ -6,6 +6,7 @@ import functools
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -164,8 +165,10 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
 def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(
     pair, tmp_path, monkeypatch, sized: Sized
 ) -> None:
+    """Nor for another camera or other thresholds, as a later pass has them."""
     sized(keypoints_per_image=300)
     options, keys = TieOptions(tile=256), []
+    later, loose = [replace(view, sensor=view.sensor.crop(9.0, 9.0)) for view in pair], replace(options, ratio=0.7)
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
             files = locate(pair, options, Work(executor, store=executor.store))
@@ -174,6 +177,7 @@ def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_fold
             with monkeypatch.context() as patch:
                 patch.setattr(features, "Sift", None)
                 assert locate(pair, options, Work(executor, store=executor.store)) == files
+                assert locate(later, replace(loose, search=9.0), Work(executor, store=executor.store)) == files
             tiles_of = [box for of_view in files for box in of_view.boxes]
             assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles_of) == 8
             assert len(list(workspace.cache.rglob("*.npz"))) == count  # and nothing is kept twice
