@@ -169,9 +169,7 @@ def test_structure_is_asked_where_keypoints_find_few_and_not_where_there_are_non
     assert matchers == ["guided", "structure", "guided", "structure"]
 
 
-def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_structure_more(
-    second_look,
-) -> None:
+def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_structure_more(second_look) -> None:
     few = [report(40)]
     assert second_look(few, TieOptions(matcher="somewhere:match"), ground=GroundAltitudes(hills))[0] == []
     assert second_look(few, TieOptions(matcher="structure"))[0] == []

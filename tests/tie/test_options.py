@@ -15,10 +15,7 @@ from barpc.tie import TieOptions, find_tracks, link
 from barpc.tie.matchers.features import KeypointDensity, Keypoints, detect_tile
 from barpc.tie.matchers.matching import match_pair
 from barpc.tie.matchers.report import PairReport
-from barpc.tie.pairing.epipolar import (
-    common_range,
-    epipolar_segments,
-)
+from barpc.tie.pairing.epipolar import common_range, epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
 from barpc.tie.patches import dense
 from barpc.tie.patches.links import refine

@@ -75,9 +75,7 @@ def test_the_listed_pairs_and_no_others_are_chosen_however_many_partners_a_view_
     assert [p.views for p in pairs] == sorted(listed)
 
 
-def test_a_listed_pair_is_tried_where_the_cameras_may_be_wrong_and_named_where_it_cannot_overlap(
-    caplog,
-) -> None:
+def test_a_listed_pair_is_tried_where_the_cameras_may_be_wrong_and_named_where_it_cannot_overlap(caplog) -> None:
     four = views(*(camera(400 * METRE * k) for k in range(4)))
     listed = [(0, 1), (1, 2), (2, 3), (0, 2), (0, 3)]
     pairs = select_pairs(four, TieOptions(search=400), Scope(only=listed))

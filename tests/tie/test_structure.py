@@ -18,19 +18,8 @@ from barpc.tie import Matches, PairReport, TieOptions, find_tracks
 from barpc.tie.matchers import matching, structural
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
-from barpc.tie.matchers.matching import (
-    FINE_STRUCTURE,
-    STRUCTURE,
-    GroundAltitudes,
-    _match_within,
-    match_pair,
-)
-from barpc.tie.matchers.structural import (
-    _GridSearch,
-    adjacency,
-    lattice_points,
-    supported,
-)
+from barpc.tie.matchers.matching import FINE_STRUCTURE, STRUCTURE, GroundAltitudes, _match_within, match_pair
+from barpc.tie.matchers.structural import _GridSearch, adjacency, lattice_points, supported
 from barpc.tie.pairing.epipolar import EpipolarSegments, epipolar_segments, robust_affine
 from barpc.tie.patches.oriented import ImageFiles, PatchTile, Sampling, register_oriented, resolution
 from tests.geotiffs import write_image
@@ -123,10 +112,7 @@ def test_two_dates_of_a_satellite_lie_where_they_lie(shared_data, step: float) -
     """Fields ten days apart on one grid, a corner of one under clouds, another without data."""
     paths = sorted((shared_data / "optical/s2_two_dates").glob("*.tif"))
     grid = np.stack(np.meshgrid(np.arange(200.0, 920.0, step), np.arange(200.0, 1160.0, step)), -1).reshape(-1, 2)
-    files, linear = (
-        [(str(path), (1200, 1200)) for path in paths],
-        np.broadcast_to(np.eye(2), (len(grid), 2, 2)),
-    )
+    files, linear = [(str(path), (1200, 1200)) for path in paths], np.broadcast_to(np.eye(2), (len(grid), 2, 2))
     xy, ok, _ = register_oriented(files, 1, grid, grid + [-0.6, 1.9], linear)
     common = [robust_affine(grid[ok], (xy - grid)[ok, k]) for k in (0, 1)]
     apart = np.hypot(*((xy - grid)[:, k] - fit(grid) for k, fit in enumerate(common)))
@@ -169,10 +155,7 @@ def test_terrain_or_other_ties_narrow_the_altitudes(scene, small, matched) -> No
 @pytest.mark.parametrize("seen", [False, True])
 def test_only_terrain_that_both_may_see_counts(seen) -> None:
     first, second = views(camera(0.0), camera(0.0, lean=0.2))
-    middle, flat = (
-        0.5 * sum(first.alt_range),
-        first.sensor.localize(np.array([[180.0, 540.0]]), np.array([0.0])),
-    )
+    middle, flat = 0.5 * sum(first.alt_range), first.sensor.localize(np.array([[180.0, 540.0]]), np.array([0.0]))
     half = replace(second, sensor=second.sensor.crop(0.0 if seen else 600.0, 0.0), size=(150, 1000))
 
     def hilly(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
@@ -409,16 +392,8 @@ def plain_tile(reach: tuple[int, int] = (4, 3), half: int = 5) -> PatchTile:
     noise = np.random.default_rng(0).normal(size=(2, 40, 50)).astype(np.float32)
     at = np.array([[15, 12], [30, 25]])
     matrix = np.array([[0.0, -2.0], [2.0, 0.0]])
-    return PatchTile(
-        (noise, noise),
-        at,
-        at.copy(),
-        np.zeros((2, 2)),
-        np.array(reach),
-        half,
-        matrix,
-        np.array([100.0, 200.0]),
-    )
+    corner = np.array([100.0, 200.0])
+    return PatchTile((noise, noise), at, at.copy(), np.zeros((2, 2)), np.array(reach), half, matrix, corner)
 
 
 def test_the_best_place_of_a_template_is_its_own() -> None:
