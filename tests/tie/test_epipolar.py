@@ -93,16 +93,11 @@ def test_an_affine_function_of_values_of_any_size_is_the_same(scale: float) -> N
     assert found.spread / scale == pytest.approx(exact.spread, rel=2e-3)
 
 
-def test_the_mad_is_a_standard_deviation_about_zero() -> None:
-    assert robust_spread(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
-    assert robust_spread(np.empty(0)) == 0.0
+def test_the_mad_is_about_zero_or_about_a_centre_of_every_row() -> None:
     shifted = np.array([8.0, 10.0, 13.0])  # of residuals the shift counts, of a sample about its median it does not
     assert robust_spread(shifted) == pytest.approx(1.4826 * 10.0)
-    assert robust_spread(shifted, np.median(shifted)) == pytest.approx(1.4826 * 2.0)
-    assert robust_spread(np.stack([shifted, -shifted]), np.array([[10.0], [0.0]])) == pytest.approx(
-        [1.4826 * 2, 1.4826 * 10]
-    )
-    assert robust_spread(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
+    found = robust_spread(np.stack([shifted, -shifted]), np.array([[10.0], [0.0]]))
+    assert found == pytest.approx([1.4826 * 2, 1.4826 * 10])
 
 
 @pytest.mark.parametrize("size", [0.0, 0.5, 3.0, -12.0, 40.0])
