@@ -15,6 +15,7 @@ from barpc.tie.matchers.features import KeypointDensity, worth_a_first_look
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.report import PairReport, ample
 from barpc.tie.pairing.overlaps import Pair
+from tests.tie.conftest import altered
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
 
@@ -126,11 +127,12 @@ def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, witho
 
 
 @pytest.mark.slow
-def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(scene, looks, without, monkeypatch) -> None:
-    monkeypatch.setattr(tracks, "ample", lambda *_: False)
-    found = find_tracks(scene.views, FEW)
+def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(scene, looks, without, tmp_path) -> None:
+    """An image of which half says nothing."""
+    half = altered(scene.views[1], tmp_path, lambda d: np.where(np.arange(300) < 150, d, 900).astype(d.dtype))
+    found = find_tracks([scene.views[0], half], FEW)
     assert looks == [True, False]
-    expected = without(scene.views)
+    expected = without([scene.views[0], half])
     assert same(found, expected)
     assert found.pairs == expected.pairs
 
