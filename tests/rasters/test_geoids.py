@@ -9,12 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from barpc.base.errors import InputError
+from barpc.base.errors import BarpcWarning, InputError
 from barpc.base.options import RunOptions
 from barpc.pipeline.inputs import with_located
 from barpc.rasters import vertical as geoids
 from barpc.rasters.dem import Dem, HeightGrid
 from barpc.rasters.vertical import geoid_file
+from tests.rasters.test_dem import write_dem
 
 
 @pytest.fixture
@@ -80,6 +81,14 @@ def test_a_geoid_that_is_not_there_is_a_line_that_says_where_to_get_it(nowhere, 
     assert "\n" not in text
     for word in (", ".join(map(str, folders)), "projsync --file", "https://cdn.proj.org/us_nga_egm08_25.tif", "egm96"):
         assert word in text
+
+
+def test_heights_above_a_geoid_that_is_not_there_are_met_by_another_unless_a_person_asks_for_it(nowhere, tmp_path):
+    path = write_dem(tmp_path / "b.tif", "EPSG:4326+3855")
+    with pytest.warns(BarpcWarning, match="EGM2008 height, made ellipsoidal with egm96"):
+        Dem.open(path)
+    with pytest.raises(InputError, match="geoid egm2008: no "):
+        Dem.open(path, "egm2008")
 
 
 def test_a_file_of_that_name_and_any_other_path_are_taken_as_given(tmp_path, monkeypatch):

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.crs import CRS
 
 from barpc.base.errors import ImageError, InputError
 from barpc.rasters.dem import Dem, HeightGrid
+from tests.rasters.test_dem import write_dem
 
 HEAD = (
     "P5\n# Geoid file in PGM format for the GeographicLib::Geoid class\n# Offset {offset}\n# Scale {scale}\n"
@@ -54,13 +53,8 @@ def test_heights_are_those_of_the_nodes_and_bilinear_between(shape, tmp_path):
 
 
 def test_a_dem_is_made_ellipsoidal_with_it(tmp_path):
-    with rasterio.open(
-        tmp_path / "dem.tif", "w", driver="GTiff", width=30, height=20, count=1, dtype="float32",
-        crs=CRS.from_string("EPSG:4326+5773"), transform=rasterio.Affine(0.01, 0, 5, 0, -0.01, 44),
-    ) as out:  # fmt: skip
-        out.write(np.full((1, 20, 30), 200.0, np.float32))
-    numbers = np.full((19, 36), 52_000)
-    dem = Dem.open(tmp_path / "dem.tif", write(tmp_path / "egm.PGM", numbers))
+    level = write_dem(tmp_path / "dem.tif", "EPSG:4326+5773", np.full((20, 30), 200.0, np.float32))
+    dem = Dem.open(level, write(tmp_path / "egm.PGM", np.full((19, 36), 52_000)))
     assert dem(5.1, 43.9) == pytest.approx(200.0 - 108.0 + 156.0)
     assert "egm.PGM" in dem.description
 

@@ -14,31 +14,18 @@ from barpc.base import identity
 from barpc.base.errors import ImageError, InputError
 from barpc.rasters import raster
 from barpc.rasters.raster import hashed, map_crs, open_raster
+from tests.geotiffs import write_image
+from tests.rasters.test_vrt import band, source
+from tests.rasters.test_vrt import vrt as written
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    path = tmp_path / "image.tif"
-    data = np.arange(48, dtype=np.uint16).reshape(1, 6, 8)
-    with (
-        pytest.warns(rasterio.errors.NotGeoreferencedWarning),
-        rasterio.open(path, "w", driver="GTiff", width=8, height=6, count=1, dtype="uint16") as out,
-    ):
-        out.write(data)
-    return path
+    return write_image(tmp_path / "image.tif", np.arange(48, dtype=np.uint16).reshape(6, 8))
 
 
-def vrt(path: Path, body: str, attributes: str = "") -> Path:
-    path.write_text(f'<VRTDataset rasterXSize="8" rasterYSize="6"{attributes}>{body}</VRTDataset>')
-    return path
-
-
-def band(source: str, relative: int = 1) -> str:
-    return (
-        '<VRTRasterBand dataType="UInt16" band="1"><SimpleSource>'
-        f'<SourceFilename relativeToVRT="{relative}">{source}</SourceFilename><SourceBand>1</SourceBand>'
-        "</SimpleSource></VRTRasterBand>"
-    )
+def vrt(path: Path, file: object, relative: int = 1) -> Path:
+    return written(path, band(source(file, relative=relative)), size=(8, 6))
 
 
 def test_a_raster_without_georeference_opens_without_a_warning(image: Path) -> None:
@@ -48,21 +35,21 @@ def test_a_raster_without_georeference_opens_without_a_warning(image: Path) -> N
 
 
 def test_a_vrt_of_a_plain_local_raster_opens(image: Path, tmp_path: Path) -> None:
-    with open_raster(vrt(tmp_path / "a.vrt", band("image.tif"))) as dataset:
+    with open_raster(vrt(tmp_path / "a.vrt", "image.tif")) as dataset:
         assert dataset.read(1)[5, 7] == 47
-    with open_raster(vrt(tmp_path / "b.vrt", band(str(image), 0))) as dataset:
+    with open_raster(vrt(tmp_path / "b.vrt", image, 0)) as dataset:
         assert dataset.read(1)[0, 1] == 1
 
 
 def test_a_vrt_that_is_replaced_while_it_is_hashed_is_no_input(image: Path, tmp_path: Path, monkeypatch) -> None:
     """Its sources would be those of another one than was hashed."""
-    path = vrt(tmp_path / "a.vrt", band("image.tif"))
+    path = vrt(tmp_path / "a.vrt", "image.tif")
     (part,) = hashed(path).parts
     assert part == identity.fingerprint(image)
     read = raster.read_vrt
 
     def replaced(file: Path) -> object:
-        vrt(path, band(str(image), 0))
+        vrt(path, image, 0)
         return read(file)
 
     monkeypatch.setattr(raster, "read_vrt", replaced)
@@ -81,13 +68,14 @@ def test_an_image_whose_metadata_name_its_overviews_is_refused_in_a_vrt_too(
         out.update_tags(ns="overviews", overview_file=str(image))
     if name == "x.jp2":
         rasterio.shutil.copy(tmp_path / "x.tif", tmp_path / name, driver="JP2OpenJPEG", WRITE_METADATA="YES")
-    for path in (tmp_path / name, vrt(tmp_path / "x.vrt", band(name))):
+    for path in (tmp_path / name, vrt(tmp_path / "x.vrt", name)):
         with pytest.raises(ImageError, match="names another file as its overviews"), open_raster(path):
             pass
 
 
 def test_a_vrt_that_warps_is_refused(tmp_path: Path, image: Path) -> None:
-    path = vrt(tmp_path / "x.vrt", band("image.tif"), ' subClass="VRTWarpedDataset"')
+    path = vrt(tmp_path / "x.vrt", "image.tif")
+    path.write_text(path.read_text().replace("<VRTDataset", '<VRTDataset subClass="VRTWarpedDataset"'))
     with pytest.raises(ImageError, match="VRTDataset"), open_raster(path):
         pass
 

@@ -269,10 +269,7 @@ REFUSED = {
         band('<SimpleSource SourceFilename="http://127.0.0.1:9/x.tif"/>'),
         "SimpleSource SourceFilename=",
     ),
-    "a band that names a file": (
-        SIMPLE.replace(' band="1"', ' SourceFilename="x"'),
-        "VRTRasterBand SourceFilename=",
-    ),
+    "a band that names a file": (SIMPLE.replace(' band="1"', ' SourceFilename="x"'), "VRTRasterBand SourceFilename="),
     "a mask that names a file": (SIMPLE + '<MaskBand SourceFilename="x"/>', "MaskBand SourceFilename="),
     "metadata that name a file": ('<Metadata SourceFilename="x"/>' + SIMPLE, "Metadata SourceFilename="),
     "a tag in other case": (SIMPLE.replace("SourceFilename", "sourcefilename"), "sourcefilename"),
@@ -281,14 +278,8 @@ REFUSED = {
     "a derived band": (band("<PixelFunctionType>sum</PixelFunctionType>"), "PixelFunctionType"),
     "a class of its own": (SIMPLE.replace(" band=", ' subClass="VRTDerivedRasterBand" band='), "subClass"),
     "open options": (band(source("a.tif", '<OpenOptions><OOI key="x">y</OOI></OpenOptions>')), "OpenOptions"),
-    "two sources in one": (
-        band(source("a.tif", "<SourceFilename>b.tif</SourceFilename>")),
-        "two <SourceFilename>",
-    ),
-    "text between tags": (
-        SIMPLE.replace("<SourceBand>", "http://x<SourceBand>"),
-        "'http://x' in <SimpleSource>",
-    ),
+    "two sources in one": (band(source("a.tif", "<SourceFilename>b.tif</SourceFilename>")), "two <SourceFilename>"),
+    "text between tags": (SIMPLE.replace("<SourceBand>", "http://x<SourceBand>"), "'http://x' in <SimpleSource>"),
     "a service as SRS": ("<SRS>http://127.0.0.1:9/x</SRS>" + SIMPLE, "'http://127.0.0.1:9/x' in <SRS>"),
     "an SRS that is none": ("<SRS>GEOGCS[nonsense]</SRS>" + SIMPLE, "reference system"),
     "overviews elsewhere": (

@@ -23,12 +23,17 @@ def exact(block):
     return [Corrected(v.sensor, c) for v, c in zip(block.views, block.truth.corrections, strict=True)]
 
 
-def test_the_exact_cameras_see_the_held_out_points_where_they_are(block):
-    check = block.truth.check
+def errors(block, seen, ground):
+    """How far observations lie from where the exact cameras see their points (N, 2) [px]."""
+    found = np.empty((len(seen.view), 2))
     for i, sensor in enumerate(exact(block)):
-        rows = check.view == i
-        seen = sensor.project(block.truth.check_ground[check.point[rows]])
-        assert np.abs(seen - check.xy[rows]).max() < 1e-9
+        rows = seen.view == i
+        found[rows] = seen.xy[rows] - sensor.project(ground[seen.point[rows]])
+    return found
+
+
+def test_the_exact_cameras_see_the_held_out_points_where_they_are(block):
+    assert np.abs(errors(block, block.truth.check, block.truth.check_ground)).max() < 1e-9
     assert block.held_out_rms(exact(block)) < 1e-8
 
 
@@ -40,10 +45,7 @@ def test_the_delivered_cameras_are_wrong_by_what_their_attitude_says():
 
 def test_the_tracks_carry_the_noise_and_the_outliers_that_were_asked_for(block):
     tracks, truth = block.tracks, block.truth
-    error = np.empty((len(tracks), 2))
-    for i, sensor in enumerate(exact(block)):
-        rows = tracks.view == i
-        error[rows] = tracks.xy[rows] - sensor.project(truth.ground[tracks.point[rows]])
+    error = errors(block, tracks, truth.ground)
     assert truth.outlier.sum() == round(0.1 * len(tracks))
     assert error[~truth.outlier].std() == pytest.approx(0.2, rel=0.03)
     assert error[truth.outlier].std() == pytest.approx(30 / np.sqrt(3), rel=0.1)
@@ -80,10 +82,10 @@ def test_the_stated_camera_centre_is_the_one_that_the_delivered_rpc_shows(block)
 
 def test_drift_is_zero_in_the_middle_row_and_grows_towards_the_ends():
     block = simulate_block(3, 400, drift=20e-6, noise=0.0)
-    tracks = block.tracks
-    for i, sensor in enumerate(exact(block)):
+    tracks, every = block.tracks, errors(block, block.tracks, block.truth.ground)
+    for i in range(3):
         rows = tracks.view == i
-        error = tracks.xy[rows] - sensor.project(block.truth.ground[tracks.point[rows]])
+        error = every[rows]
         part = tracks.xy[rows, 1] / block.views[i].size[1] - 0.5
         slope = error.T @ part / (part @ part)
         assert np.abs(error - part[:, None] * slope).max() < 0.05 * np.abs(error).max()
@@ -187,13 +189,7 @@ def test_ground_control_is_exact_on_the_ground_and_noisy_in_the_images(block):
     assert gcps.names[0] == "gcp_000"
     assert (gcps.sigma == 0.1).all()
     assert (gcps.xy_sigma == 0.2).all()
-    error = np.concatenate(
-        [
-            gcps.xy[rows] - sensor.project(gcps.lonlatalt[gcps.point[rows]])
-            for i, sensor in enumerate(exact(block))
-            for rows in [gcps.view == i]
-        ]
-    )
+    error = errors(block, gcps, gcps.lonlatalt)
     assert 0.1 < error.std() < 0.3
     assert np.abs(error).max() < 1.0  # no outliers
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +14,13 @@ from scipy import ndimage
 
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
-from barpc.scene import View
+from barpc.scene import Tracks, View
 from barpc.sensor.rpc import RPC, altitude_range
 from barpc.tie import TieResult, find_tracks
+from barpc.tie.matchers.matching import MATCHERS
 from tests.geotiffs import write_image
 from tests.scenes import ImageOptions, Scene
+from tests.tie.stages import common_tracks
 
 SIDES = [300, pytest.param(600, marks=pytest.mark.nightly)]
 """Rows and columns of a rendered scene: a quarter of the ground, all of it at night."""
@@ -26,6 +30,20 @@ def view_of(path: Path, rpc: RPC) -> View:
     with open_raster(path) as dataset:
         size = (dataset.width, dataset.height)
     return View(path.stem, str(path), size, rpc, altitude_range(rpc))
+
+
+def altered(view: View, folder: Path, change: Callable[[Any], np.ndarray], **profile: object) -> View:
+    """The view with other pixels, which `change` makes of its own."""
+    with open_raster(view.path) as dataset:
+        pixels = change(dataset.read(1))
+    path = write_image(folder / f"{view.name}.tif", pixels, **profile)
+    return replace(view, path=str(path), size=pixels.shape[:-3:-1])
+
+
+def checks(shared_data: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
+    """Independent places in both images (N, 2) [px]: correlation, no camera (`shared/data/README.md`)."""
+    table = np.genfromtxt(shared_data / f"truth/ties/{pair}__ncc_check.csv", delimiter=",", names=True)
+    return tuple(np.column_stack([table[f"col_{end}"], table[f"row_{end}"]]) for end in "ab")  # type: ignore[return-value]
 
 
 @pytest.fixture(scope="session")
@@ -80,6 +98,14 @@ class Rendered:
         errors = self.place(first, second, xy_first) - xy_second
         return errors[np.isfinite(errors).all(axis=1)]
 
+    def errors_of(self, tracks: Tracks, first: int = 0, second: int = 1) -> np.ndarray:
+        """Such errors of the tie points of two views."""
+        return self.errors(first, second, *common_tracks(tracks, first, second))
+
+    def typical(self, tracks: Tracks, first: int = 0, second: int = 1) -> np.ndarray:
+        """Robust standard deviation (2,) of their true error [px]."""
+        return 1.4826 * np.median(np.abs(self.errors_of(tracks, first, second)), axis=0)
+
     def place(self, first: int, second: int, xy_first: np.ndarray) -> np.ndarray:
         """True place in the second view (M, 2) [px]; NaN where it is not known.
 
@@ -113,3 +139,20 @@ def render(tmp_path_factory) -> Callable[..., Rendered]:
 def scene(render) -> Rendered:
     """Two views of a little ground."""
     return render(views=2, size=(300, 300))
+
+
+@pytest.fixture(scope="session")
+def three(render) -> Rendered:
+    """Three of them."""
+    return render(views=3, size=(300, 300))
+
+
+@pytest.fixture
+def in_table(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], str]:
+    """`in_table(Matcher)`: the name of a matcher that stands beside barpc's own as long as a test runs."""
+
+    def put(matcher: Any) -> str:
+        monkeypatch.setitem(MATCHERS, "another", matcher)
+        return "another"
+
+    return put

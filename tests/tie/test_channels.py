@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from barpc.tie.patches.channels import (
-    INVALID_MARGIN,
-    channels,
-    correlation,
-)
+from barpc.tie.patches.channels import INVALID_MARGIN, channels, correlation
 from barpc.tie.patches.channels import picture as resampled
 from barpc.tie.patches.oriented import PatchTile
 from tests.geotiffs import write_image

@@ -98,20 +98,16 @@ def lacking(views: list[View], ties: TieResult) -> list[Gap | None]:
 
 
 @pytest.mark.parametrize(("sigma", "told"), [(300.0, True), (0.5, False)])
-def test_rows_of_another_texture_are_told_of_the_image_that_has_them(
-    render, tmp_path, sigma: float, told: bool
-) -> None:
+def test_rows_of_another_texture_are_told_of_the_image_that_has_them(three, tmp_path, sigma: float, told: bool) -> None:
     """Of three images; where it is water, of which the others show the land, nothing of its own lacks."""
-    views = list(render(views=3, size=(300, 300)).views)
-    views[1] = changed(views[1], tmp_path, slice(100, 200), sigma)
-    found = lacking(views, find_tracks(views))
-    assert found[0] is None
-    assert found[2] is None
-    assert (found[1] is not None) is told
-    if found[1] is not None:
-        assert found[1].axis == 1
-        assert 90 <= found[1].first <= 120
-        assert 180 <= found[1].last <= 210
+    views = [three.views[0], changed(three.views[1], tmp_path, slice(100, 200), sigma), three.views[2]]
+    without, found, other = lacking(views, find_tracks(views))
+    assert (without, other) == (None, None)
+    assert (found is not None) is told
+    if found is not None:
+        assert found.axis == 1
+        assert 90 <= found.first <= 120
+        assert 180 <= found.last <= 210
 
 
 def cloud(pixels: np.ndarray) -> np.ndarray:
@@ -197,16 +193,15 @@ def test_few_keypoints_are_counted_in_fewer_parts() -> None:
 
 
 @pytest.mark.nightly
-def test_clean_images_lack_nothing(render, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
-    scene = render(views=3, size=(300, 300))
-    for views, ties in ((scene.views, scene.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):
+def test_clean_images_lack_nothing(three, triplet, triplet_ties, ventoux, ventoux_ties) -> None:
+    for views, ties in ((three.views, three.tied), (triplet, triplet_ties), (ventoux, ventoux_ties)):
         assert lacking(views, ties) == [None] * len(views)
         assert all(detail.sum() > 200 for detail in ties.detail)
 
 
-def test_beside_an_area_of_interest_nothing_is_expected(render) -> None:
+def test_beside_an_area_of_interest_nothing_is_expected(scene) -> None:
     """Half of the images is of interest: the other half has as much to see and no tie point."""
-    views = render(views=2, size=(300, 300)).views
+    views = scene.views
     ring = footprint(views[0].sensor, views[0].size, views[0].altitude)[:, :2]
     low, high = ring.min(axis=0), ring.max(axis=0)
     half = Area(shapely.box(low[0], low[1], high[0], 0.5 * (low[1] + high[1])))

@@ -31,6 +31,9 @@ def test_a_frame_predicts_where_a_point_lies_at_any_altitude(scene: Rendered) ->
         np.testing.assert_allclose(errors[:, 0], expected, atol=0.02)
         np.testing.assert_allclose(errors[:, 1], 0, atol=0.05)
     np.testing.assert_array_equal(where.before, -where.after)
+    np.testing.assert_allclose(where.place(where.after), seen, atol=1e-6)
+    along = np.linspace(-30, 30, 50)
+    np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
     moved = where.moved(-2.0).errors(seen) - where.errors(seen)
     np.testing.assert_allclose(moved, [[0.0, 2.0]] * 50, atol=1e-9)
     turned = epipolar_segments(*scene.views, xy[:7], np.array([0.0, 1.0]))
@@ -90,16 +93,11 @@ def test_an_affine_function_of_values_of_any_size_is_the_same(scale: float) -> N
     assert found.spread / scale == pytest.approx(exact.spread, rel=2e-3)
 
 
-def test_the_mad_is_a_standard_deviation_about_zero() -> None:
-    assert robust_spread(np.array([-2.0, 1.0, 3.0])) == pytest.approx(1.4826 * 2.0)
-    assert robust_spread(np.empty(0)) == 0.0
+def test_the_mad_is_about_zero_or_about_a_centre_of_every_row() -> None:
     shifted = np.array([8.0, 10.0, 13.0])  # of residuals the shift counts, of a sample about its median it does not
     assert robust_spread(shifted) == pytest.approx(1.4826 * 10.0)
-    assert robust_spread(shifted, np.median(shifted)) == pytest.approx(1.4826 * 2.0)
-    assert robust_spread(np.stack([shifted, -shifted]), np.array([[10.0], [0.0]])) == pytest.approx(
-        [1.4826 * 2, 1.4826 * 10]
-    )
-    assert robust_spread(np.random.default_rng(0).normal(0, 5, 20000)) == pytest.approx(5.0, rel=0.03)
+    found = robust_spread(np.stack([shifted, -shifted]), np.array([[10.0], [0.0]]))
+    assert found == pytest.approx([1.4826 * 2, 1.4826 * 10])
 
 
 @pytest.mark.parametrize("size", [0.0, 0.5, 3.0, -12.0, 40.0])

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 
 from barpc.base.tasks import Work, store_of
-from barpc.pipeline.executor import CachingExecutor
 from barpc.scene import View
 from barpc.tie import TieOptions
-from barpc.tie.matchers import features
-from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate, quota
-from barpc.tie.pixels import survey, tiles
-from barpc.workspace import Workspace
+from barpc.tie.matchers.features import KeypointDensity, KeypointFiles, _an_octave_up, detect_tile, locate
+from barpc.tie.pairing.overlaps import Pair
+from barpc.tie.pixels import survey
 from tests.constants import Sized, chosen
 from tests.geotiffs import write_image
 from tests.tie.stages import detect
+from tests.tie.test_pairs import camera
 
 
 @pytest.fixture(scope="module")
@@ -32,37 +31,12 @@ def view(path, size=(500, 400)) -> View:
     return View("a", str(path), size, None, (0.0, 1.0))  # type: ignore[arg-type]
 
 
-def test_tiles_cover_the_image_once_and_are_cut_at_whole_cells() -> None:
-    options = TieOptions(tile=256)
-    count = np.zeros((700, 1000), int)
-    for col, row, width, height in tiles((1000, 700), options.tile):
-        count[row : row + height, col : col + width] += 1
-        assert col % 64 == 0
-        assert row % 64 == 0
-        assert max(width, height) <= 256
-    assert (count == 1).all()
-
-
-@pytest.mark.slow
-def test_an_image_read_in_tiles_has_the_keypoints_of_the_image_read_at_once(tmp_path, texture) -> None:
-    path = write_image(tmp_path / "a.tif", texture)
-    with chosen(TieOptions, keypoints_per_cell=1000) as options:
-        whole, tiled = (detect([view(path)], each)[0] for each in (options, replace(options, tile=192)))
-    small = whole.scale < 12  # larger neighbourhoods reach beyond the margin
-    seen = {tuple(p) for p in np.round(tiled.xy, 1)}
-    share = np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)])
-    assert len(whole) > 1000
-    assert share > 0.97
-
-
-def test_no_cell_holds_more_than_its_quota_and_the_strongest_stay(tmp_path, texture) -> None:
+def test_no_cell_holds_more_than_its_quota(tmp_path, texture) -> None:
     path = write_image(tmp_path / "a.tif", texture)
     with chosen(TieOptions, keypoints_per_cell=5) as options:
         found = detect([view(path)], options)[0]
     cells = np.floor((found.xy + 0.5) / 64).astype(int)
     assert np.unique(cells, axis=0, return_counts=True)[1].max() == 5
-    response = np.arange(10.0)
-    assert quota(np.zeros((10, 2)), response, 64, 3).tolist() == [7, 8, 9]
 
 
 def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture, sized: Sized) -> None:
@@ -72,16 +46,6 @@ def test_the_bound_on_an_image_thins_all_cells_alike(tmp_path, texture, sized: S
     assert 150 <= len(found) <= 300
     counts = np.unique(np.floor((found.xy + 0.5) / 64).astype(int), axis=0, return_counts=True)[1]
     assert counts.max() <= 8
-
-
-def test_keypoints_stay_away_from_nodata(tmp_path, texture) -> None:
-    holed = texture.copy()
-    holed[150:250, 200:300] = 9
-    path = write_image(tmp_path / "a.tif", holed, nodata=9)
-    xy = detect([view(path)])[0].xy
-    inside = (np.abs(xy - [249.5, 199.5]) < 52.5).all(axis=1)
-    assert len(xy) > 500
-    assert not inside.any()
 
 
 def test_keypoints_stay_as_far_from_every_border_as_they_reach_and_no_farther(tmp_path, texture) -> None:
@@ -145,32 +109,19 @@ def test_every_view_has_the_files_of_its_own_tiles(tmp_path, texture) -> None:
         assert [name for found in coarse for name in found.names if not name.endswith("-coarse")] == []
 
 
-def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, monkeypatch) -> None:
-    """Keypoints wanted of an image are those of its part that is read."""
-    parts: list[float] = []
-    within = KeypointDensity.within
-    monkeypatch.setattr(KeypointDensity, "within", lambda self, part: parts.append(part) or within(self, part))
-    one = view(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:200, :300])), (300, 200))
-    monkeypatch.setattr(features, "shared_tiles", lambda views, pairs, boxes, *_: [boxes[0][:1]])
-    with store_of(None) as store:
-        locate([one], TieOptions(tile=128), Work(store=store))
-        locate([one], TieOptions(tile=128), Work(store=store), pairs=[])
-    assert parts == [1.0, pytest.approx(300 * 128 / (300 * 200))]
-
-
-@pytest.mark.slow
-def test_keypoints_are_kept_for_a_later_pass_with_another_camera_or_threshold(tmp_path, texture) -> None:
-    blocks = {"tiled": True, "blockxsize": 64, "blockysize": 64}
-    first = view(write_image(tmp_path / "a.tif", texture, **blocks))
-    options = TieOptions(tile=192)
-    with Workspace(tmp_path / "run") as workspace, CachingExecutor(workspace, {}) as executor:
-        for sensor, chosen in (
-            (None, options),
-            ("corrected", options),
-            (None, replace(options, ratio=0.7, search=9.0)),
-        ):
-            detect([replace(first, sensor=sensor)], chosen, executor=executor)
-            assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles(first.size, options.tile))
+def test_cells_hold_more_where_less_of_an_image_is_looked_at(tmp_path, texture, sized: Sized) -> None:
+    """Keypoints wanted of an image are those of its part that is read: of under a half, twice as many a pixel."""
+    sized(keypoints_per_image=40)
+    path = str(write_image(tmp_path / "a.tif", np.ascontiguousarray(texture[:, :300])))
+    one, north = (
+        View(name, path, (300, 400), camera(0.0).crop(0.0, top), (0.0, 200.0)) for name, top in (("a", 0), ("b", -320))
+    )
+    options, first = TieOptions(tile=150, search=10.0), (0, 0, 300, 192)
+    for pairs, count in ((None, 18), ([Pair((0, 1), 0.2, 0.0)], 38)):
+        with store_of(None) as store:
+            found = locate([one, north], options, Work(store=store), pairs=pairs)[0]
+        assert (found.boxes[0], found.counts[0]) == (first, count)
+        assert len(found.boxes) == (1 if pairs else 3)
 
 
 # --- how many, and how closely an image is looked at ---------------------------------------------------------
@@ -275,5 +226,6 @@ def test_a_box_looked_at_in_parts_has_the_keypoints_that_the_whole_has_there(tmp
     assert len(wanted) > 300
     for found in (once, parts):
         assert ((found.xy >= first) & (found.xy < last)).all()
+        assert len(np.unique(np.column_stack([found.xy, found.angle]), axis=0)) == len(found)
         seen = {tuple(xy) for xy in np.round(found.xy[found.scale < 12], 1)}
         assert len(wanted & seen) > 0.97 * len(wanted | seen)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from barpc.tie import TieOptions, TieResult, find_tracks, linking, tracks
+from barpc.tie import TieOptions, TieResult, find_tracks, tracks
 from barpc.tie.matchers import features
 from barpc.tie.matchers.features import KeypointDensity, worth_a_first_look
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.report import PairReport, ample
 from barpc.tie.pairing.overlaps import Pair
-from tests.tie.stages import common_tracks
+from tests.tie.conftest import altered
 
 FEW = TieOptions(points_per_image=500)  # of which 300 px hold enough to look twice
 
@@ -122,30 +122,29 @@ def test_what_a_first_look_shows_enough_of_is_looked_at_once(scene, looks, witho
     found = find_tracks(scene.views, FEW)
     assert looks == [True]
     assert 100 <= found.tracks.num_points < without(scene.views).tracks.num_points
-    errors = scene.errors(0, 1, *common_tracks(found.tracks, 0, 1))
-    assert (1.4826 * np.median(np.abs(errors), axis=0)).max() <= 0.06
-    assert np.abs(np.median(errors, axis=0)).max() <= 0.01
+    assert scene.typical(found.tracks).max() <= 0.06
+    assert np.abs(np.median(scene.errors_of(found.tracks), axis=0)).max() <= 0.01
 
 
 @pytest.mark.slow
-def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(scene, looks, without, monkeypatch) -> None:
-    monkeypatch.setattr(tracks, "ample", lambda *_: False)
-    found = find_tracks(scene.views, FEW)
+def test_what_it_shows_too_little_of_is_matched_as_if_it_had_not_been(scene, looks, without, tmp_path) -> None:
+    """An image of which half says nothing."""
+    half = altered(scene.views[1], tmp_path, lambda d: np.where(np.arange(300) < 150, d, 900).astype(d.dtype))
+    found = find_tracks([scene.views[0], half], FEW)
     assert looks == [True, False]
-    expected = without(scene.views)
+    expected = without([scene.views[0], half])
     assert same(found, expected)
     assert found.pairs == expected.pairs
 
 
 @pytest.mark.slow
-def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeypatch) -> None:
+def test_points_of_two_looks_are_not_taken_for_each_other(three, looks, monkeypatch) -> None:
     """One pair of three is looked at closely: a number stands for one place of a view, and tracks are true."""
-    scene = render(views=3, size=(300, 300))
-    names = tuple(view.name for view in (scene.views[0], scene.views[2]))
+    names = tuple(view.name for view in (three.views[0], three.views[2]))
     monkeypatch.setattr(tracks, "ample", lambda report, _: report.names != names)
-    linked, link = [], linking.link
-    monkeypatch.setattr(linking, "link", lambda *given: linked.append(given) or link(*given))
-    found = find_tracks(scene.views, FEW)
+    linked, link = [], tracks.link
+    monkeypatch.setattr(tracks, "link", lambda *given: linked.append(given) or link(*given))
+    found = find_tracks(three.views, FEW)
     assert looks == [True, False]
     pairs, matches = max(linked, key=lambda given: sum(map(len, given[1])))
     assert len(pairs) == 3
@@ -155,7 +154,7 @@ def test_points_of_two_looks_are_not_taken_for_each_other(render, looks, monkeyp
             for number, xy in zip(of_pair.index[:, end].tolist(), of_pair.xy[:, end].tolist(), strict=True):
                 assert places.setdefault((view, number), tuple(xy)) == tuple(xy)
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        errors = scene.errors(i, j, *common_tracks(found.tracks, i, j))
+        errors = three.errors_of(found.tracks, i, j)
         assert len(errors) > 100
         off = np.abs(errors).max(axis=1)  # a point of another look lies pixels off; a roof's edge by up to 1.5 px
         assert np.median(off) <= 0.05

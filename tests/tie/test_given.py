@@ -12,16 +12,14 @@ from scipy.spatial import cKDTree
 
 import barpc.tie.pixels as reading
 from barpc.base.errors import DisconnectedError, TiePointError
-from barpc.rasters.raster import open_raster
 from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, find_tracks
-from barpc.tie.linking import pair_counts
 from barpc.tie.pairing.epipolar import epipolar_segments
-from tests.geotiffs import write_image
+from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import SIDES, Rendered
+from .conftest import SIDES, Rendered, altered
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -46,10 +44,6 @@ def true_matches(
     return made
 
 
-def typical(scene: Rendered, tracks: Tracks, i: int, j: int) -> float:
-    return 1.4826 * np.median(np.abs(scene.errors(i, j, *common_tracks(tracks, i, j))), axis=0).max()
-
-
 @pytest.mark.parametrize("side", SIDES)
 @pytest.mark.parametrize(
     ("views", "noise", "false"),
@@ -68,9 +62,13 @@ def test_half_a_pixel_becomes_a_tenth_and_false_matches_go(
         assert 0.75 * true <= report.verified <= 1.15 * true
         assert noise < report.spread < 2 * noise  # of both ends together
         assert pair_counts(result.tracks)[pair] >= 0.55 * true
-        assert typical(scene, result.tracks, *pair) <= 0.1
-        errors = np.abs(scene.errors(*pair, *common_tracks(result.tracks, *pair))).max(axis=1)
+        assert scene.typical(result.tracks, *pair).max() <= 0.1
+        errors = np.abs(scene.errors_of(result.tracks, *pair)).max(axis=1)
         assert (errors > 1.0).mean() <= 0.02
+
+
+def blank(pixels: np.ndarray) -> np.ndarray:
+    return np.full_like(pixels, 900)
 
 
 def shifted(scene: Rendered, by: tuple[float, float]) -> dict[tuple[int, int], Matches]:
@@ -81,8 +79,7 @@ def shifted(scene: Rendered, by: tuple[float, float]) -> dict[tuple[int, int], M
 
 @pytest.mark.landing(1)
 @pytest.mark.parametrize("count", rest_slow((13, 6, 500)))
-def test_false_matches_are_as_none_given_and_that_is_said(render, caplog, count: int) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_false_matches_are_as_none_given_and_that_is_said(scene, caplog, count: int) -> None:
     alone = find_tracks(scene.views)
     result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=count, false=1.0)))
     assert result.tracks.xy.tolist() == alone.tracks.xy.tolist()
@@ -91,34 +88,30 @@ def test_false_matches_are_as_none_given_and_that_is_said(render, caplog, count:
 
 @pytest.mark.landing(1)
 @pytest.mark.parametrize("by", rest_slow(((3.0, -4.0), (-30.0, 0.0), (0.0, 9.0))))
-def test_matches_that_agree_with_each_other_and_with_no_pixel_give_way_to_own_ones(render, caplog, by) -> None:
+def test_matches_that_agree_with_each_other_and_with_no_pixel_give_way_to_own_ones(scene, caplog, by) -> None:
     """As those of other crops, or of another pair, do: their epipolar lines are straight, and elsewhere."""
-    scene = render(views=2, size=(300, 300))
     result = find_tracks(scene.views, scope=Scope(given=shifted(scene, by)))
     assert re.search(
         r"of \d\d\d matches given \d\d? could be registered, of own ones \d{3,4}: these are used", caplog.text
     )
     assert result.pairs[0].matcher == "guided"
-    assert typical(scene, result.tracks, 0, 1) <= 0.1
-    errors = scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))
-    assert np.abs(np.median(errors, axis=0)).max() <= 0.05
+    assert scene.typical(result.tracks).max() <= 0.1
+    assert np.abs(np.median(scene.errors_of(result.tracks), axis=0)).max() <= 0.05
 
 
 @pytest.mark.parametrize(("count", "used"), [(25, False), (400, True)])
-def test_few_true_matches_have_own_ones_beside_them(render, caplog, count: int, used: bool) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_few_true_matches_have_own_ones_beside_them(scene, caplog, count: int, used: bool) -> None:
     result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), count=count)))
     assert (result.pairs[0].matcher == "given") is used
     assert ("own are used" in caplog.text) is not used
-    assert typical(scene, result.tracks, 0, 1) <= 0.1
+    assert scene.typical(result.tracks).max() <= 0.1
 
 
 @pytest.mark.parametrize(("noise", "used"), [(0.4, True), (7.0, False)])
-def test_where_nothing_else_ties_what_agrees_by_chance_is_refused(render, tmp_path, noise: float, used: bool) -> None:
+def test_where_nothing_else_ties_what_agrees_by_chance_is_refused(scene, tmp_path, noise: float, used: bool) -> None:
     """Images that show nothing: a matcher's places, or places that lie as densely beside a line as on it."""
-    scene, count = render(views=2, size=(300, 300)), 40
-    blank = write_image(tmp_path / "blank.tif", np.full((300, 300), 900, np.uint16))
-    views = [replace(view, path=str(blank)) for view in scene.views]
+    count = 40
+    views = [altered(view, tmp_path, blank) for view in scene.views]
     for seed in range(10):
         given = true_matches(scene, (0, 1), count=count)[0, 1]
         where = epipolar_segments(*views, given.xy[:, 0])
@@ -133,62 +126,57 @@ def test_where_nothing_else_ties_what_agrees_by_chance_is_refused(render, tmp_pa
 
 
 @pytest.mark.slow
-def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(render) -> None:
-    scene = render(views=3, size=(300, 300))
-    result = find_tracks(scene.views, scope=Scope(given=true_matches(scene, (0, 1), (0, 2))))
+def test_pairs_that_are_not_given_are_matched_and_points_in_common_are_one_track(three) -> None:
+    result = find_tracks(three.views, scope=Scope(given=true_matches(three, (0, 1), (0, 2))))
     assert [report.keypoints[0] == 500 for report in result.pairs] == [True, True, False]
     assert result.pairs[2].verified > 500
     lengths = np.bincount(result.tracks.point)
     assert (lengths == 3).sum() > 150  # of the points that the given pairs share
     for pair in PAIRS:
-        assert typical(scene, result.tracks, *pair) <= 0.1
+        assert three.typical(result.tracks, *pair).max() <= 0.1
 
 
 @pytest.mark.slow
-def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(render) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_a_camera_that_is_wrong_by_hundreds_of_pixels_does_not_refuse_them(scene) -> None:
     first, second = scene.views
     moved = replace(second, sensor=second.sensor.crop(-300.0, -200.0))
     result = find_tracks([first, moved], scope=Scope(given=true_matches(scene, (0, 1))))
     assert result.pairs[0].verified > 400
     assert np.hypot(*result.pairs[0].offset) > 150
-    assert typical(scene, result.tracks, 0, 1) <= 0.1
+    assert scene.typical(result.tracks).max() <= 0.1
 
 
 @pytest.mark.slow
-def test_a_negative_is_registered_on_channels(render, tmp_path, caplog) -> None:
+def test_a_negative_is_registered_on_channels(three, tmp_path, caplog) -> None:
     """No patch has the grey values of its other; edges are where they were."""
-    scene = render(views=3, size=(300, 300))
-    first, second, third = scene.views
-    with open_raster(second.path) as image:
-        path = write_image(tmp_path / "negative.tif", 4000 - image.read(1).clip(0, 3999))
-    views = [first, replace(second, path=str(path)), third]
+    first, second, third = three.views
+    views = [first, altered(second, tmp_path, lambda d: 4000 - d.clip(0, 3999)), third]
     with caplog.at_level(logging.WARNING):
-        tracks = find_tracks(views, scope=Scope(given=true_matches(scene, *PAIRS, noise=0.4, false=0.2))).tracks
+        tracks = find_tracks(views, scope=Scope(given=true_matches(three, *PAIRS, noise=0.4, false=0.2))).tracks
     assert "used as found" not in caplog.text
     for pair in PAIRS:
         assert pair_counts(tracks)[pair] >= 150
-        across = np.abs(scene.errors(*pair, *common_tracks(tracks, *pair))).min(axis=1)
+        across = np.abs(three.errors_of(tracks, *pair)).min(axis=1)
         assert 0.002 < np.median(across) < (0.05 if pair == (0, 2) else 0.1)
-    assert typical(scene, tracks, 0, 2) <= 0.1  # of one date: by grey values
+    assert three.typical(tracks, 0, 2).max() <= 0.1  # of one date: by grey values
 
 
 @pytest.mark.nightly
-def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, caplog) -> None:
+def test_what_cannot_be_registered_is_used_as_it_is_and_once(scene, tmp_path, caplog) -> None:
     """Of the second image three sixteenths are left, the rest says nothing: places stay true, and each counts once."""
-    scene = render(views=2, size=(300, 300))
     first, second = scene.views
-    with open_raster(second.path) as image:
-        pixels = image.read(1)
-    noise = np.random.default_rng(3).integers(100, 3000, pixels.shape).astype(pixels.dtype)
-    noise[:, :56] = pixels[:, :56]
-    path = write_image(tmp_path / "noise.tif", noise)
+
+    def left(pixels: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng(3).integers(100, 3000, pixels.shape).astype(pixels.dtype)
+        return np.where(np.arange(300) < 56, pixels, noise)
+
+    views = [first, altered(second, tmp_path, left)]
     given = true_matches(scene, (0, 1), noise=0.3, false=0.2)
     with caplog.at_level(logging.WARNING):
-        result = find_tracks([first, replace(second, path=str(path))], TieOptions(min_matches=100), Scope(given=given))
+        result = find_tracks(views, TieOptions(min_matches=100), Scope(given=given))
     assert "used as found, good to 0." in caplog.text
     assert 0.7 * 400 <= result.tracks.num_points <= 450
-    errors = np.abs(scene.errors(0, 1, *common_tracks(result.tracks, 0, 1))).max(axis=1)
+    errors = np.abs(scene.errors_of(result.tracks)).max(axis=1)
     assert 0.2 < np.median(errors) < 0.6
     assert (errors > 3.0).mean() <= 0.02
     exact = result.tracks.sigma < 0.25
@@ -199,32 +187,25 @@ def test_what_cannot_be_registered_is_used_as_it_is_and_once(render, tmp_path, c
 
 
 @pytest.mark.slow
-def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_registered_by(render, tmp_path) -> None:
+def test_a_view_that_cannot_be_registered_joins_the_points_that_the_others_are_registered_by(three, tmp_path) -> None:
     """Each point is one track: that of the two views that register, and the third where it was matched."""
-    scene = render(views=3, size=(300, 300))
-    blank = np.full((300, 300), 900, np.uint16)
-    third = replace(scene.views[2], path=str(write_image(tmp_path / "blank.tif", blank)))
-    given = true_matches(scene, *PAIRS, noise=0.3)
-    result = find_tracks([*scene.views[:2], third], TieOptions(min_matches=100), Scope(given=given))
+    third = altered(three.views[2], tmp_path, blank)
+    given = true_matches(three, *PAIRS, noise=0.3)
+    result = find_tracks([*three.views[:2], third], TieOptions(min_matches=100), Scope(given=given))
     tracks = result.tracks
     assert [report.unregistered > 100 for report in result.pairs] == [False, True, True]
     assert "by keypoints" in result.pairs[1].means
     assert (np.bincount(tracks.point) == 3).sum() > 100
     places = tracks.xy[tracks.view == 0]
     assert (cKDTree(places).query(places, k=2)[0][:, 1] < 1.0).mean() < 0.03  # two points of one pixel
-    errors = np.abs(scene.errors(0, 2, *common_tracks(tracks, 0, 2)))
+    errors = np.abs(three.errors_of(tracks, 0, 2))
     assert 0.1 < np.median(errors) < 0.5
     assert (errors > 3.0).mean() <= 0.02
 
 
-def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, tmp_path, monkeypatch) -> None:
+def test_no_more_is_read_for_matches_of_others_than_patches_about_them(scene, tmp_path, monkeypatch) -> None:
     """Of nine million pixels an image the corner that the points stand in, once."""
-    scene = render(views=2, size=(300, 300))
-    large = []
-    for view in scene.views:
-        with open_raster(view.path) as image:
-            path = write_image(tmp_path / f"{view.name}.tif", np.tile(image.read(1), (10, 10)), tiled=True)
-        large.append(replace(view, path=str(path), size=(3000, 3000)))
+    large = [altered(view, tmp_path, lambda d: np.tile(d, (10, 10)), tiled=True) for view in scene.views]
     read, pixels = reading._RasterBand.read, []
 
     def watched(band, box, *more):
@@ -237,8 +218,7 @@ def test_no_more_is_read_for_matches_of_others_than_patches_about_them(render, t
     assert 2 * 290**2 < sum(pixels) <= 2 * 356**2  # 300 and a margin of 28 px
 
 
-def test_given_pairs_connect_what_the_cameras_say_is_apart(render) -> None:
-    scene = render(views=2, size=(300, 300))
+def test_given_pairs_connect_what_the_cameras_say_is_apart(scene) -> None:
     options = TieOptions(angles=(50.0, 60.0))
     with pytest.raises(DisconnectedError, match="no overlap"):
         find_tracks(scene.views, options)

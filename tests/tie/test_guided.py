@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers.features import KeypointDensity, Keypoints, Sift, detect_tile, join_keypoints, quota, ranked
+from barpc.tie.matchers.features import Keypoints, Sift, join_keypoints, quota, ranked
 from barpc.tie.matchers.guided import Guided, _Described, _pairs_in_band
 from barpc.tie.matchers.matcher import Matches, Prediction
 from barpc.tie.pairing.epipolar import EpipolarSegments
-from barpc.tie.pixels import PIECE, Stretch, grow, read_pixels, sample_stretch, survey, tiles
+from barpc.tie.pixels import PIECE, tiles
 from tests.constants import Sized, chosen
-from tests.geotiffs import write_image
+from tests.tie.stages import part_of
 
 ACROSS = 4.0
 LINEAR = np.array([[1.1, 0.2], [-0.1, 0.9]])
@@ -95,7 +95,7 @@ def test_the_matcher_finds_what_a_loop_over_all_pairs_finds(pair, ratio) -> None
 def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are_enough(pair) -> None:
     a, b, where = pair
     chosen = np.linspace(0, 499, 120).astype(int)
-    clear = brute(a.select(chosen), b, where_of(where, chosen))
+    clear = brute(a.select(chosen), b, part_of(where, chosen))
     for ratio, bound in ((0.95, 0.8), (0.6, 0.6)):
         expected = {(int(chosen[i]), j) for (i, j), (_, ambiguity) in clear.items() if ambiguity <= bound}
         found = guided(a, b, where, ratio, probes=120)
@@ -103,16 +103,11 @@ def test_where_the_cameras_error_is_looked_for_some_points_and_clear_matches_are
         assert len(expected) > 10
 
 
-def where_of(where: EpipolarSegments, rows: np.ndarray) -> EpipolarSegments:
-    names = ("along", "across", "slope", "before", "after")
-    return replace(where, **{name: getattr(where, name)[rows] for name in names})
-
-
 def test_without_points_there_are_no_matches(pair) -> None:
     a, b, where = pair
     nobody = np.empty(0, dtype=np.int64)
     assert not len(guided(a, b.select(nobody), where, 1.0))
-    assert not len(guided(a.select(nobody), b, where_of(where, nobody), 1.0))
+    assert not len(guided(a.select(nobody), b, part_of(where, nobody), 1.0))
 
 
 # --- keypoints ---------------------------------------------------------------------------------------------
@@ -141,6 +136,7 @@ def test_cells_take_their_strongest_in_turns() -> None:
     [
         ((1000, 500), 512, 64, ([0, 512], [0])), ((1000, 500), 300, 50, ([0, 250, 500, 750], [0, 250])),
         ((1025, 128), 1024, 64, ([0, 576], [0])), ((100, 100), 128, 64, ([0], [0])),
+        ((1000, 700), 256, 64, ([0, 256, 512, 768], [0, 256, 512])),
     ],
 )  # fmt: skip
 def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None:
@@ -153,7 +149,7 @@ def test_tiles_are_equal_and_cut_at_whole_cells(size, tile, cell, edges) -> None
         assert (w, h) == (right - c, below - r)
 
 
-def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path) -> None:
+def test_descriptors_are_square_roots_of_shares_and_angles_are_radians() -> None:
     picture = np.full((200, 200), 40, np.uint8)
     picture[90:112, 95:107] = 220
     everything = Sift().detect(picture, lambda xy, scale, response: np.arange(len(xy)))
@@ -165,77 +161,6 @@ def test_descriptors_are_square_roots_of_shares_and_angles_are_radians(tmp_path)
     nothing = Sift().detect(picture, lambda xy, scale, response: np.arange(0))
     assert len(nothing) == 0
     assert join_keypoints([]).descriptors.shape == (0, 128)
-
-
-def test_a_tile_holds_the_keypoints_between_its_edges_away_from_nodata(tmp_path) -> None:
-    rng = np.random.default_rng(5)
-    data = (rng.integers(0, 2, (40, 40)).repeat(8, 0).repeat(8, 1) * 800 + 100).astype(np.uint16)
-    data[:, 250:] = 0
-    path = write_image(tmp_path / "a.tif", data, nodata=0)
-    stored = survey(path, 1)
-    assert stored is not None
-    with chosen(TieOptions, keypoints_per_cell=10_000, tile=160, cell=32) as options:
-        boxes = tiles((320, 320), options.tile)
-        found = [
-            detect_tile(str(path), (320, 320), box, stored, KeypointDensity(0.1, 1, options.tile)) for box in boxes
-        ]
-    for (col, row, width, height), part in zip(boxes, found, strict=True):
-        assert (part.xy >= [col - 0.5, row - 0.5]).all()
-        assert (part.xy < [col + width - 0.5, row + height - 0.5]).all()
-    every = join_keypoints(found)
-    assert (250 - every.xy[:, 0] > 2.9).all()
-    assert (250 - every.xy[:, 0] > every.scale - 1.5).all()
-    assert (every.xy > 2.0).all()
-    assert (np.abs(every.xy - 159.5) < 3).any(axis=0).all()  # beside the edge of a tile, whose neighbour is looked at
-    assert len(every) > 50
-
-
-# --- pixels ------------------------------------------------------------------------------------------------
-
-
-def test_a_stretch_takes_its_ends_to_0_and_255_and_holes_to_the_mean() -> None:
-    pixels = np.array([[100.0, 150.0, 200.0], [50.0, 300.0, 100.4]], np.float32)
-    whole = np.ones((2, 3), bool)
-    assert Stretch(100.0, 200.0).apply(pixels, whole).tolist() == [[0, 128, 255], [0, 255, 1]]
-    hole = whole.copy()
-    hole[1, :2] = False
-    picture = Stretch(100.0, 200.0).apply(pixels, hole)
-    assert picture[1, :2].tolist() == [96, 96]  # the mean of 0, 127.5, 255 and 1
-    assert Stretch(0.0, 1.0).apply(pixels, ~whole).tolist() == [[0] * 3] * 2
-
-
-def test_the_stretch_lies_between_the_percentiles_of_the_valid_pixels(tmp_path) -> None:
-    values = np.arange(1, 60_001, dtype=np.uint16).reshape(200, 300)
-    shuffled = np.random.default_rng(0).permutation(values.ravel()).reshape(200, 300)
-    stretch = sample_stretch(write_image(tmp_path / "a.tif", shuffled), 1)
-    assert stretch is not None
-    assert stretch.low == pytest.approx(300, rel=0.15)
-    assert stretch.high == pytest.approx(59_700, rel=0.003)
-    flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
-    for range_, varies in ((6.0, False), (10.0, True)):
-        flat[20:30] = 2.0**23 + range_
-        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat), 1) is not None) == varies
-
-
-def test_zero_borders_of_five_pixels_are_invalid_and_smaller_ones_are_not(tmp_path) -> None:
-    data = np.full((60, 60), 7, np.uint16)
-    data[:, :5], data[40:44, 40:44], data[20:25, 20:25], data[50, 50] = 0, 0, 0, 65535
-    _, valid = read_pixels(write_image(tmp_path / "a.tif", data), (0, 0, 60, 60), 1)
-    expected = np.ones((60, 60), bool)
-    expected[:, :5] = expected[20:25, 20:25] = expected[50, 50] = False
-    np.testing.assert_array_equal(valid, expected)
-
-
-@pytest.mark.parametrize(
-    ("box", "grown"),
-    [
-        ((10, 20, 30, 40), (5, 15, 40, 50)),
-        ((0, 3, 30, 40), (0, 0, 35, 48)),
-        ((80, 90, 20, 8), (75, 85, 25, 15)),
-    ],
-)
-def test_a_box_grows_on_every_side_up_to_the_border(box, grown) -> None:
-    assert grow(box, 5, (100, 100)) == grown
 
 
 @pytest.mark.parametrize("slope", [0.4, -0.4, 0.02, 0.0])

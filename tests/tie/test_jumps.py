@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.ndimage import shift
 
 from barpc.base.options import TieOptions
 from barpc.base.tasks import HERE
-from barpc.rasters.raster import open_raster
 from barpc.scene import View
 from barpc.tie import find_tracks
 from barpc.tie.matchers.given import verify_given
@@ -19,8 +16,7 @@ from barpc.tie.matchers.pair_search import PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import Pair
 from benchmarks.planted import Plant
-from tests.geotiffs import write_image
-from tests.tie.conftest import Rendered
+from tests.tie.conftest import Rendered, altered
 from tests.tie.stages import common_tracks
 
 PLANTS = [
@@ -35,13 +31,14 @@ PLANTS = [
 ]
 
 
+def whole(grey: np.ndarray) -> np.ndarray:
+    """Grey values as images have them."""
+    return np.clip(np.rint(grey), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+
 def planted(view: View, plant: Plant, folder) -> View:
     """The view as it is delivered with the error."""
-    with open_raster(view.path) as dataset:
-        pixels = dataset.read(1)
-    moved = np.clip(np.rint(plant.pixels(pixels.astype(np.float64))), 0, np.iinfo(pixels.dtype).max)
-    path = write_image(folder / f"{view.name}.tif", moved.astype(pixels.dtype))
-    return replace(view, path=str(path), size=(moved.shape[1], moved.shape[0]))
+    return altered(view, folder, lambda pixels: whole(plant.pixels(pixels.astype(np.float64))))
 
 
 @pytest.mark.few(4)
@@ -71,14 +68,15 @@ def test_single_places_that_lie_off_their_lines_reach_whoever_judges_them(scene:
     for place in there[((there > 30) & (there < 270)).all(axis=1)]:
         if all(np.abs(place - other).max() > 60 for other in far):
             far.append(place)
-    with open_raster(scene.views[1].path) as dataset:
-        pixels = dataset.read(1)
-    for col, row in np.rint(far).astype(int):
-        near = np.s_[row - 25 : row + 26, col - 25 : col + 26]
-        moved = shift(pixels[near].astype(np.float64), by[::-1], order=3, mode="nearest")[7:-7, 7:-7]
-        pixels[row - 18 : row + 19, col - 18 : col + 19] = np.clip(np.rint(moved), 0, np.iinfo(pixels.dtype).max)
-    path = write_image(tmp_path / "off.tif", pixels)
-    two, few = [scene.views[0], replace(scene.views[1], path=str(path))], TieOptions(points_per_image=300)
+
+    def moved(pixels: np.ndarray) -> np.ndarray:
+        for col, row in np.rint(far).astype(int):
+            near = np.s_[row - 25 : row + 26, col - 25 : col + 26]
+            patch = shift(pixels[near].astype(np.float64), by[::-1], order=3, mode="nearest")[7:-7, 7:-7]
+            pixels[row - 18 : row + 19, col - 18 : col + 19] = whole(patch)
+        return pixels
+
+    two, few = [scene.views[0], altered(scene.views[1], tmp_path, moved)], TieOptions(points_per_image=300)
     first, second = common_tracks(find_tracks(two, few).tracks, 0, 1)
     off = second - scene.place(0, 1, first)
     inside = np.array([np.abs(second - place).max(axis=1) < 8 for place in far])

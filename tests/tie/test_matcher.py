@@ -13,8 +13,6 @@ import pytest
 from barpc.base.errors import TiePointError
 from barpc.tie import Keypoints, Matches, TieOptions, find_tracks
 from barpc.tie.matchers.matcher import Prediction
-from barpc.tie.matchers.pair_search import MATCHERS
-from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pixels import levelled, read_pixels
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
@@ -86,9 +84,8 @@ class Guessing(Correlated):
 
 
 @pytest.fixture(params=rest_slow([Correlated, Everywhere]))
-def matcher(request, monkeypatch) -> str:
-    monkeypatch.setitem(MATCHERS, "another", request.param)
-    return "another"
+def matcher(request, in_table) -> str:
+    return in_table(request.param)
 
 
 @pytest.mark.landing(1)
@@ -102,29 +99,14 @@ def test_a_dense_matcher_gives_tracks_as_good_as_the_detectors(render, matcher, 
     assert all(report.status == "ok" and report.control_share <= 0.01 for report in result.pairs)
     assert (np.bincount(tracks.point) == number).sum() > 200 * share
     for i, j in combinations(range(number), 2):
-        first, second = common_tracks(tracks, i, j)
-        errors = scene.errors(i, j, first, second)
-        assert len(first) > 300 * share
-        assert 1.4826 * np.median(np.abs(errors), axis=0).max() <= 0.06
-        assert (np.abs(errors).max(axis=1) > 1.0).mean() <= 0.02
+        assert len(common_tracks(tracks, i, j)[0]) > 300 * share
+        assert scene.typical(tracks, i, j).max() <= 0.06
+        assert (np.abs(scene.errors_of(tracks, i, j)).max(axis=1) > 1.0).mean() <= 0.02
 
 
-def test_a_matcher_that_guesses_is_not_believed(render, monkeypatch) -> None:
-    monkeypatch.setitem(MATCHERS, "another", Guessing)
+def test_a_matcher_that_guesses_is_not_believed(scene, in_table) -> None:
     with pytest.raises(TiePointError, match=r"no common offset|too few matches"):
-        find_tracks(render(views=2, size=(300, 300)).views, TieOptions(matcher="another"))
-
-
-def test_a_place_along_the_line_has_no_error_across_it(render) -> None:
-    first, second = render(views=2, size=(300, 300)).views
-    xy = np.random.default_rng(0).uniform(0, 299, (50, 2))
-    where, along = epipolar_segments(first, second, xy), np.linspace(-30, 30, 50)
-    np.testing.assert_allclose(where.errors(where.place(along)), np.stack([along, 0 * along], 1), atol=1e-9)
-    np.testing.assert_allclose(
-        where.place(where.after),
-        second.sensor.project(first.sensor.localize(xy, np.full(50, first.alt_range[1]))),
-        atol=1e-6,
-    )
+        find_tracks(scene.views, TieOptions(matcher=in_table(Guessing)))
 
 
 class Blocks(Correlated):
@@ -134,9 +116,7 @@ class Blocks(Correlated):
 
 
 @pytest.mark.slow
-def test_matches_of_a_few_patches_are_not_many(render, monkeypatch) -> None:
+def test_matches_of_a_few_patches_are_not_many(scene, in_table) -> None:
     """Templates wider than their pitch share their pixels: of noise so many agree by chance as stand on one patch."""
-    monkeypatch.setitem(MATCHERS, "another", Blocks)
-    scene = render(views=2, size=(300, 300))
     with pytest.raises(TiePointError, match="too few matches on common epipolar lines"):
-        find_tracks(scene.views, TieOptions(matcher="another"))
+        find_tracks(scene.views, TieOptions(matcher=in_table(Blocks)))

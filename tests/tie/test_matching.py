@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers import pair_search
+from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.pair_search import MATCHERS, PairSearch, _latest
+from barpc.tie.matchers.matching import _latest, _PairSearch
 from barpc.tie.matchers.report import PairReport, better, enough
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.tie.test_pairs import camera, views
@@ -51,6 +51,9 @@ def test_a_report_says_which_attempts_found_fewer_of_how_many_that_were_wanted()
     none = replace(many, status="too few matches", verified=0)
     assert better(first, (NO_MATCHES, none))[1].beaten == ("guided 20 of 54", "structure 0 of 100")
     assert better((NO_MATCHES, few))[1].beaten == ()
+    refused = replace(many, status="too few matches")
+    for attempts in ((refused, few), (few, refused)):  # however many it has verified
+        assert better(*((NO_MATCHES, one) for one in attempts))[1] == replace(few, beaten=("structure 240 of 100",))
     others = replace(NO_MATCHES)
     assert better((NO_MATCHES, few), (others, many))[0] is others
     assert better((NO_MATCHES, few), (others, few))[0] is NO_MATCHES  # of equals the earlier one
@@ -73,31 +76,26 @@ class Scripted:
 
 
 @pytest.fixture
-def search(monkeypatch) -> Callable[[Scripted], PairSearch]:
-    def made(matcher: Scripted) -> PairSearch:
-        monkeypatch.setitem(MATCHERS, "scripted", lambda *_: matcher)
-        return PairSearch(
-            tuple(views(camera(0.0), camera(0.0))),
-            (join_keypoints([]), join_keypoints([])),
-            TieOptions(matcher="scripted"),
-        )
+def search(in_table) -> Callable[..., _PairSearch]:
+    """`search(matcher, **options)`: the search of a pair of like cameras with it."""
+
+    def made(matcher: Any, keypoints: Any = None, **options: Any) -> _PairSearch:
+        ends = tuple(views(camera(0.0), camera(0.0)))
+        chosen = TieOptions(matcher=in_table(lambda *_: matcher), **options)
+        return _PairSearch(ends, keypoints or (join_keypoints([]),) * 2, chosen)
 
     return made
 
 
-def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_that_both_share(monkeypatch) -> None:
+def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_that_both_share(search, monkeypatch):
     asked: list[Any] = []
-    monkeypatch.setitem(MATCHERS, "blind", lambda *_: SimpleNamespace(detects=False))
-    monkeypatch.setattr(pair_search, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
+    monkeypatch.setattr(matching, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
     monkeypatch.setattr(
-        pair_search, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
+        matching, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
     )
-    ends = tuple(views(camera(0.0), camera(0.0)))
-    PairSearch(ends, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="blind"))
+    search(SimpleNamespace(detects=False))
     assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
-    monkeypatch.setitem(MATCHERS, "scripted", lambda *_: Scripted([]))
-    keypoints: Any = SimpleNamespace(xy="of the first"), SimpleNamespace(xy="of the second")
-    PairSearch(ends, keypoints, TieOptions(matcher="scripted"))
+    search(Scripted([]), (SimpleNamespace(xy="of the first"), SimpleNamespace(xy="of the second")))
     assert asked[1] == "of the first"
 
 
@@ -128,8 +126,7 @@ def test_as_many_matches_are_trusted_as_the_bands_aside_allow(search, aside, sha
 
 def test_no_matches_are_none_in_every_column() -> None:
     assert [column.shape for column in (NO_MATCHES.xy, NO_MATCHES.score, NO_MATCHES.index)] == [(0, 2, 2), (0,), (0, 2)]
-    assert [len(NO_MATCHES), len(NO_MATCHES.xy), len(NO_MATCHES.score), len(NO_MATCHES.index)] == [0] * 4
-    assert NO_MATCHES.index.shape == (0, 2)
+    assert len(NO_MATCHES) == 0
     assert np.isnan(NO_MATCHES.sigma) or NO_MATCHES.sigma >= 0
 
 
@@ -239,9 +236,20 @@ def test_passes_grow_wider_until_one_is_clear(search) -> None:
     assert [probes for _, probes in unclear.asked] == [1500, 2000, 3000]
     assert found is not None
     assert found.half_width == 3.0
-    none = Listed(spread_out(300, 5, width=700.0))
-    assert search(none).offset is None
-    assert len(none.asked) == 3
+
+
+@pytest.mark.parametrize(
+    ("asked", "passes"),
+    [
+        (700.0, [(20.0, 1500), (80.0, 2000), (700.0, 3000)]),
+        (54.0, [(20.0, 1500), (54.0, 3000)]),
+        (20.0, [(20.0, 3000)]),
+    ],
+)
+def test_no_width_is_searched_twice(search, asked, passes) -> None:
+    nothing = Listed(spread_out(300, 5, width=700.0))
+    assert search(nothing, search=asked).offset is None
+    assert nothing.asked == passes
 
 
 def test_the_most_significant_peak_decides_where_none_is_clear(search) -> None:

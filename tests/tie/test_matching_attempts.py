@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from barpc.base.tasks import Work, store_of
 from barpc.scene import Tracks, View
 from barpc.tie import Matches, TieOptions
 from barpc.tie.linking import link
 from barpc.tie.matchers import matching
-from barpc.tie.matchers.features import join_keypoints
+from barpc.tie.matchers.features import join_keypoints, locate
 from barpc.tie.matchers.matcher import NO_MATCHES
 from barpc.tie.matchers.matching import FALSE_SHARE, GroundAltitudes, match_pair, match_pairs
 from barpc.tie.matchers.report import PairReport
@@ -65,6 +66,21 @@ def test_a_pair_with_enough_is_tried_once(attempts) -> None:
     made = attempts(report(100))
     assert match_pair((None, None), NOBODY, PAIR, TieOptions())[1] == report(100)  # type: ignore[arg-type]
     assert made == [TieOptions()]
+
+
+@pytest.mark.parametrize(
+    ("status", "ratio", "times"),
+    [
+        ("no common offset within 7 px", 0.85, 1),
+        ("no common offset within 7 px", 0.7, 2),
+        ("too few matches", 0.85, 2),
+    ],
+)
+def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(attempts, status, ratio, times) -> None:
+    """A stricter ratio than that of clear matches is loosened for these, too."""
+    made = attempts(*[report(0, status)] * 2)
+    match_pair((None, None), NOBODY, PAIR, TieOptions(ratio=ratio))  # type: ignore[arg-type]
+    assert len(made) == times
 
 
 @pytest.mark.parametrize(
@@ -154,9 +170,7 @@ def test_structure_is_asked_where_keypoints_find_few_and_not_where_there_are_non
     assert matchers == ["guided", "structure", "guided", "structure"]
 
 
-def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_structure_more(
-    second_look,
-) -> None:
+def test_a_matcher_that_is_named_is_what_is_wanted_unless_the_terrain_tells_structure_more(second_look) -> None:
     few = [report(40)]
     assert second_look(few, TieOptions(matcher="somewhere:match"), ground=GroundAltitudes(hills))[0] == []
     assert second_look(few, TieOptions(matcher="structure"))[0] == []
@@ -261,11 +275,7 @@ def test_given_matches_are_added_where_fewer_than_are_wanted_could_be_registered
     assert (np.bincount(more.point) == 2).all()
 
 
-def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(render) -> None:
-    from barpc.base.tasks import Store, Work, store_of
-    from barpc.tie.matchers.features import locate
-
-    scene = render(views=2, size=(300, 300))
+def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(scene) -> None:
     pair = tuple(scene.views)
     with store_of(SimpleNamespace(store=None)) as store:  # type: ignore[arg-type]
         files = locate(pair, TieOptions(), Work(store=store))
@@ -274,7 +284,6 @@ def test_the_quick_score_is_of_the_strongest_and_nought_where_there_are_none(ren
         assert all(500 <= len(few) <= 500 + len(few.boxes) for few in asked)
         score = matching.quick_score(pair, (files[0], files[1]), TieOptions())
         assert 60 < score < 400
-        assert isinstance(store, Store)
         none = replace(files[1], counts=(0,) * len(files[1].counts))
         assert matching.quick_score(pair, (files[0], none), TieOptions()) == 0
 

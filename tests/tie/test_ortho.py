@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio import Affine
 
 from barpc.base.errors import InputError
@@ -59,13 +58,8 @@ def test_a_camera_that_is_off_shows_a_patch_beside_its_place() -> None:
 
 def sheet(path, data: np.ndarray, step: float = 1e-5, corner: tuple[float, float] = (5.4, 43.3)) -> str:
     """An orthoimage whose pixels are `step` degrees a side, from its outer corner on."""
-    bands = data if data.ndim == 3 else data[None]
-    with rasterio.open(
-        path, "w", "GTiff", bands.shape[2], bands.shape[1], len(bands), dtype=bands.dtype, crs="EPSG:4326",
-        transform=Affine(step, 0, corner[0], 0, -step, corner[1]), nodata=0,
-    ) as file:  # fmt: skip
-        file.write(bands)
-    return str(path)
+    place = Affine(step, 0, corner[0], 0, -step, corner[1])
+    return str(write_image(path, data, crs="EPSG:4326", transform=place, nodata=0))
 
 
 @pytest.fixture
@@ -95,15 +89,9 @@ def test_three_bands_are_seen_together_and_of_two_the_first(tmp_path, count, ban
     assert Sheet.read(path).size == (9, 8)
 
 
-@pytest.mark.parametrize("crs", [None, "EPSG:4326"])
-def test_a_raster_without_a_crs_or_an_extent_is_refused(tmp_path, crs) -> None:
-    path = tmp_path / "a.tif"
-    write_image(path, np.ones((8, 9), np.uint8))
-    if crs is not None:
-        with rasterio.open(
-            path, "w", "GTiff", 9, 8, 1, dtype="uint8", crs=crs, transform=Affine(1e-5, 0, 5, 0, 0, 43)
-        ) as file:
-            file.write(np.ones((1, 8, 9), np.uint8))
+@pytest.mark.parametrize("place", [{}, {"crs": "EPSG:4326", "transform": Affine(1e-5, 0, 5, 0, 0, 43)}], ids=str)
+def test_a_raster_without_a_crs_or_an_extent_is_refused(tmp_path, place) -> None:
+    path = write_image(tmp_path / "a.tif", np.ones((8, 9), np.uint8), **place)
     with pytest.raises(InputError, match=r"a\.tif: a reference is an orthoimage"):
         Sheet.read(str(path))
 

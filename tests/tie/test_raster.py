@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
 
 from barpc.base.errors import ImageError
-from barpc.tie.pixels import Stretch, grow, levelled, read_pixels, sample_stretch
+from barpc.tie.pixels import Stretch, grow, jpeg, levelled, read_pixels, sample_stretch, thumbnail
 from tests.geotiffs import write_image
+from tests.rasters.test_vrt import band, rects, source, vrt
 
 RNG = np.random.default_rng(0)
 
@@ -101,13 +103,13 @@ def test_nodata_nan_saturated_and_zero_borders_are_invalid_but_a_lone_zero_is_no
     data[0, 0], data[1, 1], data[2, 2] = np.nan, np.inf, -9999
     _, valid = read_pixels(write_image(tmp_path / "float.tif", data, nodata=-9999), (0, 0, 60, 60), 1)
     assert np.flatnonzero(~valid).tolist() == [0, 61, 122]
-    whole = RNG.integers(1, 60000, (60, 60)).astype(np.uint16)
-    whole[:10], whole[30, 30], whole[40, 40] = 0, 0, 65535
+    whole = np.full((60, 60), 7, np.uint16)
+    whole[:, :5], whole[20:25, 20:25], whole[50, 50] = 0, 0, 65535
+    whole[40:44, 40:44], whole[30, 30] = 0, 0  # under five pixels: dark ones
     _, valid = read_pixels(write_image(tmp_path / "whole.tif", whole), (0, 0, 60, 60), 1)
-    assert not valid[:10].any()
-    assert valid[30, 30]
-    assert not valid[40, 40]
-    assert (~valid).sum() == 601
+    expected = np.ones((60, 60), bool)
+    expected[:, :5] = expected[20:25, 20:25] = expected[50, 50] = False
+    np.testing.assert_array_equal(valid, expected)
 
 
 @pytest.mark.parametrize(
@@ -122,14 +124,18 @@ def test_an_image_of_one_pixel_has_no_stretch(tmp_path) -> None:
     assert sample_stretch(write_image(tmp_path / "a.tif", np.ones((1, 1), np.uint8)), 1) is None
 
 
-def test_a_box_grows_up_to_the_border_of_the_image() -> None:
-    assert grow((0, 10, 20, 20), 5, (100, 32)) == (0, 5, 25, 27)
+def test_an_image_that_varies_by_a_few_steps_of_its_type_alone_has_no_stretch(tmp_path) -> None:
+    flat = np.full((50, 50), 2.0**23, np.float32)  # one step of the type is 1
+    for range_, varies in ((6.0, False), (10.0, True)):
+        flat[20:30] = 2.0**23 + range_
+        assert (sample_stretch(write_image(tmp_path / f"{varies}.tif", flat), 1) is not None) == varies
 
 
 @pytest.mark.parametrize(
     ("box", "grown"),
     [
         ((40, 10, 20, 12), (35, 5, 30, 22)),
+        ((0, 3, 30, 20), (0, 0, 35, 28)),
         ((90, 30, 20, 20), (85, 25, 15, 7)),
         ((-9, -9, 4, 4), (0, 0, 1, 1)),  # beside the image: the pixel that is nearest
         ((150, 50, 20, 20), (99, 31, 1, 1)),
@@ -165,13 +171,16 @@ def test_the_stretch_is_that_of_the_usual_values_not_of_the_extreme_ones(tmp_pat
     np.testing.assert_allclose(picture[0].astype(int), [0, 0, 127, 255, 255], atol=1)
 
 
-def test_invalid_pixels_take_the_mean_of_the_valid_ones() -> None:
-    for dtype in (np.float32, np.float64):
-        pixels = np.array([[10.0, 0.0], [20.0, 0.0]], dtype)
-        valid = np.array([[True, False], [True, False]])
-        picture = Stretch(0.0, 51.0).apply(pixels, valid)
-        np.testing.assert_array_equal(picture, [[50, 75], [100, 75]])
-        assert not Stretch(0.0, 51.0).apply(pixels, ~valid & False).any()
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_stretch_takes_its_ends_to_0_and_255_and_holes_to_the_mean(dtype) -> None:
+    pixels = np.array([[100.0, 150.0, 200.0], [50.0, 300.0, 100.4]], dtype)
+    whole = np.ones((2, 3), bool)
+    assert Stretch(100.0, 200.0).apply(pixels, whole).tolist() == [[0, 128, 255], [0, 255, 1]]
+    hole = whole.copy()
+    hole[1, :2] = False
+    picture = Stretch(100.0, 200.0).apply(pixels, hole)
+    assert picture[1, :2].tolist() == [96, 96]  # the mean of 0, 127.5, 255 and 1
+    assert Stretch(0.0, 1.0).apply(pixels, ~whole).tolist() == [[0] * 3] * 2
 
 
 def test_a_window_of_one_value_is_level() -> None:
@@ -186,11 +195,57 @@ def test_a_stretch_of_jpeg_2000_is_that_of_its_overviews(tmp_path) -> None:
     noise = np.random.default_rng(0).normal(1000, 100, (700, 900)).astype(np.uint16)
     found, place = {}, {"crs": "EPSG:32631", "transform": rasterio.Affine(2, 0, 5e5, 0, -2, 5e6)}
     for driver, given in (("GTiff", {}), ("JP2OpenJPEG", {"REVERSIBLE": "YES", "QUALITY": "100", "BLOCKXSIZE": 256})):
-        path = tmp_path / driver
-        with rasterio.open(path, "w", driver, 900, 700, 1, dtype="uint16", **place, **given) as file:
-            file.write(noise, 1)
-        stretch = sample_stretch(path, 1)
+        stretch = sample_stretch(write_image(tmp_path / driver, noise, driver=driver, **place, **given), 1)
         assert stretch is not None
         found[driver] = (stretch.high - stretch.low) / 515.2  # 0.5 to 99.5 % of a normal distribution
     assert found["GTiff"] == pytest.approx(1.0, abs=0.03)
     assert 0.24 < found["JP2OpenJPEG"] < 0.5
+
+
+# --- small pictures of images as they lie, of a bounded size in pixels and bytes ------------------------------
+
+
+@pytest.fixture
+def ramp(tmp_path):
+    """An image that grows brighter to the right and, by half as much, downwards; its left border is no data."""
+    rows, cols = np.mgrid[0:900, 0:1300]
+    pixels = (1000 + 2 * cols + rows).astype(np.uint16)
+    pixels[:, :130] = 7
+    return write_image(tmp_path / "ramp.tif", pixels, nodata=7)
+
+
+@pytest.mark.parametrize("kind", ["file", "mosaic", "small"])
+def test_a_thumbnail_is_the_image_as_it_lies_stretched_with_black_where_nothing_is_known(ramp, tmp_path, kind):
+    path = ramp
+    if kind == "mosaic":
+        whole = rects((0, 0, 1300, 900), (0, 0, 1300, 900))
+        body = band("<NoDataValue>7</NoDataValue>", source("ramp.tif", whole))
+        path = vrt(tmp_path / "m.vrt", body, size=(1300, 900))
+    grey = thumbnail(path, (1300, 900), 2000 if kind == "small" else 130, 1)
+    assert grey.shape == ((900, 1300) if kind == "small" else (90, 130))
+    shown = cv2.resize(grey, (130, 90), interpolation=cv2.INTER_AREA).astype(float)
+    assert (shown[:, :12] == 0).all()
+    assert shown[10:80, 15:125].min() > 0
+    right, down = np.diff(shown[10:80, 20:120], axis=1).mean(), np.diff(shown[10:80, 20:120], axis=0).mean()
+    rows, cols = np.mgrid[0:900, 130:1300]
+    assert right == pytest.approx(255 * 20 / np.ptp(np.percentile(1000 + 2 * cols + rows, (0.5, 99.5))), rel=0.03)
+    assert down == pytest.approx(right / 2, rel=0.05)
+
+
+def test_an_image_without_contrast_has_no_thumbnail_and_one_of_noise_fits_its_bytes(tmp_path):
+    flat = write_image(tmp_path / "flat.tif", np.full((50, 50), 9, np.uint8))
+    assert thumbnail(flat, (50, 50), 48, 1) is None
+    noise = np.random.default_rng(1).integers(0, 255, (480, 480)).astype(np.uint8)
+    assert len(jpeg(noise)) > 60_000
+    for most in (60_000, 25_000, 1000, 1):
+        made = jpeg(noise, most)
+        assert len(made) <= most or most == 1
+        assert cv2.imdecode(np.frombuffer(made, np.uint8), 0) is not None
+
+
+@pytest.mark.parametrize("size", [(20, 30_000), (30_000, 3), (1, 1), (2, 1)])
+def test_an_image_of_few_columns_or_rows_has_a_thumbnail_or_none(tmp_path, size):
+    pixels = (np.arange(size[0] * size[1]) % 251).reshape(size[1], size[0]).astype(np.uint8)
+    grey = thumbnail(write_image(tmp_path / "thin.tif", pixels, nodata=255), size, 480, 1)
+    assert grey is None or (max(grey.shape) <= 480 and min(grey.shape) >= 1)
+    assert (grey is None) <= (max(size) < 3)

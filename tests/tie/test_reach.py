@@ -16,20 +16,17 @@ from rasterio.warp import transform
 
 from barpc.base.geodesy import Array
 from barpc.pipeline.loading import load_views
-from barpc.scene import View
-from barpc.tie import PairReport, TieOptions, find_tracks
-from barpc.tie.matchers import matching, structural
+from barpc.tie import TieOptions, find_tracks
+from barpc.tie.matchers import structural
 from barpc.tie.matchers.features import join_keypoints
-from barpc.tie.matchers.matcher import NO_MATCHES, Prediction
-from barpc.tie.matchers.matching import match_pair
-from barpc.tie.matchers.pair_search import PairSearch
+from barpc.tie.matchers.matching import _PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
-from barpc.tie.pairing.overlaps import Pair, reach_of
+from barpc.tie.pairing.overlaps import reach_of
 from barpc.tie.patches.oriented import PatchTile
 from tests.constants import Sized
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
-from tests.tie.stages import common_tracks
+from tests.tie.stages import common_tracks, part_of
 
 from .test_pairs import METRE, camera, views
 
@@ -66,54 +63,6 @@ def test_a_camera_that_sees_no_ground_is_searched_as_far_as_any() -> None:
     assert reach_of(view, None) == 700.0
 
 
-@pytest.mark.parametrize(
-    ("asked", "passes"),
-    [
-        (700.0, [(20.0, 1500), (80.0, 2000), (700.0, 3000)]),
-        (54.0, [(20.0, 1500), (54.0, 3000)]),
-        (20.0, [(20.0, 3000)]),
-    ],
-)
-def test_no_width_is_searched_twice(monkeypatch, asked, passes) -> None:
-    made = []
-
-    class Nothing:
-        detects = True
-
-        def __init__(self, options, keypoints) -> None: ...
-
-        def match(self, a: View, b: View, prediction: Prediction):
-            made.append((prediction.half_width, prediction.probes))
-            return NO_MATCHES
-
-    monkeypatch.setitem(matching.MATCHERS, "nothing", Nothing)
-    two = (*views(camera(0.0), camera(METRE)),)
-    search = PairSearch(two, (join_keypoints([]), join_keypoints([])), TieOptions(matcher="nothing", search=asked))  # type: ignore[arg-type]
-    assert search.offset is None
-    assert made == passes
-
-
-@pytest.mark.parametrize(
-    ("status", "ratio", "times"),
-    [
-        ("no common offset within 7 px", 0.85, 1),
-        ("no common offset within 7 px", 0.7, 2),
-        ("too few matches", 0.85, 2),
-    ],
-)
-def test_where_clear_matches_show_no_offset_looser_thresholds_are_not_tried(monkeypatch, status, ratio, times) -> None:
-    """A stricter ratio than that of clear matches is loosened for these, too."""
-    made = []
-
-    def attempt(*given):
-        made.append(given)
-        return NO_MATCHES, PairReport(("a", "b"), status, (900, 900), overlap=1.0)
-
-    monkeypatch.setattr(matching, "_attempt", attempt)
-    match_pair((None, None), (join_keypoints([]),) * 2, Pair((0, 1), 1.0, 5.0), TieOptions(ratio=ratio))  # type: ignore[arg-type]
-    assert len(made) == times
-
-
 class Pinhole:
     """A frame camera 3 km above a point, looking down, half a metre a pixel."""
 
@@ -142,22 +91,14 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
     near = np.abs((along - axis + 90.0) % 180.0 - 90.0) < 40.0
     assert near.sum() > 100
     top = below[0].sensor.project(above.sensor.localize(xy[near], np.full(near.sum(), 200.0)))
-    assert (
-        np.abs(
-            replace(
-                where,
-                **{name: getattr(where, name)[near] for name in ("along", "across", "slope", "before", "after")},
-            ).errors(top)[:, 1]
-        ).max()
-        < 1e-6
-    )  # where they lie along the axis they are as they were
+    assert np.abs(part_of(where, near).errors(top)[:, 1]).max() < 1e-6  # along the axis they are as they were
 
 
 @pytest.mark.slow
 def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, sized: Sized, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
-    search = PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
+    search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
     coarse = search.offset
     assert coarse is not None
     whole = structural._GridSearch(*scene.views, 1, coarse).matches()

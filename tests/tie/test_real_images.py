@@ -11,6 +11,7 @@ from barpc.base.statistics import robust_spread
 from barpc.scene import Tracks, View
 from barpc.tie import TieOptions, TieResult, find_tracks, match_pairs
 from barpc.tie.pairing.epipolar import Affine, coherent, epipolar_segments, robust_affine
+from tests.tie.conftest import checks
 from tests.tie.stages import common_tracks, detect, select_pairs
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
@@ -94,11 +95,10 @@ def test_matches_are_many_and_hardly_any_is_false(triplet, triplet_ties: TieResu
 def test_independent_check_points_lie_where_the_tie_points_say(
     triplet, triplet_ties, shared_data, i: int, j: int
 ) -> None:
-    name = f"phr_triplet_north__{triplet[i].name}__{triplet[j].name}__ncc_check.csv"
-    table = np.genfromtxt(shared_data / "truth/ties" / name, delimiter=",", skip_header=1)
-    errors = across(triplet, i, j, table[:, :2], table[:, 2:4])
-    left = errors - fit(triplet, triplet_ties.tracks, i, j)[0](table[:, :2])
-    own = robust_affine(table[:, :2], errors).spread
+    at, other = checks(shared_data, f"phr_triplet_north__{triplet[i].name}__{triplet[j].name}")
+    errors = across(triplet, i, j, at, other)
+    left = errors - fit(triplet, triplet_ties.tracks, i, j)[0](at)
+    own = robust_affine(at, errors).spread
     assert abs(np.median(left)) <= 0.02
     assert robust_spread(left - np.median(left)) <= 1.1 * own
 

@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from scipy import ndimage
 
+from barpc import open_camera
 from barpc.base.errors import InputError
 from barpc.base.geodesy import metres_per_unit
 from barpc.base.tasks import HERE
@@ -31,11 +32,11 @@ from barpc.tie.reference import (
     register_views,
     vote,
 )
+from barpc.verbs.moving import moved
 from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.scenes import ImageOptions, Scene
 from tests.scenes.season import other_season, write_dem, write_reference
-from tests.scenes.terrain import Grid
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 GSD = 2.0
@@ -122,43 +123,6 @@ def test_a_reference_that_lies_off_moves_what_it_finds(views, scene, season, dem
     assert second.control.bias[:2] == pytest.approx([5.0, 5.0])
 
 
-@pytest.mark.slow
-def test_other_places_and_no_texture_are_refused(views, scene, season, dem, tmp_path):
-    mirrored = Grid(season.origin, season.step, np.ascontiguousarray(season.values[:, ::-1]))
-    plain = Grid(season.origin, season.step, np.full_like(season.values, 0.3))
-    for name, grid in (("mirrored", mirrored), ("plain", plain)):
-        path = str(write_reference(tmp_path / f"{name}.tif", scene, grid, GSD))
-        found = register_views(views, [path], dem, 1)
-        assert found.control is None, name
-        assert found.views[0].peak < PEAK - 1.0
-        assert found.views[0].points == 0
-
-
-@pytest.mark.slow
-def test_a_reference_that_does_not_reach_the_image_is_no_error(views, scene, season, dem, tmp_path):
-    path = str(write_reference(tmp_path / "far.tif", scene, season, GSD, shift=(5000.0, 0.0)))
-    found = register_views(views, [path], dem, 1)
-    assert found.control is None
-    assert found.views[0].peak == 0.0
-
-
-@pytest.mark.nightly
-def test_of_several_files_each_shows_its_part(views, reference, dem, tmp_path):
-    with rasterio.open(reference) as file:
-        pixels, profile, place = file.read(1), file.profile, file.transform
-    paths, half = [], pixels.shape[1] // 2
-    for name, part, left in (("west", pixels[:, :half], 0), ("east", pixels[:, half:], half)):
-        profile.update(width=part.shape[1], transform=rasterio.Affine(GSD, 0, place.c + GSD * left, 0, -GSD, place.f))
-        paths.append(str(write_image(tmp_path / f"{name}.tif", part, **profile)))
-    whole, parts = register_views(views, [reference], dem, 1), register_views(views, paths, dem, 1)
-    assert parts.views[0].points > 0.6 * whole.views[0].points
-    assert np.subtract(parts.views[0].offset, whole.views[0].offset) == pytest.approx([0, 0], abs=0.2)
-    east = register_views(views, paths[1:], dem, 1).control.points
-    whole_east = whole.control.points.lonlatalt[:, 0].max()
-    assert east.lonlatalt[:, 0].max() == pytest.approx(whole_east, abs=1e-3)
-    assert east.lonlatalt[:, 0].min() > whole.control.points.lonlatalt[:, 0].min() + 1e-3
-
-
 def test_a_raster_without_a_place_is_refused(views):
     with pytest.raises(InputError, match="no place on the ground"):
         register_views(views, [views[0].path], flat, 1)
@@ -194,12 +158,7 @@ def ground(seed: int) -> np.ndarray:
 def plain(path: Path, grey: np.ndarray, left: int = 0) -> str:
     """A reference of the plain, from a column of the whole one on."""
     corner = rasterio.Affine(DEGREES, 0, (left - WIDE / 2) * DEGREES, 0, -DEGREES, WIDE / 2 * DEGREES)
-    with rasterio.open(
-        path, "w", "GTiff", grey.shape[1], grey.shape[0], 1, dtype="uint16", crs="EPSG:4326",
-        transform=corner, nodata=0,
-    ) as file:  # fmt: skip
-        file.write(grey.astype(np.uint16), 1)
-    return str(path)
+    return str(write_image(path, grey.astype(np.uint16), crs="EPSG:4326", transform=corner, nodata=0))
 
 
 def taken(path: Path, grey: np.ndarray, sensor: RPC) -> View:
@@ -287,11 +246,13 @@ def test_a_block_votes_by_its_correlation_where_it_and_the_reference_show_enough
 @pytest.mark.slow
 def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(plains):
     seen, grey, _, folder = plains
-    other, far = plain(folder / "other.tif", ground(2)), plain(folder / "far.tif", grey, left=3000)
-    for path in (other, far):
+    far = plain(folder / "far.tif", grey, left=3000)
+    others = {"other": ground(2), "mirrored": grey[:, ::-1], "bare": np.full_like(grey, 900.0)}
+    for path in (far, *(plain(folder / f"{name}.tif", there) for name, there in others.items())):
         found = register_views(seen[:1], [path], flat, 1)
         assert found.control is None
         assert found.views[0].peak < PEAK - 1.0
+        assert (found.views[0].peak == 0.0) == (path == far)
         assert (found.views[0].tried, found.views[0].points) == (0, 0)
     halves = [
         plain(folder / "w.tif", grey[:, : WIDE // 2]),
@@ -303,20 +264,21 @@ def test_what_a_plain_does_not_show_is_not_found_and_what_two_files_share_is(pla
     east = mixed.control.points.lonlatalt[:, 0] / DEGREES
     assert (east.min() < -60) & (east.max() > 60)
     assert np.abs(east).min() > 16  # none of them beside the edge between the files
+    alone = register_views(seen[:1], halves[1:], flat, 1).control.points.lonlatalt[:, 0] / DEGREES
+    assert alone.min() > 16
+    assert alone.max() == pytest.approx(east.max(), abs=8)
     assert mixed.sigma == 5.0
     assert mixed.control.bias == pytest.approx([5.0, 5.0, 5.0])
     assert mixed.control.points.sigma[0] == pytest.approx([0.1 * mixed.step, 0.1 * mixed.step, 10.0])
 
 
 @pytest.mark.parametrize(("metres", "sigma"), [(0.5, 0.5), (1.6, 0.5), (4.0, 1.0), (10.0, 2.5)])
-def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_best(
-    metres, sigma, tmp_path, monkeypatch
-):
+def test_a_reference_is_good_to_a_quarter_of_its_pixel_and_to_half_a_metre_at_best(metres, sigma, plains, tmp_path):
+    """Of a reference that shows nothing."""
     path, degrees = tmp_path / "ref.tif", metres / 111_000.0
     corner = rasterio.Affine(degrees, 0, -25 * degrees, 0, -degrees, 25 * degrees)
     write_image(path, np.ones((50, 50), np.uint8), transform=corner, crs="EPSG:4326")
-    monkeypatch.setattr(_ReferenceWork, "vote", lambda self: [(0.0, np.zeros(2))])  # it shows nothing
-    view = View("a", "", (SIDE, SIDE), camera(0.0), (0.0, 200.0))
+    view = plains[0][0]
     assert register_views([view], [str(path)], flat, 1).sigma == pytest.approx(sigma, rel=0.02)
     assert register_views([view], [str(path)], flat, 1, accuracy=Accuracy(7.0)).sigma == 7.0
 
@@ -419,3 +381,25 @@ def test_shifts_without_any_scatter_are_good_to_a_thirtieth_of_a_pixel():
     assert keep.all()
     assert scatter == pytest.approx([1.4826 * 0.02 * 2.0] * 2)
     np.testing.assert_allclose(fitted, true, atol=1e-9)
+
+
+# --- a real orthoimage --------------------------------------------------------------------------------------
+
+
+@pytest.mark.nightly
+@pytest.mark.filterwarnings("ignore::barpc.base.errors.BarpcWarning")
+@pytest.mark.parametrize("off", [(0.0, 0.0), (150.0, 0.0), (400.0, -300.0), (-700.0, 500.0), (2500.0, -1500.0)])
+def test_cameras_far_off_are_found_on_a_real_orthoimage_which_does_not_show_other_places(shared_data, off):
+    folder = shared_data / "cross_sensor/ngi_2015"
+    camera = open_camera(folder / "ngi_05_0182.tif")
+    (there,) = moved([camera], (*off, 0.0), None)
+    view = View("a", str(folder / "ngi_05_0182.tif"), camera.extent, there.model, camera.alt_range)
+    terrain = Dem.open([str(folder / "dem.tif")], None, None)
+    found = register_views([view], [str(folder / "ortho_05_0182.tif")], terrain, 1)
+    if max(off) > 1000.0:
+        assert found.control is None
+        return
+    (match,) = found.views
+    assert match.peak > 10.0
+    assert match.points > 300
+    np.testing.assert_allclose(match.offset, off, atol=0.5)

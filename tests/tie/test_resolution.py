@@ -21,7 +21,7 @@ from tests.geotiffs import write_image
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 
-from .conftest import Rendered, view_of
+from .conftest import Rendered, checks, view_of
 from .test_pairs import METRE, camera
 
 RNG = np.random.default_rng(4)
@@ -84,17 +84,11 @@ def test_images_that_are_turned_are_compared_as_they_are_and_so_is_what_sees_no_
             return image @ self.turn.T, self.turn @ slope
 
     for angle in (np.pi / 4, np.pi / 2):
-        both = [
-            View("a", "", (500, 500), upright, (0.0, 500.0)),
-            View("b", "", (500, 500), Turned(angle), (0.0, 500.0)),
-        ]
+        both = [View(name, "", (500, 500), one, (0.0, 500.0)) for name, one in (("a", upright), ("b", Turned(angle)))]
         assert Looks.at(both, [Pair((0, 1), 1.0, 0.0)]).ends == {(0, 1): (0, 1)}
     wide = replace(both[0], sensor=upright.window(0, 0, 4, 1))
     looks = Looks.at([wide, both[1]], [Pair((0, 1), 1.0, 0.0)])
-    assert [tuple(looks.pixel[k]) for k in looks.ends[0, 1]] == [
-        (1, 1),
-        (1, 4),
-    ]  # its rows lie along these columns
+    assert [tuple(looks.pixel[k]) for k in looks.ends[0, 1]] == [(1, 1), (1, 4)]  # its rows lie along these columns
     blind = replace(both[0], sensor=upright.crop(1e9, 0))
     assert Looks.at([blind, wide], [Pair((0, 1), 1.0, 0.0)]).ends == {(0, 1): (0, 1)}
 
@@ -208,10 +202,8 @@ def test_matches_of_others_between_two_resolutions_become_as_exact_as_our_own(sc
     first = rng.uniform(20, 279, (900, 2))
     other = (scene.place(0, 1, first) + 0.5) / 3 - 0.5
     rows = np.flatnonzero(((other > 7) & (other < 92)).all(axis=1))[:400]
-    xy = np.stack(
-        [first[rows] + rng.normal(0, 1.5, (len(rows), 2)), other[rows] + rng.normal(0, 0.5, (len(rows), 2))],
-        1,
-    )
+    noise = [rng.normal(0, sigma, (len(rows), 2)) for sigma in (1.5, 0.5)]
+    xy = np.stack([first[rows] + noise[0], other[rows] + noise[1]], axis=1)
     wrong = rng.random(len(rows)) < 0.2
     xy[wrong, 1] = rng.uniform(7, 92, (wrong.sum(), 2))
     index = -1 - np.stack([np.arange(len(rows))] * 2, axis=1)
@@ -235,12 +227,6 @@ def test_pairs_that_registered_ones_leave_apart_keep_their_matches_and_no_others
 
 
 # --- real images --------------------------------------------------------------------------------------------
-
-
-def checks(shared_data: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
-    """Independent places in both images (N, 2) [px]: correlation, no camera (`shared/data/README.md`)."""
-    table = np.genfromtxt(shared_data / f"truth/ties/{pair}__ncc_check.csv", delimiter=",", names=True)
-    return tuple(np.column_stack([table[f"col_{end}"], table[f"row_{end}"]]) for end in "ab")  # type: ignore[return-value]
 
 
 def shift_left(views: tuple[View, View], tracks: Tracks, where: tuple[np.ndarray, np.ndarray]) -> float:

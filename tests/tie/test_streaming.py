@@ -30,6 +30,7 @@ from tests.geotiffs import write_image
 from tests.lanes import diagonal, rest_slow
 from tests.tie.stages import detect
 
+from .conftest import altered
 from .test_pairs import camera
 
 SIDE = 1000
@@ -112,7 +113,7 @@ def test_a_share_lasts_when_the_cameras_move_a_little() -> None:
 
 
 @pytest.mark.slow
-def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
+def test_the_caller_never_loads_keypoints(scene, monkeypatch) -> None:
     inside, load = [], KeypointFiles.load
 
     def watched(self: KeypointFiles, wanted=None):
@@ -121,7 +122,7 @@ def test_the_caller_never_loads_keypoints(render, monkeypatch) -> None:
 
     monkeypatch.setattr(KeypointFiles, "load", watched)
     with ThreadPoolExecutor(1) as pool:
-        find_tracks(render(views=2, size=(300, 300)).views, executor=pool)
+        find_tracks(scene.views, executor=pool)
     assert inside == [False] * 4  # to match, and to count what there was to see
 
 
@@ -155,7 +156,7 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
             KeypointFiles(store, (box,), ("tile/a",), (count,)).load()
     else:
         path.write_bytes({"cut": whole[:-300], "empty": b"", "other": other}[damage])
-    assert keep_tile(*task) == count
+    assert [keep_tile(*task), keep_tile(*task)] == [count, count]
     assert path.read_bytes() == whole
     assert [p.name for p in tmp_path.iterdir() if p.name != "b.npz"] == ["kept"]
 
@@ -164,8 +165,10 @@ def test_a_damaged_tile_is_made_again_and_a_missing_one_is_named(pair, tmp_path,
 def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_folder(
     pair, tmp_path, monkeypatch, sized: Sized
 ) -> None:
+    """Nor for another camera or other thresholds, as a later pass has them."""
     sized(keypoints_per_image=300)
     options, keys = TieOptions(tile=256), []
+    later, loose = [replace(view, sensor=view.sensor.crop(9.0, 9.0)) for view in pair], replace(options, ratio=0.7)
     for number in range(2):
         with Workspace(tmp_path / f"run{number}") as workspace, CachingExecutor(workspace, {}) as executor:
             files = locate(pair, options, Work(executor, store=executor.store))
@@ -174,6 +177,7 @@ def test_a_finished_tile_is_not_searched_again_and_its_keys_do_not_name_the_fold
             with monkeypatch.context() as patch:
                 patch.setattr(features, "Sift", None)
                 assert locate(pair, options, Work(executor, store=executor.store)) == files
+                assert locate(later, replace(loose, search=9.0), Work(executor, store=executor.store)) == files
             tiles_of = [box for of_view in files for box in of_view.boxes]
             assert len(list(workspace.cache.glob("detect_tile/*.npz"))) == len(tiles_of) == 8
             assert len(list(workspace.cache.rglob("*.npz"))) == count  # and nothing is kept twice
@@ -209,13 +213,10 @@ def test_a_picture_is_the_same_however_the_file_is_stored(tmp_path, zoom: int, p
 
 @pytest.mark.parametrize(("zoom", "side"), rest_slow(pytest.param(*row) for row in ((4, 512), (4, 960), (2, 960))))
 def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, side: int) -> None:
-    rasterio = pytest.importorskip("rasterio")
     data = quiet(0.0)[:side, -side:]
-    paths = [write_image(tmp_path / "a.tif", data, **BLOCKS), tmp_path / "a.jp2"]
     lossless = {"driver": "JP2OpenJPEG", "QUALITY": "100", "REVERSIBLE": "YES", "RESOLUTIONS": "4"}
     warnings.simplefilter("ignore")
-    with rasterio.open(paths[1], "w", width=side, height=side, count=1, dtype="uint16", **lossless) as out:
-        out.write(data, 1)
+    paths = [write_image(tmp_path / name, data, **how) for name, how in (("a.tif", BLOCKS), ("a.jp2", lossless))]
     found = [survey(path, 1) for path in paths]
     assert [known and known.levels for known in found] == [False, True]
     share = KeypointDensity(1.0, zoom)
@@ -230,12 +231,9 @@ def test_the_levels_of_a_jpeg_2000_show_the_same_places(tmp_path, zoom: int, sid
 
 @pytest.mark.parametrize(("side", "resolutions", "levels"), [(1024, 5, True), (512, 3, True), (512, 2, False)])
 def test_a_jpeg_2000_has_levels_where_every_second_and_fourth_pixel_are_stored(tmp_path, side, resolutions, levels):
-    rasterio = pytest.importorskip("rasterio")
     warnings.simplefilter("ignore")
-    layout = {"driver": "JP2OpenJPEG", "RESOLUTIONS": resolutions, "width": side, "height": side, "count": 1}
-    with rasterio.open(tmp_path / "a.jp2", "w", dtype="uint8", **layout) as out:
-        out.write(np.tile(np.arange(side, dtype=np.uint8), (side, 1)), 1)
-    found = survey(tmp_path / "a.jp2", 1)
+    ramp = np.tile(np.arange(side, dtype=np.uint8), (side, 1))
+    found = survey(write_image(tmp_path / "a.jp2", ramp, driver="JP2OpenJPEG", RESOLUTIONS=resolutions), 1)
     assert found is not None
     assert found.levels == levels
 
@@ -251,18 +249,6 @@ def decoded(log: list[tuple[int, str, tuple[int, int], tuple[int, int, int, int]
     shapes = {path: shape for _, path, shape, _, _ in log}
     whole = {path: -(-SIDE // shape[0]) * -(-SIDE // shape[1]) for path, shape in shapes.items()}
     return {path: sum(1 / zoom**2 for _, p, zoom, _, _ in blocks if p == path) / n for path, n in whole.items()}
-
-
-def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
-    """The view with its pixels in a file of another layout."""
-    rasterio = pytest.importorskip("rasterio")
-    path, size = folder / f"{view.name}.img", {"width": SIDE, "height": SIDE, "count": 1, "dtype": "uint16"}
-    with (
-        rasterio.open(view.path) as of,
-        rasterio.open(path, "w", **{"driver": "GTiff", **size, **layout}) as out,
-    ):
-        out.write(of.read())
-    return replace(view, path=str(path))
 
 
 @pytest.mark.parametrize(
@@ -283,7 +269,7 @@ def stored(view: View, folder: Path, layout: dict[str, Any]) -> View:
 def test_blocks_are_decoded_once_a_stage(pair, tmp_path, monkeypatch, layout, zoom, surveyed, found) -> None:
     """But for those in the margins; of JPEG 2000 the survey looks at every fourth pixel."""
     warnings.simplefilter("ignore")
-    views, options = [stored(view, tmp_path, layout) for view in pair], TieOptions(tile=512)
+    views, options = [altered(view, tmp_path, lambda d: d, **layout) for view in pair], TieOptions(tile=512)
     log: list[Any] = []
     opened: list[str] = []
     read, start = reading._RasterBand.read, reading.open_raster
@@ -325,18 +311,6 @@ def test_tiles_are_whole_strips_and_whole_blocks_where_decoding_is_dear(size, zo
     assert {w for _, _, w, _ in boxes} == widths
     assert {h for _, _, _, h in boxes} == heights
     assert sum(w * h for _, _, w, h in boxes) == size[0] * size[1]
-
-
-@pytest.mark.slow
-def test_a_wide_tile_is_searched_in_parts_without_a_seam(pair) -> None:
-    found = survey(pair[0].path, 1)
-    assert found is not None
-    wide = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 128))
-    whole = detect_tile(pair[0].path, (SIDE, SIDE), (0, 0, SIDE, 256), found, KeypointDensity(0.1, 1, 1024))
-    small = whole.scale < 8
-    seen = {tuple(p) for p in np.round(wide.xy, 1)}
-    assert np.mean([tuple(p) in seen for p in np.round(whole.xy[small], 1)]) > 0.95
-    assert len(wide) == len({(*p, a) for p, a in zip(map(tuple, wide.xy), wide.angle, strict=True)})
 
 
 def test_the_store_goes_with_the_run_folder(tmp_path) -> None:

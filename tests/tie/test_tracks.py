@@ -83,6 +83,11 @@ def many(count: int, views: int = 2, crowd: float = 1.0) -> Tracks:
     return tied(xy, 0.1)
 
 
+def both(a: Tracks, b: Tracks) -> Tracks:
+    columns = [a.view, b.view], [a.point, b.point + a.num_points], [a.xy, b.xy], [a.sigma, b.sigma]
+    return Tracks(*map(np.concatenate, columns))
+
+
 @pytest.mark.parametrize("crowd", [1.0, 3.0])
 def test_thinned_tracks_are_about_as_many_as_asked_for_and_cover_the_image_evenly(crowd: float) -> None:
     tracks = thin(many(20_000, crowd=crowd), [(1001, 1001)] * 2, 1000)
@@ -96,27 +101,15 @@ def test_thinned_tracks_are_about_as_many_as_asked_for_and_cover_the_image_evenl
 
 def test_long_and_accurate_tracks_are_kept_first() -> None:
     short, long = many(3000), many(300, 3)
-    joined = Tracks(
-        np.concatenate([short.view, long.view]),
-        np.concatenate([short.point, long.point + 3000]),
-        np.concatenate([short.xy, long.xy]),
-        np.concatenate([short.sigma, long.sigma]),
-    )
-    tracks = thin(joined, [(1001, 1001)] * 3, 600)
+    tracks = thin(both(short, long), [(1001, 1001)] * 3, 600)
     assert (np.bincount(tracks.point) == 3).sum() > 250
 
 
 def test_a_border_that_two_of_three_views_see_has_its_tracks() -> None:
     """The third view begins at column 127 of the others, where all tracks are short before: cells keep half."""
-    both, three = many(20_000), many(20_000, 3)
+    two, three = many(20_000), many(20_000, 3)
     three = three.select(np.repeat(three.xy[::3, 0] >= 127, 3))
-    joined = Tracks(
-        np.concatenate([both.view, three.view]),
-        np.concatenate([both.point, three.point + both.num_points]),
-        np.concatenate([both.xy, three.xy]),
-        np.concatenate([both.sigma, three.sigma]),
-    )
-    kept = thin(joined, [(1001, 1001)] * 3, 1000)
+    kept = thin(both(two, three), [(1001, 1001)] * 3, 1000)
     first = kept.xy[kept.view == 0]
     assert 700 <= len(first) <= 1000
     side = np.sqrt(4 * 1001**2 / 1000)
@@ -148,11 +141,6 @@ def test_among_equals_no_direction_is_preferred() -> None:
     place = ((kept.xy[kept.view == 0, 0] + 0.5) / side) % 1.0
     assert 0.45 < place.mean() < 0.55
     assert place.std() == pytest.approx(np.sqrt(1 / 12), abs=0.02)
-
-
-def test_few_tracks_are_not_thinned() -> None:
-    tracks = many(50)
-    assert thin(tracks, [(1001, 1001)] * 2, 50) is tracks
 
 
 def test_common_tracks_come_in_the_same_order() -> None:
