@@ -9,6 +9,7 @@ import pytest
 from rasterio.shutil import copy as raster_copy
 
 from barpc.rasters.raster import open_raster
+from barpc.rpcio.formats import FORMATS
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
 from barpc.rpcio.xml import rpc_items
 from barpc.sensor.rpc import RPC
@@ -30,6 +31,10 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RP
     coeffs[1::2, 0] = 1.0
     errors = {"err_bias": 3.1, "err_rand": 0.7} | changes
     return RPC(coeffs, [lon, lat, 166.6667], [0.0062, 0.0045, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors)
+
+
+WRITABLE = [row for row in FORMATS.values() if row.write is not None]
+each_written = pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
 
 
 @pytest.fixture
@@ -75,6 +80,24 @@ def grid(rpc: RPC) -> np.ndarray:
     """Ground points over an RPC's box (N, 3)."""
     t = np.linspace(-1, 1, 7)
     return np.stack(np.meshgrid(t, t, t), axis=-1).reshape(-1, 3) * rpc.ground_scale + rpc.ground_offset
+
+
+A_ORDER = "1 L P H LP LH PH LPH LL PP HH LLL LLP LLH LPP PPP PPH LHH PHH HHH"
+"""STDI-0002, table 8-1 (RPC00A)."""
+B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
+
+
+def polynomials(rpc: RPC, ground: np.ndarray, order: str = B_ORDER) -> np.ndarray:
+    """The four polynomials (4, N) at ground points (N, 3), an RPC's numbers summed in an order that is written out."""
+    L, P, H = ((ground - rpc.ground_offset) / rpc.ground_scale).T
+    value = {"1": np.ones(len(ground)), "L": L, "P": P, "H": H}
+    return rpc.coeffs @ np.array([np.prod([value[letter] for letter in word], axis=0) for word in order.split()])
+
+
+def in_order(rpc: RPC, ground: np.ndarray, order: str = B_ORDER) -> np.ndarray:
+    """Image points (N, 2) by these polynomials."""
+    col, col_den, row, row_den = polynomials(rpc, ground, order)
+    return np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
 
 
 def dimap_v2(rpc: RPC) -> str:
@@ -147,6 +170,15 @@ def enmap(rpc: RPC) -> str:
     return f"<level_X><product><navigation><RPC>{bands}</RPC></navigation></product></level_X>"
 
 
+def alos() -> str:
+    """Columns of an ALOS scene: offsets, scales, four times twenty coefficients."""
+    offsets = ["006500", "03550", "35.6812", "139.7671", "0500"]
+    scales = ["006501", "03551", "0.3000", "0.3500", "0510"]
+    head = (f"{cell:>{width}}" for cell, width in zip(offsets + scales, 2 * (6, 5, 8, 9, 5), strict=True))
+    numbers = (f"{value:+.5f}E-{i}" for value in (1.25, 2.25, 3.25, 4.25) for i in [*range(10)] * 2)
+    return "".join([*head, *(f"{number:>12}" for number in numbers)])
+
+
 def yaml(rpc: RPC) -> str:
     """What orthority writes."""
     fields = {key.lower(): values for key, values in fields_from_rpc(rpc).items()}
@@ -166,3 +198,14 @@ def envi(rpc: RPC) -> str:
     values = [v for key in (*OFFSETS, *SCALES, *COEFFICIENTS) for v in fields[key]] + [0, 0, 1]
     lines = [", ".join(map(repr, values[i : i + 4])) for i in range(0, 93, 4)]
     return "ENVI\nsamples = 60\nlines = 40\nrpc info = {\n  " + ",\n  ".join(lines) + "}\nbyte order = 0\n"
+
+
+DIALECTS = {
+    "dimap v1": dimap_v1,
+    "dimap v2": dimap_v2,
+    "dimap v3": dimap_v3,
+    "enmap": enmap,
+    "yaml": yaml,
+    "envi": envi,
+}
+"""Format, and which of its dialects, of those that are only read -> who writes it."""

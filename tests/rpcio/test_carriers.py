@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
 
 from barpc.base.errors import ImageError, MissingRpcError, RpcFormatError
@@ -26,12 +24,7 @@ from tests.rpcio.carriers import MAKERS, envi, gdal_pixels, pcidsk, seen_by_gdal
 from tests.rpcio.conftest import grid, make_rpc, pixels, rpc_domain, write_image
 from tests.rpcio.test_tiles import STRIP, strip, tile
 
-
-@pytest.fixture(autouse=True)
-def _no_georeference():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        yield
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
 @pytest.fixture
