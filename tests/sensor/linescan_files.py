@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef
+from barpc.sensor.linescan import read_linescan
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.samples import Linescan
 from barpc.simulate import Look, fly
 
 START = np.datetime64("2026-05-07T23:59:59.250000", "ns")
@@ -21,6 +25,13 @@ START = np.datetime64("2026-05-07T23:59:59.250000", "ns")
 SIZE = (4000, 20000)
 STEP = 0.02
 PITCH = 0.008
+
+
+def read(folder: Path, text: str, **choices: object) -> Linescan:
+    """The camera of a document."""
+    path = folder / "metadata.xml"
+    path.write_text(text)
+    return read_linescan(path, **choices)
 
 
 def words(values: Array) -> str:
@@ -81,6 +92,10 @@ class Truth:
             far = brentq(lambda s, o=o, d=d: ground_from_ecef(o + s * d)[2] - alt, 3e5, 1.2e6, xtol=1e-7)
             out.append(ground_from_ecef(o + far * d))
         return np.array(out)
+
+    def misses(self, model: Pushbroom, image: Array, alt: float = 500.0) -> float:
+        """How far off [px] a model sees the ground points of image points, at most."""
+        return float(np.abs(model.project(self.ground(image, alt)) - image).max())
 
 
 def inertial_sight(ground: Array, origin: Array, velocity: Array) -> Array:

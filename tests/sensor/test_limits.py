@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
@@ -239,11 +240,8 @@ def test_motions_of_many_views_are_those_of_each() -> None:
      ({"drift": np.zeros((1, 2))}, False), ({"drift": np.full((1, 3), np.nan)}, False)],
 )  # fmt: skip
 def test_rows_of_a_drift_are_finite_and_their_scale_is_not_zero(change: dict[str, Any], ok: bool) -> None:
-    if ok:
+    with nullcontext() if ok else pytest.raises(RpcError, match=r"correction rows|drift"):
         assert replace(drifting(), **change) != drifting()
-    else:
-        with pytest.raises(RpcError, match=r"correction rows|drift"):
-            replace(drifting(), **change)
 
 
 def test_a_correction_tells_its_turns_in_microradians() -> None:
@@ -430,11 +428,8 @@ def test_each_formation_states_the_range_and_its_rate_by_its_formula() -> None:
 )  # fmt: skip
 def test_a_radar_image_has_pixels_altitudes_spacing_and_a_side(change: dict[str, Any], ok: bool, tmp_path) -> None:
     model = sicd(tmp_path)
-    if ok:
+    with nullcontext() if ok else pytest.raises(RpcError, match="SICD"):
         assert replace(model, **change) != model
-    else:
-        with pytest.raises(RpcError, match="SICD"):
-            replace(model, **change)
 
 
 def sicd(folder: Any, kind: str = "PFA", change: tuple[str, str] = ("", "")) -> Monostatic:
@@ -502,11 +497,8 @@ def test_a_polynomial_of_a_document_has_powers_up_to_thirty(tmp_path) -> None:
     more = '<Coef exponent1="0" exponent2="{}">0.0</Coef></TimeCOAPoly>'
     for power, ok in (("30", True), ("31", False), ("1.0", False), ("", False), ("²", False)):
         path.write_text(text.replace("</TimeCOAPoly>", more.format(power)))
-        if ok:
+        with nullcontext() if ok else pytest.raises(RpcFormatError, match="of no power from 0 to 30"):
             assert open_sicd(path).formation.time.shape == (1, 31)
-        else:
-            with pytest.raises(RpcFormatError, match="of no power from 0 to 30"):
-                open_sicd(path)
     path.write_text(text.replace("<CollectType>MONOSTATIC</CollectType>", ""))
     assert open_sicd(path) == sicd(tmp_path)
     path.write_text(text.replace("RGAZIM", "RGAZIN"))
