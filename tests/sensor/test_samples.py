@@ -50,6 +50,14 @@ def refused(given: Samples, words: str, **how: object) -> None:
     assert "\n" not in str(told.value)
 
 
+def held(given: Samples, ok: bool, words: str, flight: Flight = FLIGHT) -> None:
+    """A camera of the flight's size is made of samples; or they are refused, in these words."""
+    if ok:
+        assert camera_of_samples(given, detector(flight)).size == flight.size
+    else:
+        refused(given, words, flight=flight)
+
+
 def test_the_camera_of_samples_is_the_one_that_was_flown() -> None:
     found = camera_of_samples(samples(), detector())
     assert found.size == SIZE
@@ -87,10 +95,7 @@ def test_beyond_slow_samples_a_camera_is_believed_for_a_second() -> None:
     assert len(rows) > 6
     for shift, ok in ((0.95, True), (1.05, False)):  # the samples come late by so much
         late = replace(flown, times=flown.times + shift, ticks=flown.ticks + shift)
-        if ok:
-            assert camera_of_samples(late, detector(slow)).size == slow.size
-        else:
-            refused(late, "the image lasts from 0.00", flight=slow)
+        held(late, ok, "the image lasts from 0.00", slow)
 
 
 @pytest.mark.parametrize("what", ["positions", "attitudes"])
@@ -155,10 +160,7 @@ def test_satellites_fly_between_6500_and_8000_km_from_the_earth_s_centre(radius:
     s = samples()
     scale = radius / np.linalg.norm(s.positions, axis=1).mean()
     moved = replace(s, positions=s.positions * scale, velocities=s.velocities * scale)
-    if ok:
-        assert camera_of_samples(moved, detector()).size == SIZE
-    else:
-        refused(moved, "no satellite's orbit; metres and ECEF are expected")
+    held(moved, ok, "no satellite's orbit; metres and ECEF are expected")
 
 
 @pytest.mark.parametrize(("off", "ok"), [(690.0, True), (710.0, False)])
@@ -167,10 +169,7 @@ def test_a_stated_velocity_may_be_that_of_the_inertial_frame(off: float, ok: boo
     s = samples()
     velocities = s.velocities.copy()
     velocities[9] += off * np.array([0.6, 0.0, -0.8])
-    if ok:
-        assert camera_of_samples(replace(s, velocities=velocities), detector()).size == SIZE
-    else:
-        refused(replace(s, velocities=velocities), "otherwise than their stated velocities; are the times right")
+    held(replace(s, velocities=velocities), ok, "otherwise than their stated velocities; are the times right")
     velocities = s.velocities.copy()
     velocities[[0, -1]] += 5000.0  # of differences to one side nothing is asked
     assert camera_of_samples(replace(s, velocities=velocities), detector()).size == SIZE
@@ -183,10 +182,7 @@ def test_no_satellite_turns_by_a_third_of_a_radian_a_second(rate: float, ok: boo
     jump = np.where(np.arange(len(s.ticks)) < 40, 0.0, rate * 0.02)[:, None] * [0.0, 0.0, 1.0]
     body = FLIGHT.body * Rotation.from_rotvec(jump)
     q = body.as_quat(scalar_first=True) * np.where(np.arange(len(s.ticks)) % 2, 1.0, -1.0)[:, None]
-    if ok:
-        assert camera_of_samples(replace(s, quaternions=q), detector()).size == SIZE
-    else:
-        refused(replace(s, quaternions=q), r"turns by 0.3\d* rad/s at 0.74 s, as no satellite does")
+    held(replace(s, quaternions=q), ok, r"turns by 0.3\d* rad/s at 0.74 s, as no satellite does")
 
 
 @pytest.mark.parametrize(("length", "ok"), [(0.9992, True), (1.0008, True), (0.998, False), (1.002, False)])
