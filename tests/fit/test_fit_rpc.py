@@ -124,7 +124,7 @@ def test_a_flat_scene_keeps_its_altitude_terms(camera: Camera) -> None:
 def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> None:
     fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(method="lcurve-joint"))
     assert fit.rmse_ckp.max() <= 2e-4
-    assert fit.h[0] == fit.h[1]
+    assert fit.h[0] == fit.h[1] > 0
 
 
 def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> None:

@@ -179,13 +179,6 @@ def test_the_tolerance_decides_whether_a_fit_is_accepted(camera: Camera) -> None
         fit_rpc(model, camera.size, camera.alt_range, options=FitOptions(method="ridge", tolerance=most * 0.99))
 
 
-def test_joint_fits_share_one_regularisation(camera: Camera) -> None:
-    model: Any = Shaking(camera, 0.3)
-    options = FitOptions(method="lcurve-joint", grid=(6, 6, 4))
-    col, row = fit_rpc(model, camera.size, (0.0, 900.0), options=options, strict=False).h
-    assert col == row > 0
-
-
 def test_points_of_a_strip_are_as_mirrored_as_the_whole(camera: Camera) -> None:
     ground, image = random_points(camera, 2000, np.random.default_rng(0))
     strip = image[:, 1] < 0.15 * camera.size[1]  # its pixels are as square as those of the whole
@@ -320,16 +313,6 @@ def test_the_round_trip_is_measured_in_pixels() -> None:
     assert roundtrip(Off(rpc), ground) == pytest.approx(expected, rel=1e-4)  # type: ignore[arg-type]
     assert roundtrip(rpc, ground) < 1e-6
     assert roundtrip(rpc, np.array([[5.4, 43.2, np.nan]])) == float("inf")
-
-
-def test_coverage_is_the_share_of_the_image_inside_the_hull() -> None:
-    low, high = np.array([-0.5, -0.5]), np.array([999.5, 499.5])
-    corners = np.array([[-0.5, -0.5], [999.5, -0.5], [999.5, 499.5], [-0.5, 499.5]])
-    assert coverage(corners, low, high) == 1.0
-    assert coverage(corners * [0.5, 1.0], low, high) == pytest.approx(0.5, abs=0.03)
-    assert coverage(corners[:3], low, high) == pytest.approx(0.5, abs=0.06)
-    many = np.random.default_rng(0).uniform(low, low + 0.5 * (high - low), (3000, 2))
-    assert coverage(many, low, high) == pytest.approx(0.25, abs=0.03)
 
 
 @pytest.mark.parametrize("step", [1, 3, 8])

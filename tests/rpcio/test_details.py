@@ -491,15 +491,6 @@ def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool,
     assert read_acquisition(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
 
 
-def test_a_correction_grid_whose_nodes_lie_nowhere_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a_correction.tif"
-    write_correction(correction(), make_rpc(), path)
-    with rasterio.open(path, "r+") as file:
-        file.write(np.full((5, 6), 1e30, np.float32), 1)
-    with pytest.raises(RpcFormatError, match="a node of it is no image point, or has no displacement"):
-        read_correction(path)
-
-
 @pytest.mark.parametrize(("rows", "words"), [(8192, "no correction grid"), (8193, "1073872896 bytes, too large for")])
 def test_a_correction_grid_is_held_to_what_its_numbers_become(rows: int, words: str, tmp_path: Path) -> None:
     """Nodes are kept in four bytes and worked on in eight: a gigabyte of them is the most. None is written here."""

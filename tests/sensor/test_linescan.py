@@ -22,7 +22,7 @@ from barpc.scene import View
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import STRAIGHT, Light
-from tests.sensor.linescan_files import START, Flight, dimap, inertial_sight, isd, read
+from tests.sensor.linescan_files import Flight, dimap, inertial_sight, isd, read
 
 FLIGHT = Flight()
 IMAGE = np.array([[0.0, 0.0], [3999.0, 0.0], [1234.5, 7000.25], [0.0, 19999.0], [3999.0, 19999.0], [2000.0, 333.0]])
@@ -191,39 +191,6 @@ def test_a_dimap_says_what_bends_its_light(tmp_path, speed, air, light):
     text = text.replace("<Raster_Data>", part.format(said) + "</Processing_Information><Raster_Data>")
     assert read(tmp_path, text).model.light == light
     assert read(tmp_path, text, aberration=False, refraction=False).model.light == STRAIGHT
-
-
-def _shaken(text, noise, first=2):
-    """The document with noise [m] on its positions, and without those before the `first`."""
-    rng = np.random.default_rng(8)
-    points = re.findall(r"<Point>.*?</Point>", text)
-    for k, point in enumerate(points):
-        place = [float(v) for v in re.search(r"<LOCATION_XYZ>(.*?)<", point)[1].split()]
-        moved = " ".join(repr(float(v)) for v in place + rng.normal(0, noise, 3))
-        new = re.sub(r"<LOCATION_XYZ>.*?<", f"<LOCATION_XYZ>{moved}<", point)
-        text = text.replace(point, new if k >= first else "")
-    return text
-
-
-def test_dense_positions_scatter_about_an_orbit(tmp_path):
-    text, truth = dimap(Flight(swing=0.0), poly=False)
-    clean = read(tmp_path, text).model
-    model = read(tmp_path, _shaken(text, 0.003, first=3)).model  # the first sample is one step behind row 0
-    rows = np.linspace(0, 19999, 50)
-    off = np.linalg.norm(model.position(rows) - clean.position(rows), axis=-1)
-    assert 1e-4 < off.max() < 0.006
-    assert truth.misses(model, IMAGE) < 0.02
-
-
-def test_positions_that_no_orbit_follows_are_taken_as_they_are(tmp_path):
-    text = _shaken(dimap(FLIGHT, poly=False)[0], 0.1)
-    model = read(tmp_path, text).model
-    points = re.findall(r"<TIME>(\S+?)Z</TIME><LOCATION_XYZ>(.*?)<", text)
-    assert len(points) > 30
-    for stated, place in points[3:-3:5]:
-        time = (np.datetime64(stated, "ns") - START) / np.timedelta64(1, "ns") * 1e-9
-        at = model.position(time / model.line_period)
-        np.testing.assert_allclose(at, [float(v) for v in place.split()], rtol=0, atol=1e-5)
 
 
 def test_commas_may_stand_between_coordinates(tmp_path):

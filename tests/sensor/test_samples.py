@@ -202,10 +202,13 @@ def test_positions_that_scatter_by_millimetres_are_smoothed_by_centimetres_not(n
     s = samples()
     rng = np.random.default_rng(0)
     shaken = s.positions + rng.normal(0, noise, s.positions.shape)
-    orbit = camera_of_samples(replace(s, positions=shaken), detector()).model.orbit
+    model = camera_of_samples(replace(s, positions=shaken), detector()).model
+    orbit = model.orbit
     off = np.abs(orbit(s.times)[0].T - shaken)[3:-3].max()
     assert (off > noise) == smoothed
     assert (len(orbit.coeffs) == 1) == smoothed
+    seen = model.project(FLIGHT.sensor.localize(IMAGE, np.full(4, 300.0)))
+    assert (np.abs(seen - IMAGE).max() < 0.02) == smoothed
     if not smoothed:
         assert off < 1e-6
 
