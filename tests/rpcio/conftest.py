@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rasterio.shutil import copy as raster_copy
 
+from barpc.cli import main
 from barpc.rasters.raster import open_raster
 from barpc.rpcio.formats import FORMATS
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
@@ -46,6 +47,13 @@ def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile
     """A raster of known pixels; keywords go to rasterio."""
     data = np.random.default_rng(5).integers(0, 60000, shape).astype(profile.pop("dtype", "uint16"))
     return geotiffs.write_image(path, data, **profile)
+
+
+def ended(*words: object) -> int:
+    """The code with which a command line ends."""
+    with pytest.raises(SystemExit) as stop:
+        main([*map(str, words)])
+    return int(stop.value.code or 0)
 
 
 def pixels(path: Path) -> np.ndarray:

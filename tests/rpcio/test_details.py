@@ -164,22 +164,9 @@ def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> No
 # --- rasters ---------------------------------------------------------------------------------------------------
 
 
-def mosaic(folder: Path) -> Path:
-    """A VRT written here: its pixels are those of scene.tif."""
-    write_image(folder / "scene.tif")
-    write_rpc_vrt(make_rpc(), folder / "scene.tif", folder / "scene.vrt")
-    return folder / "scene.vrt"
-
-
-def test_a_vrt_is_copied_with_its_pixels(tmp_path: Path) -> None:
-    rpc = make_rpc().crop(1.0, 2.0)
-    write_rpc_copy(rpc, mosaic(tmp_path), tmp_path / "copy.tif")
-    assert read_rpc(tmp_path / "copy.tif").off(rpc).max() < 1e-9
-    np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(tmp_path / "scene.tif"))
-
-
 def test_a_vrt_of_a_vrt_points_at_the_image_and_shows_the_same_part(tmp_path: Path) -> None:
-    path = mosaic(tmp_path)
+    path = tmp_path / "scene.vrt"
+    write_rpc_vrt(make_rpc(), write_image(tmp_path / "scene.tif"), path)
     write_rpc_vrt(make_rpc(), path, tmp_path / "again.vrt")
     assert "scene.tif" in (tmp_path / "again.vrt").read_text()
     text = path.read_text()
