@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.sensor.centers import camera_center
-from barpc.sensor.corrected import Corrected, Correction, RigidMotion
+from barpc.sensor.corrected import Corrected, Correction, RigidMotion, correction_of
 from barpc.sensor.curve import Curve, about_middle, rotation_matrix
 from barpc.sensor.document import XmlFields, parse_time, seconds
 from barpc.sensor.geometry import Several, image_border, lines_of_sight, view_angles
@@ -238,14 +238,54 @@ def test_motions_of_many_views_are_those_of_each() -> None:
     np.testing.assert_array_equal(*still)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-4, 0.3, 3.0])
+def test_the_rotation_matrix_is_scipys(angle: float) -> None:
+    vector = angle * np.array([0.6, -0.48, 0.64])
+    np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
+
+
+def test_a_similarity_of_the_ground_is_undone_before_the_camera_sees_it() -> None:
+    rpc = make_rpc()
+    xy = np.array([[3000.0, 4000.0], [12000.0, 800.0], [9000.0, 15000.0]])
+    ground = rpc.localize(xy, np.array([100.0, 700.0, 400.0]))
+    ecef = ecef_from_ground(ground)
+    turn = 1.00003 * Rotation.from_rotvec([1e-4, 2e-4, -3e-4]).as_matrix()
+    matrix = np.column_stack([turn, ecef[0] + [70.0, -20.0, 35.0] - turn @ ecef[0]])
+    there = ground_from_ecef(ecef @ matrix[:, :3].T + matrix[:, 3])
+    model = Corrected(rpc, correction_of(matrix, ecef[1]))
+    np.testing.assert_allclose(model.project(there), xy, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(model.localize(xy, there[:, 2]), there, rtol=0, atol=1e-9)
+    assert np.abs(model.project(ground) - xy).min() > 1
+
+
+@pytest.mark.parametrize("lon", [-179.999, 5.4, 179.999])
+def test_a_point_is_localised_where_the_equation_projects_it_at_its_altitude_and_longitude(lon: float) -> None:
+    rpc = make_rpc(lon)
+    middle = ecef_from_ground(rpc.ground_offset)
+    turn, move, center = np.array([3e-6, -2e-5, 1e-5]), np.array([40.0, -25.0, 60.0]), 1.1 * middle
+    camera = Corrected(rpc, Correction(turn, move, center, scale=1.00001))
+    image = np.random.default_rng(4).uniform(0, 19000, (50, 2))
+    alt = np.linspace(0.0, 1000.0, 50)
+    ground = camera.localize(image, alt)
+    np.testing.assert_array_equal(ground[:, 2], alt)
+    assert np.abs(ground[:, 0] - lon).max() < 1.0  # not a turn away
+    # equation 7 by scipy's rotation, and the projection of the RPC as delivered
+    ecef = ecef_from_ground(ground)
+    moved = 1.00001 * Rotation.from_rotvec(turn).apply(ecef - move - center) + center
+    np.testing.assert_allclose(rpc.project(ground_from_ecef(moved)), image, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize(
-    ("change", "ok"),
-    [({"row_scale": 0.0}, False), ({"row_scale": -5.0}, True), ({"row_scale": np.inf}, False),
-     ({"row_offset": np.nan}, False),
-     ({"drift": np.zeros((1, 2))}, False), ({"drift": np.full((1, 3), np.nan)}, False)],
+    ("change", "words"),
+    [({"row_scale": 0.0}, "correction rows"), ({"row_scale": -5.0}, ""), ({"row_scale": np.inf}, "correction rows"),
+     ({"row_offset": np.nan}, "correction rows"),
+     ({"rotation": [1.0, 2.0]}, "rotation"), ({"rotation": [np.nan, 0.0, 0.0]}, "rotation"),
+     ({"drift": np.zeros((1, 2))}, "drift"), ({"drift": np.full((1, 3), np.nan)}, "drift")],
 )  # fmt: skip
-def test_rows_of_a_drift_are_finite_and_their_scale_is_not_zero(change: dict[str, Any], ok: bool) -> None:
-    with nullcontext() if ok else pytest.raises(RpcError, match=r"correction rows|drift"):
+def test_a_correction_is_of_finite_numbers_and_its_scale_of_rows_is_not_zero(
+    change: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(RpcError, match=words) if words else nullcontext():
         assert replace(drifting(), **change) != drifting()
 
 
@@ -397,16 +437,17 @@ def test_each_formation_states_the_range_and_its_rate_by_its_formula() -> None:
 @pytest.mark.parametrize(
     ("change", "ok"),
     [
-        ({"size": (1, 1)}, True), ({"size": (0, 5)}, False), ({"alt_range": (3.0, 3.0)}, True),
-        ({"alt_range": (3.0, 2.0)}, False),
+        ({"size": (1, 1)}, True), ({"size": (0, 5)}, False), ({"size": (1, 0)}, False),
+        ({"alt_range": (3.0, 3.0)}, True), ({"alt_range": (3.0, 2.0)}, False),
         ({"spacing": (0.0, 1.0)}, False), ({"spacing": (1.0, -1.0)}, False), ({"look": "left"}, True),
-        ({"look": "R"}, False),
+        ({"look": "R"}, False), ({"look": "Left"}, False),
     ],
 )  # fmt: skip
 def test_a_radar_image_has_pixels_altitudes_spacing_and_a_side(change: dict[str, Any], ok: bool, tmp_path) -> None:
-    model = sicd(tmp_path)
-    with nullcontext() if ok else pytest.raises(RpcError, match="SICD"):
-        assert replace(model, **change) != model
+    for model, words in ((sicd(tmp_path), "SICD"), (MODELS["range-doppler"]().model, "Range-Doppler model")):
+        if hasattr(model, *change):
+            with nullcontext() if ok else pytest.raises(RpcError, match=words):
+                assert replace(model, **change) != model
 
 
 def sicd(folder: Any, kind: str = "PFA", change: tuple[str, str] = ("", "")) -> Monostatic:

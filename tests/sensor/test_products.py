@@ -291,22 +291,6 @@ def test_the_model_of_a_swath_has_the_numbers_of_its_annotation(first):
         assert words in repr(replace(model, alt_range=(-100.0, 900.0)))
 
 
-@pytest.mark.parametrize(
-    ("change", "ok"),
-    [
-        ({"size": (1, 1)}, True),
-        ({"size": (1, 0)}, False),
-        ({"alt_range": (5.0, 5.0)}, True),
-        ({"alt_range": (5.0, 4.0)}, False),
-        ({"look": "left"}, True),
-        ({"look": "Left"}, False),
-    ],
-)
-def test_a_model_has_pixels_altitudes_and_a_side(change, ok):
-    with nullcontext() if ok else pytest.raises(RpcError, match="Range-Doppler model"):
-        assert replace(IW["IW1"].model(), **change) != IW["IW1"].model()
-
-
 def test_bistatic_corrections_are_half_the_range_time_less_than_their_constants(first):
     """As the grid tells the first, to whole microseconds; the other from rank times pulse interval."""
     plain = RangeDoppler.from_annotation(first)
