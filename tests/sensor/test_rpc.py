@@ -16,7 +16,7 @@ from barpc.rpcio import read_rpc
 from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.lanes import rest_slow
-from tests.sensor.conftest import make_rpc
+from tests.sensor.conftest import make_rpc, slopes_off
 
 VENDORS = [
     "optical/phr_triplet_north/img_01.tif",
@@ -104,14 +104,9 @@ def test_a_point_found_far_out_lies_on_the_sheet_of_the_centre(file, shared_data
 def test_the_jacobian_is_the_central_difference(file, shared_data):
     rpc = read_rpc(shared_data / file)
     ground = rpc.localize(*box(rpc, 0.9, 200))
-    value, jacobian = rpc.project_jacobian(ground)
+    value, _ = rpc.project_jacobian(ground)
     np.testing.assert_allclose(value, rpc.project(ground), rtol=0, atol=1e-9 + 1e-13 * np.abs(value).max())
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = 1e-4 * abs(rpc.ground_scale[axis])
-        numeric = (rpc.project(ground + step) - rpc.project(ground - step)) / (2 * step[axis])
-        scale = np.abs(jacobian[:, :, axis]).max()
-        np.testing.assert_allclose(jacobian[:, :, axis], numeric, rtol=0, atol=2e-6 * scale)
+    assert slopes_off(rpc, ground, 1e-4 * np.abs(rpc.ground_scale)) < 2e-6
 
 
 def test_a_chunk_border_shows_nowhere():
