@@ -76,8 +76,9 @@ def test_a_grid_on_the_ground_reaches_the_rounding_of_coordinates_too(camera: Ca
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-def test_the_error_does_not_grow_with_the_area(some_vendors: list[Camera]) -> None:
-    for camera in some_vendors:
+@pytest.mark.parametrize("third", rest_slow([0, 1, 2]))
+def test_the_error_does_not_grow_with_the_area(vendors: list[Camera], third: int) -> None:
+    for camera in vendors[third::3]:
         if camera.name == PECULIAR:
             continue
         errors = []

@@ -108,15 +108,17 @@ def in_order(rpc: RPC, ground: np.ndarray, order: str = B_ORDER) -> np.ndarray:
     return np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
 
 
+def _numbered(name: str, values: list[float]) -> str:
+    return "".join(f"<{name}_{i}>{value!r}</{name}_{i}>" for i, value in enumerate(values, 1))
+
+
 def dimap_v2(rpc: RPC) -> str:
     """Pleiades' XML: 1-based offsets, and a direct model that is somebody else's."""
     fields = fields_from_rpc(rpc)
-    model = "".join(
-        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
-    )
+    model = "".join(_numbered(key, fields[key]) for key in COEFFICIENTS)
     shift = {"LINE_OFF": 1, "SAMP_OFF": 1}
     validity = "".join(f"<{k}>{fields[k][0] + shift.get(k, 0)!r}</{k}>" for k in OFFSETS + SCALES)
-    direct = "".join(f"<{key}_{i}>7.5</{key}_{i}>" for key in COEFFICIENTS for i in range(1, 21))
+    direct = "".join(_numbered(key, [7.5] * 20) for key in COEFFICIENTS)
     return (
         '<?xml version="1.0" encoding="UTF-8"?><Dimap_Document><Rational_Function_Model><Global_RFM>'
         f"<Direct_Model>{direct}</Direct_Model><Inverse_Model>{model}<ERR_BIAS_ROW>0.001</ERR_BIAS_ROW>"
@@ -128,9 +130,7 @@ def dimap_v2(rpc: RPC) -> str:
 def dimap_v3(rpc: RPC) -> str:
     """Pleiades Neo's XML: 0-based offsets, other names."""
     fields = fields_from_rpc(rpc)
-    model = "".join(
-        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
-    )
+    model = "".join(_numbered(key, fields[key]) for key in COEFFICIENTS)
     validity = "".join(f"<{k}>{fields[k][0]!r}</{k}>" for k in OFFSETS + SCALES)
     return (
         "<Dimap_Document><Rational_Function_Model><Global_RFM>"
@@ -172,8 +172,7 @@ def enmap(rpc: RPC) -> str:
             items += f"<{rename.get(axis, axis)}_{kind}>{fields[key][0]!r}</{rename.get(axis, axis)}_{kind}>"
         for key in COEFFICIENTS:
             axis, part, _ = key.split("_")
-            name = f"{rename[axis]}_{part}"
-            items += "".join(f"<{name}_{i}>{v!r}</{name}_{i}>" for i, v in enumerate(fields[key], 1))
+            items += _numbered(f"{rename[axis]}_{part}", fields[key])
         bands += f'<bandID number="{band}">{items}</bandID>'
     return f"<level_X><product><navigation><RPC>{bands}</RPC></navigation></product></level_X>"
 
