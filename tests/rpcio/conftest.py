@@ -178,8 +178,8 @@ def enmap(rpc: RPC) -> str:
 
 
 def alos() -> str:
-    """Columns of an ALOS scene: offsets, scales, four times twenty coefficients."""
-    offsets = ["006500", "03550", "35.6812", "139.7671", "0500"]
+    """Columns of an ALOS scene: offsets that fill them, scales, four times twenty coefficients."""
+    offsets = ["006500", "03550", "-35.6812", "-139.7671", "00500"]
     scales = ["006501", "03551", "0.3000", "0.3500", "0510"]
     head = (f"{cell:>{width}}" for cell, width in zip(offsets + scales, 2 * (6, 5, 8, 9, 5), strict=True))
     numbers = (f"{value:+.5f}E-{i}" for value in (1.25, 2.25, 3.25, 4.25) for i in [*range(10)] * 2)

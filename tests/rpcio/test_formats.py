@@ -162,7 +162,7 @@ def test_alos_columns_are_read(tmp_path):
     path.write_text(alos() + "\r\n")
     source = read_rpc_source(path)
     assert source.format == "alos"
-    np.testing.assert_array_equal(source.rpc.ground_offset, [139.7671, 35.6812, 500.0])
+    np.testing.assert_array_equal(source.rpc.ground_offset, [-139.7671, -35.6812, 500.0])
     np.testing.assert_array_equal(source.rpc.ground_scale, [0.35, 0.3, 510.0])
     np.testing.assert_array_equal(source.rpc.image_offset, [3550.0, 6500.0])
     np.testing.assert_array_equal(source.rpc.image_scale, [3551.0, 6501.0])
