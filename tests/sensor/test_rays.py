@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import RpcError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit, up
+from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.pushbroom import STRAIGHT, Light, Pushbroom
 from tests.sensor.conftest import slopes
@@ -267,7 +268,9 @@ def test_a_camera_tells_its_height_its_pace_and_for_how_long_it_is_known() -> No
     assert CASES["curved"].advice == ""
     times = np.linspace(*CASES["curved"].attitude.knots, 9)
     sampled = Curve.through(times, CASES["curved"].attitude(times)[0].T)
-    assert "which no RPC represents" in replace(CASES["curved"], attitude=sampled).advice
+    swinging = replace(CASES["curved"], attitude=sampled)
+    assert "which no RPC represents" in swinging.advice
+    assert Corrected(swinging, Correction(np.zeros(3), np.zeros(3), np.zeros(3))).advice == swinging.advice
 
 
 def test_the_vertical_of_the_oracle_is_that_of_the_ellipsoid() -> None:
