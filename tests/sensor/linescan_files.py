@@ -115,7 +115,6 @@ def isd(
     angle: float = 0.0,
     along: float = 0.0,
     camera: Rotation | None = None,
-    covariance: bool = True,
 ) -> tuple[str, Truth]:
     """Maxar's XML, of a detector turned by `angle` [deg] and `along` [mm] before the axis, in a turned camera."""
     distance = PITCH * flight.look.altitude / 0.5
@@ -123,8 +122,7 @@ def isd(
     camera = camera or Rotation.identity()
     body = (flight.body * camera.inv()).as_quat()
     body[::3] *= -1  # the same rotations
-    cov = [4e-12, 0, 0, 0, 3e-12, 0, 0, 2e-12, 0, 3e-12] if covariance else []
-    eph = [0.01, 0, 0, 0.02, 0, 0.03] if covariance else []
+    cov, eph = [4e-12, 0, 0, 0, 3e-12, 0, 0, 2e-12, 0, 3e-12], [0.01, 0, 0, 0.02, 0, 0.03]
     n = range(len(flight.times))
     tables = {
         "EPH": [[k + 1, *flight.positions[k], *flight.velocities[k], *eph] for k in n],

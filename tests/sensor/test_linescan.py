@@ -12,13 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from barpc.ba.parameters.priors import prior_sigmas
 from barpc.base.errors import FitError, InputError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, enu_basis
-from barpc.base.options import AdjustOptions
 from barpc.fit import fit_rpc
 from barpc.rpcio import read_rpc
-from barpc.scene import View
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.pushbroom import STRAIGHT, Light
 from tests.sensor.linescan_files import Flight, dimap, inertial_sight, isd, read
@@ -74,17 +71,6 @@ def test_refraction_is_that_of_a_ray_through_the_air(tmp_path, alt):
     bent = np.trapezoid(np.tan(zenith) - np.tan(np.arcsin(sine)), heights)
     assert bent == pytest.approx(1.3 * np.exp(-alt / 8e3), rel=0.1)
     assert shift[:2] @ to_nadir[:2] / np.hypot(*to_nadir[:2]) == pytest.approx(bent, rel=0.05)
-
-
-def test_stated_covariances_are_the_priors_of_the_view(tmp_path):
-    found = read(tmp_path, isd(FLIGHT)[0])
-    view = View("a", "", found.size, found.model, (0.0, 500.0))
-    far = np.linalg.norm(found.model.position(10000) - ecef_from_ground(found.model.localize(IMAGE[2], np.array(0.0))))
-    wanted = [2 * np.sqrt(12e-12 / 3) * far] * 3 + [np.sqrt(0.02)] * 3
-    np.testing.assert_allclose(prior_sigmas((view,), AdjustOptions(), 0, None, 0), [wanted], rtol=1e-3)
-    assert prior_sigmas((view,), AdjustOptions(sigma_attitude=3.0), 0, None, 0)[0, 0] == 3.0
-    silent = replace(view, sensor=read(tmp_path, isd(FLIGHT, covariance=False)[0]).model)
-    np.testing.assert_array_equal(prior_sigmas((silent,), AdjustOptions(), 0, None, 0), np.full((1, 6), 7.5))
 
 
 # What the files of two satellites say, against their RPC over five altitudes: mean and spread [px]. Both were put
