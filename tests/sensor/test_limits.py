@@ -289,11 +289,6 @@ def test_a_correction_is_of_finite_numbers_and_its_scale_of_rows_is_not_zero(
         assert replace(drifting(), **change) != drifting()
 
 
-def test_a_correction_tells_its_turns_in_microradians() -> None:
-    told = repr(Correction([3e-6, 0.0, 4e-6], [0.0, 2.0, 0.0], [0.0, 0.0, 7e6], [[0.0, 1.5e-6, 0.0]]))
-    assert "rotation 5 urad, translation 2 m, drift 1.5 urad" in told
-
-
 def test_an_image_is_corrected_by_a_shift_and_a_slope() -> None:
     affine = ImageAffine([3.0, -4.0], [[0.01, 0.02], [-0.03, 0.04]])
     model, ground = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -240,14 +239,8 @@ def test_a_point_found_far_out_may_be_off_by_the_rounding_of_its_pixel(col):
 
 def test_an_rpc_tells_its_box():
     rpc = RPC(make_rpc().coeffs, [5.0, 43.0, 500.0], [-0.25, 0.5, 400.0], [1000.0, 900.0], [-1100.0, 950.0])
-    for words in (
-        "lon 4.7500 to 5.2500",
-        "lat 42.5000 to 43.5000",
-        "100 to 900 m",
-        "col -100 to 2100",
-        "row -50 to 1850",
-    ):
-        assert words in repr(rpc)
+    ground = "lon 4.7500 to 5.2500, lat 42.5000 to 43.5000, 100 to 900 m"
+    assert repr(rpc) == f"RPC({ground}, col -100 to 2100, row -50 to 1850)"
 
 
 def test_rpcs_are_off_by_what_their_image_points_are_apart_over_the_box():
@@ -284,14 +277,12 @@ def test_a_crop_and_a_window_of_step_one_are_the_same_to_the_bit():
     np.testing.assert_array_equal(rpc.crop(3, 4).image_offset, rpc.image_offset - [3, 4])
 
 
-def test_equality_and_hash_go_by_content_and_survive_pickling():
+def test_equality_goes_by_content_of_which_the_inverse_that_is_kept_is_no_part():
+    """Of arrays, hashes and pickles: `tests/base/test_frozen.py`."""
     rpc, twin = make_rpc(), make_rpc()
-    rpc.localize([[1.0, 2.0]], [0.0])  # the inverse that is kept is no part of the content
-    assert rpc == twin
-    assert hash(rpc) == hash(twin)
-    assert pickle.loads(pickle.dumps(rpc)) == rpc
+    rpc.localize([[1.0, 2.0]], [0.0])
+    assert (rpc, hash(rpc)) == (twin, hash(twin))
     assert rpc != replace(rpc, err_bias=None)
-    assert rpc != replace(rpc, image_offset=rpc.image_offset + 1e-9)
 
 
 @pytest.mark.parametrize(
