@@ -71,8 +71,8 @@ def first() -> Annotation:
 @pytest.mark.parametrize(
     ("there", "taken", "given"),
     [
-        (("vh", "vv"), "vv", "folder"), (("hh", "hv"), "hh", "zip"), (("vh", "hv"), "vh", "manifest"),
-        (("hv",), "hv", "zip"), (("hh", "vh"), "hh", "folder"),
+        (("vh", "vv"), "vv", "folder"), (("hh", "hv"), "hh", "zip"), (("hh", "vh"), "hh", "folder"),
+        (("hv",), "hv", "zip"), (("vh", "hv"), "vh", "manifest"),
     ],
 )  # fmt: skip
 def test_of_several_polarisations_the_one_sent_and_received_alike_is_taken(tmp_path, there, taken, given):
