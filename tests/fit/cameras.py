@@ -9,6 +9,7 @@ import numpy as np
 
 from barpc.base.errors import BarpcError
 from barpc.base.geodesy import Array, ecef_from_ground
+from barpc.fit import Normalization
 from barpc.rasters.raster import open_raster
 from barpc.rpcio import read_rpc
 from barpc.sensor.centers import camera_center
@@ -25,6 +26,12 @@ class Camera:
     model: Corrected
     size: tuple[int, int]
     alt_range: tuple[float, float]
+
+    @property
+    def norm(self) -> Normalization:
+        """The offsets and scales of the RPC."""
+        rpc = self.rpc
+        return Normalization(rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
 
 
 def synthetic_rpc(lon: float = 5.4, lat: float = 43.2, seed: int = 3) -> RPC:

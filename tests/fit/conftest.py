@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from tests.fit.cameras import Camera, synthetic, vendor
-from tests.lanes import rest_slow
 
 
 @pytest.fixture(scope="session")
@@ -20,9 +19,3 @@ def camera() -> Camera:
 def vendors(shared_data: Path) -> list[Camera]:
     """P_BA of every vendor's RPC."""
     return vendor(shared_data)
-
-
-@pytest.fixture(params=rest_slow([0, 1, 2]))
-def some_vendors(request: pytest.FixtureRequest, vendors: list[Camera]) -> list[Camera]:
-    """A third of the vendors' cameras: before a commit one of them."""
-    return vendors[request.param :: 3]

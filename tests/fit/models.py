@@ -143,6 +143,11 @@ def waves(rows: int, cycles: float, height: float) -> Callable[[Array], Array]:
     return moves
 
 
+def quotient(x: Array, basis: Array) -> Array:
+    """Values (N,) of a numerator (20) and a denominator (19 behind a 1) `x` (39,) of terms (20, N)."""
+    return (x[:20] @ basis) / (np.append(1.0, x[20:]) @ basis)
+
+
 SIZE = (20000, 20000)
 RANGE = (0.0, 1500.0)
 
@@ -150,34 +155,22 @@ RANGE = (0.0, 1500.0)
 @cache
 def hard() -> dict[str, tuple[object, tuple[int, int], tuple[float, float]]]:
     """Name -> model, size, altitude range: what a cubic RPC cannot follow to a thousandth of a pixel."""
-    found = {
-        "frame, k1 -0.1": (
-            Frame(5.4, 43.2, 5000.0, 12000.0, (14000, 10000), -0.1),
-            (14000, 10000),
-            (0.0, 600.0),
-        ),
-        "frame, k1 0.02": (
-            Frame(5.4, 43.2, 5000.0, 12000.0, (14000, 10000), 0.02),
-            (14000, 10000),
-            (0.0, 600.0),
-        ),
+    wide, low = (14000, 10000), (0.0, 600.0)
+    smooth = pushbroom(45.0)
+    bends = {
+        "distortion": lambda p: 3e-13 * (p - 1e4) ** 3 + 2e-17 * (p - 1e4) ** 4,
+        **{f"waves {cycles:g}": waves(20000, cycles, 0.5) for cycles in (0.25, 1.0, 7.0, 60.0)},
+        "bump": bump(SIZE, 250.0, 0.5, (0.37, 0.61)),
+        "bump in a corner": bump(SIZE, 250.0, 0.5, (0.01, 0.99)),
+    }
+    return {
+        **{f"frame, k1 {k1:g}": (Frame(5.4, 43.2, 5000.0, 12000.0, wide, k1), wide, low) for k1 in (-0.1, 0.02)},
         "whiskbroom 110 deg": (whiskbroom(55.0), (2000, 2000), RANGE),
         "pushbroom at 89.9 N": (pushbroom(89.9), SIZE, RANGE),
         "pushbroom at 78 N, 100k rows": (pushbroom(78.0, (20000, 100000)), (20000, 100000), RANGE),
         "wide pushbroom": (pushbroom(45.0, (20000, 40000), 15.0), (20000, 40000), (0.0, 4000.0)),
-        "distortion": (
-            Bent(pushbroom(45.0), lambda p: 3e-13 * (p - 1e4) ** 3 + 2e-17 * (p - 1e4) ** 4),
-            SIZE,
-            RANGE,
-        ),
-        "waves 0.25": (Bent(pushbroom(45.0), waves(20000, 0.25, 0.5)), SIZE, RANGE),
-        "waves 1": (Bent(pushbroom(45.0), waves(20000, 1.0, 0.5)), SIZE, RANGE),
-        "waves 7": (Bent(pushbroom(45.0), waves(20000, 7.0, 0.5)), SIZE, RANGE),
-        "waves 60": (Bent(pushbroom(45.0), waves(20000, 60.0, 0.5)), SIZE, RANGE),
-        "bump": (Bent(pushbroom(45.0), bump(SIZE, 250.0, 0.5, (0.37, 0.61))), SIZE, RANGE),
-        "bump in a corner": (Bent(pushbroom(45.0), bump(SIZE, 250.0, 0.5, (0.01, 0.99))), SIZE, RANGE),
+        **{name: (Bent(smooth, moves), SIZE, RANGE) for name, moves in bends.items()},
     }
-    return found
 
 
 def made(**changes: object) -> RpcFit:

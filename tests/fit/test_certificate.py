@@ -15,7 +15,7 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.sampler import SAMPLE_CELLS, Scattered
 from tests.costs import once
 from tests.fit.cameras import synthetic
-from tests.fit.models import FLAT, Bent, bump, hard, pushbroom, waves
+from tests.fit.models import FLAT, Bent, bump, hard, pushbroom, quotient, waves
 from tests.lanes import rest_slow
 
 EASY = ("wide pushbroom", "frame, k1 0.02", "waves 0.25")  # that are fitted in a moment, one of each kind
@@ -114,7 +114,7 @@ def best_possible(name: str, axis: int, start: RPC) -> float:
     def residual(x):
         below = np.append(1.0, x[20:])
         pole = cost * np.maximum(0.2 - below @ around, 0.0)
-        return np.concatenate([(x[:20] @ basis) / (below @ basis) - y, pole])
+        return np.concatenate([quotient(x, basis) - y, pole])
 
     def jacobian(x):
         below = np.append(1.0, x[20:])
@@ -133,8 +133,7 @@ def best_possible(name: str, axis: int, start: RPC) -> float:
         end = least_squares(residual, x, jacobian, method="lm", xtol=1e-12, ftol=1e-10, max_nfev=100).x
         below = np.append(1.0, end[20:])
         if Region.box(np.full((3, 2), [-1.25, 1.25])).least(below) > 0.1:
-            value = (end[:20] @ fresh) / (below @ fresh)
-            error = start.image_scale[axis] * value + start.image_offset[axis] - image[:, axis]
+            error = start.image_scale[axis] * quotient(end, fresh) + start.image_offset[axis] - image[:, axis]
             found.append(float(np.sqrt((error**2).mean())))
     return min(found)
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from rasterio.transform import RPCTransformer
 
 from barpc.base.errors import FitError
 from barpc.fit import FitOptions, fit_rpc, fit_rpc_points
 from barpc.fit.points import control_points
-from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
-from barpc.sensor.rpc import RPC
 from barpc.simulate import Look, fly
 from tests.fit.cameras import Camera, random_points, synthetic
 from tests.lanes import rest_slow
@@ -70,18 +68,17 @@ def test_the_certificate_holds_on_points_that_neither_grid_contains(camera: Came
     assert np.all(np.sqrt((error**2).mean(axis=0)) <= 3 * fit.rmse_ckp)
 
 
-@pytest.mark.parametrize("space", ["image", "ground"])
-def test_every_grid_reaches_the_rounding_of_coordinates(camera: Camera, space: str) -> None:
-    options = FitOptions(space=space)  # type: ignore[arg-type]
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
+def test_a_grid_on_the_ground_reaches_the_rounding_of_coordinates_too(camera: Camera) -> None:
+    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(space="ground"))
     assert fit.max_ckp.max() <= 1e-7
     assert fit.coverage == 1.0
 
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-def test_the_error_does_not_grow_with_the_area(some_vendors: list[Camera]) -> None:
-    for camera in some_vendors:
+@pytest.mark.parametrize("third", rest_slow([0, 1, 2]))
+def test_the_error_does_not_grow_with_the_area(vendors: list[Camera], third: int) -> None:
+    for camera in vendors[third::3]:
         if camera.name == PECULIAR:
             continue
         errors = []
@@ -128,16 +125,7 @@ def test_a_flat_scene_keeps_its_altitude_terms(camera: Camera) -> None:
 def test_the_papers_solver_fits_a_ten_thousandth_of_a_pixel(camera: Camera) -> None:
     fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=FitOptions(method="lcurve-joint"))
     assert fit.rmse_ckp.max() <= 2e-4
-    assert fit.h[0] == fit.h[1]
-
-
-def test_an_rpc_that_misses_the_tolerance_is_refused_or_handed_out_with_its_verdict(camera: Camera) -> None:
-    options = FitOptions(tolerance=1e-13)
-    with pytest.raises(FitError, match=r"misses its check points by up to .* wanted 1e-13"):
-        fit_rpc(camera.model, camera.size, camera.alt_range, options=options)
-    fit = fit_rpc(camera.model, camera.size, camera.alt_range, options=options, strict=False)
-    assert "wanted 1e-13" in fit.verdict(1e-13)
-    assert fit.verdict(0.01) == ""
+    assert fit.h[0] == fit.h[1] > 0
 
 
 def test_a_model_without_ground_under_its_image_is_refused(camera: Camera) -> None:
@@ -161,59 +149,13 @@ def test_memory_does_not_grow_with_the_number_of_points(camera: Camera) -> None:
         assert peak <= limit
 
 
-def test_a_fitted_rpc_survives_its_files(camera: Camera, tmp_path: Path) -> None:
-    rasterio = pytest.importorskip("rasterio")
-    rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
-    image = tmp_path / "image.tif"
-    with rasterio.open(
-        image,
-        "w",
-        driver="GTiff",
-        width=8,
-        height=8,
-        count=1,
-        dtype="uint8",
-        transform=rasterio.Affine(1, 0, 0.5, 0, 1, 0.5),
-    ) as file:
-        file.write(np.zeros((1, 8, 8), np.uint8))
-    write_rpc(rpc, tmp_path / "image_RPC.TXT")
-    write_rpc_copy(rpc, image, tmp_path / "copy.tif")
-    ground, _ = random_points(camera, 1000, np.random.default_rng(3))
-    text, tag = read_rpc(tmp_path / "image_RPC.TXT"), read_rpc(tmp_path / "copy.tif")
-    assert text == rpc
-    assert np.abs(tag.project(ground) - rpc.project(ground)).max() <= 6e-8
-    assert miss(camera) >= 1.0
-
-
 def test_the_coefficients_stand_in_rpc00b_order_for_rpcm_and_gdal(camera: Camera) -> None:
     rpcm = pytest.importorskip("rpcm")
-    rasterio = pytest.importorskip("rasterio")
-    transform = pytest.importorskip("rasterio.transform")
     rpc = fit_rpc(camera.model, camera.size, camera.alt_range).rpc
     assert all(len(np.unique(row)) == 20 for row in rpc.coeffs)
     ground, image = random_points(camera, 200, np.random.default_rng(4))
-    assert np.abs(peer_rpcm(rpcm, rpc).projection(*ground.T) - image.T).max() <= 1e-7
-    gdal = rasterio.rpc.RPC(
-        height_off=rpc.ground_offset[2], height_scale=rpc.ground_scale[2],
-        lat_off=rpc.ground_offset[1], lat_scale=rpc.ground_scale[1],
-        long_off=rpc.ground_offset[0], long_scale=rpc.ground_scale[0],
-        samp_off=rpc.image_offset[0], samp_scale=rpc.image_scale[0],
-        line_off=rpc.image_offset[1], line_scale=rpc.image_scale[1],
-        samp_num_coeff=rpc.coeffs[0].tolist(), samp_den_coeff=rpc.coeffs[1].tolist(),
-        line_num_coeff=rpc.coeffs[2].tolist(), line_den_coeff=rpc.coeffs[3].tolist(),
-    )  # fmt: skip
-    with transform.RPCTransformer(gdal) as transformer:
+    peer = rpcm.RPCModel(rpc.to_rpcm_dict(), dict_format="rpcm")
+    assert np.abs(np.array(peer.projection(*ground.T)) - image.T).max() <= 1e-7
+    with RPCTransformer(rpc.to_rasterio()) as transformer:
         row, col = transformer.rowcol(*ground.T, op=lambda v: v)
     assert np.abs(np.column_stack([col, row]) - 0.5 - image).max() <= 1e-7
-
-
-def peer_rpcm(rpcm: object, rpc: RPC) -> object:
-    """The same RPC as rpcm's object."""
-    values = {}
-    for i, name in enumerate(("SAMP_NUM", "SAMP_DEN", "LINE_NUM", "LINE_DEN")):
-        values[f"{name}_COEFF"] = " ".join(f"{c:.17g}" for c in rpc.coeffs[i])
-    for i, name in enumerate(("LONG", "LAT", "HEIGHT")):
-        values[f"{name}_OFF"], values[f"{name}_SCALE"] = rpc.ground_offset[i], rpc.ground_scale[i]
-    for i, name in enumerate(("SAMP", "LINE")):
-        values[f"{name}_OFF"], values[f"{name}_SCALE"] = rpc.image_offset[i], rpc.image_scale[i]
-    return rpcm.rpc_model.RPCModel({k: str(v) for k, v in values.items()})  # type: ignore[attr-defined]

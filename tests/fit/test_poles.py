@@ -12,7 +12,7 @@ from barpc.fit.poles import MIN_DENOMINATOR_RATIO, Region, bounded
 from barpc.fit.system import TriangularSystem
 from barpc.sensor.rpc import RPC
 from tests.costs import once
-from tests.fit.models import Bent, pushbroom
+from tests.fit.models import Bent, pushbroom, quotient
 
 ALL = np.arange(20)
 
@@ -70,11 +70,9 @@ def test_a_smooth_detector_is_followed_as_least_squares_follow_it(rate, before, 
     x = (ground - fit.rpc.ground_offset) / fit.rpc.ground_scale
     basis, y = terms(x), (image[:, 0] - fit.rpc.image_offset[0]) / fit.rpc.image_scale[0]
 
-    def residual(p):
-        return (p[:20] @ basis) / (1.0 + p[20:] @ basis[1:]) - y
-
     start = np.concatenate([np.linalg.lstsq(basis.T, y, rcond=None)[0], np.zeros(19)])
-    best = np.sqrt((least_squares(residual, start, method="lm", max_nfev=20_000).fun ** 2).mean())
+    least = least_squares(lambda x: quotient(x, basis) - y, start, method="lm", max_nfev=20_000)
+    best = np.sqrt((least.fun**2).mean())
     rmse = np.sqrt(((fit.rpc.project(ground) - image)[:, 0] ** 2).mean())
     assert rmse <= 1.05 * best * fit.rpc.image_scale[0]
     assert rmse < wanted < before / 20

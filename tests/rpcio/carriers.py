@@ -63,7 +63,7 @@ def envi(path: Path, rpc: RPC | None, more: str = "", **image) -> Path:
 
 def jp2(path: Path, rpc: RPC | None, **image) -> Path:
     """A JPEG 2000 with the RPC in its GeoTIFF box."""
-    options = {} if rpc is None else {"rpcs": gdal_rpc(rpc)}
+    options = {} if rpc is None else {"rpcs": rpc.to_rasterio()}
     return _written(path, driver="JP2OpenJPEG", REVERSIBLE="YES", QUALITY="100", **options, **image)
 
 
@@ -78,12 +78,6 @@ def _written(path: Path, data: np.ndarray | None = None, **profile: object) -> P
             out.write(data)
     path.with_name(f"{path.name}.aux.xml").unlink(missing_ok=True)
     return path
-
-
-def gdal_rpc(rpc: RPC) -> GdalRPC:
-    """The RPC as rasterio has it."""
-    fields = {key.lower(): v if len(v) > 1 else v[0] for key, v in fields_from_rpc(rpc).items()}
-    return GdalRPC(**fields)
 
 
 def seen_by_gdal(path: Path) -> GdalRPC | None:

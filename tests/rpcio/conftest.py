@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from rasterio.shutil import copy as raster_copy
 
+from barpc.cli import main
 from barpc.rasters.raster import open_raster
+from barpc.rpcio.formats import FORMATS
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, SINGLE, fields_from_rpc
 from barpc.rpcio.xml import rpc_items
 from barpc.sensor.rpc import RPC
@@ -32,6 +34,10 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, **changes: float | None) -> RP
     return RPC(coeffs, [lon, lat, 166.6667], [0.0062, 0.0045, 142.8571], [999.1, 950.7], [1010.3, 980.9], **errors)
 
 
+WRITABLE = [row for row in FORMATS.values() if row.write is not None]
+each_written = pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
+
+
 @pytest.fixture
 def rpc() -> RPC:
     return make_rpc()
@@ -41,6 +47,13 @@ def write_image(path: Path, shape: tuple[int, int, int] = (1, 40, 60), **profile
     """A raster of known pixels; keywords go to rasterio."""
     data = np.random.default_rng(5).integers(0, 60000, shape).astype(profile.pop("dtype", "uint16"))
     return geotiffs.write_image(path, data, **profile)
+
+
+def ended(*words: object) -> int:
+    """The code with which a command line ends."""
+    with pytest.raises(SystemExit) as stop:
+        main([*map(str, words)])
+    return int(stop.value.code or 0)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -77,15 +90,35 @@ def grid(rpc: RPC) -> np.ndarray:
     return np.stack(np.meshgrid(t, t, t), axis=-1).reshape(-1, 3) * rpc.ground_scale + rpc.ground_offset
 
 
+A_ORDER = "1 L P H LP LH PH LPH LL PP HH LLL LLP LLH LPP PPP PPH LHH PHH HHH"
+"""STDI-0002, table 8-1 (RPC00A)."""
+B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
+
+
+def polynomials(rpc: RPC, ground: np.ndarray, order: str = B_ORDER) -> np.ndarray:
+    """The four polynomials (4, N) at ground points (N, 3), an RPC's numbers summed in an order that is written out."""
+    L, P, H = ((ground - rpc.ground_offset) / rpc.ground_scale).T
+    value = {"1": np.ones(len(ground)), "L": L, "P": P, "H": H}
+    return rpc.coeffs @ np.array([np.prod([value[letter] for letter in word], axis=0) for word in order.split()])
+
+
+def in_order(rpc: RPC, ground: np.ndarray, order: str = B_ORDER) -> np.ndarray:
+    """Image points (N, 2) by these polynomials."""
+    col, col_den, row, row_den = polynomials(rpc, ground, order)
+    return np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
+
+
+def _numbered(name: str, values: list[float]) -> str:
+    return "".join(f"<{name}_{i}>{value!r}</{name}_{i}>" for i, value in enumerate(values, 1))
+
+
 def dimap_v2(rpc: RPC) -> str:
     """Pleiades' XML: 1-based offsets, and a direct model that is somebody else's."""
     fields = fields_from_rpc(rpc)
-    model = "".join(
-        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
-    )
+    model = "".join(_numbered(key, fields[key]) for key in COEFFICIENTS)
     shift = {"LINE_OFF": 1, "SAMP_OFF": 1}
     validity = "".join(f"<{k}>{fields[k][0] + shift.get(k, 0)!r}</{k}>" for k in OFFSETS + SCALES)
-    direct = "".join(f"<{key}_{i}>7.5</{key}_{i}>" for key in COEFFICIENTS for i in range(1, 21))
+    direct = "".join(_numbered(key, [7.5] * 20) for key in COEFFICIENTS)
     return (
         '<?xml version="1.0" encoding="UTF-8"?><Dimap_Document><Rational_Function_Model><Global_RFM>'
         f"<Direct_Model>{direct}</Direct_Model><Inverse_Model>{model}<ERR_BIAS_ROW>0.001</ERR_BIAS_ROW>"
@@ -97,9 +130,7 @@ def dimap_v2(rpc: RPC) -> str:
 def dimap_v3(rpc: RPC) -> str:
     """Pleiades Neo's XML: 0-based offsets, other names."""
     fields = fields_from_rpc(rpc)
-    model = "".join(
-        f"<{key}_{i}>{value!r}</{key}_{i}>" for key in COEFFICIENTS for i, value in enumerate(fields[key], 1)
-    )
+    model = "".join(_numbered(key, fields[key]) for key in COEFFICIENTS)
     validity = "".join(f"<{k}>{fields[k][0]!r}</{k}>" for k in OFFSETS + SCALES)
     return (
         "<Dimap_Document><Rational_Function_Model><Global_RFM>"
@@ -141,10 +172,18 @@ def enmap(rpc: RPC) -> str:
             items += f"<{rename.get(axis, axis)}_{kind}>{fields[key][0]!r}</{rename.get(axis, axis)}_{kind}>"
         for key in COEFFICIENTS:
             axis, part, _ = key.split("_")
-            name = f"{rename[axis]}_{part}"
-            items += "".join(f"<{name}_{i}>{v!r}</{name}_{i}>" for i, v in enumerate(fields[key], 1))
+            items += _numbered(f"{rename[axis]}_{part}", fields[key])
         bands += f'<bandID number="{band}">{items}</bandID>'
     return f"<level_X><product><navigation><RPC>{bands}</RPC></navigation></product></level_X>"
+
+
+def alos() -> str:
+    """Columns of an ALOS scene: offsets that fill them, scales, four times twenty coefficients."""
+    offsets = ["006500", "03550", "-35.6812", "-139.7671", "00500"]
+    scales = ["006501", "03551", "0.3000", "0.3500", "0510"]
+    head = (f"{cell:>{width}}" for cell, width in zip(offsets + scales, 2 * (6, 5, 8, 9, 5), strict=True))
+    numbers = (f"{value:+.5f}E-{i}" for value in (1.25, 2.25, 3.25, 4.25) for i in [*range(10)] * 2)
+    return "".join([*head, *(f"{number:>12}" for number in numbers)])
 
 
 def yaml(rpc: RPC) -> str:
@@ -166,3 +205,14 @@ def envi(rpc: RPC) -> str:
     values = [v for key in (*OFFSETS, *SCALES, *COEFFICIENTS) for v in fields[key]] + [0, 0, 1]
     lines = [", ".join(map(repr, values[i : i + 4])) for i in range(0, 93, 4)]
     return "ENVI\nsamples = 60\nlines = 40\nrpc info = {\n  " + ",\n  ".join(lines) + "}\nbyte order = 0\n"
+
+
+DIALECTS = {
+    "dimap v1": dimap_v1,
+    "dimap v2": dimap_v2,
+    "dimap v3": dimap_v3,
+    "enmap": enmap,
+    "yaml": yaml,
+    "envi": envi,
+}
+"""Format, and which of its dialects, of those that are only read -> who writes it."""

@@ -5,33 +5,25 @@ from __future__ import annotations
 import json
 import os
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import RPCTransformer
 
 from barpc.base.errors import ImageError, MissingRpcError, RpcFormatError
 from barpc.cameras import open_camera
-from barpc.cli import main
 from barpc.rasters.raster import hashed, open_raster
 from barpc.rpcio import read_rpc, read_rpc_source, shadows, write_crop, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.rpc import RPC
 from barpc.verbs.images import expanded
 from tests.rpcio.carriers import MAKERS, envi, gdal_pixels, pcidsk, seen_by_gdal
-from tests.rpcio.conftest import grid, make_rpc, pixels, rpc_domain, write_image
+from tests.rpcio.conftest import ended, grid, make_rpc, pixels, rpc_domain, write_image
 from tests.rpcio.test_tiles import STRIP, strip, tile
 
-
-@pytest.fixture(autouse=True)
-def _no_georeference():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        yield
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
 @pytest.fixture
@@ -309,12 +301,6 @@ def test_a_header_by_gdal_s_rules_smuggles_nothing(rpc: RPC, tmp_path: Path) -> 
 # --- a run -------------------------------------------------------------------------------------------------
 
 
-def ended(words: list[str]) -> int:
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    return int(end.value.code or 0)
-
-
 @pytest.mark.nightly
 def test_a_run_of_such_images_is_that_of_the_tiffs(tmp_path: Path) -> None:
     samples = Path(__file__).parents[2] / "data_samples"
@@ -329,13 +315,13 @@ def test_a_run_of_such_images_is_that_of_the_tiffs(tmp_path: Path) -> None:
         write_rpc_copy(camera, source, plain[-1])
         write_rpc(camera, plain[-1].with_suffix(".RPB"))
     for name, images in (("out", given), ("ref", plain)):
-        assert ended(["adjust", *map(str, images), "-o", str(tmp_path / name)]) == 0
+        assert ended("adjust", *images, "-o", tmp_path / name) == 0
     for n in range(2):
         found, expected = (read_rpc(tmp_path / name / f"view_0{n}_RPC.TXT") for name in ("out", "ref"))
         assert found.off(expected).max() < 1e-6
         seen = tmp_path / "out" / f"view_0{n}.vrt"
         np.testing.assert_allclose(projected_by_gdal(seen, grid(found)), found.project(grid(found)), rtol=0, atol=1e-6)
         np.testing.assert_array_equal(gdal_pixels(seen), gdal_pixels(plain[n]))
-    assert ended(["verify", str(tmp_path / "out")]) == 0
+    assert ended("verify", tmp_path / "out") == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert any(one["path"].endswith("view_01.hdr") for one in summary["inputs"])

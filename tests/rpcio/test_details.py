@@ -8,6 +8,7 @@ import os
 import re
 import struct
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +17,6 @@ import pytest
 import rasterio
 
 from barpc.base.errors import ImageError, InputError, OutputError, RpcError, RpcFormatError
-from barpc.base.safe_io import Kind
-from barpc.rasters.raster import open_raster
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc, write_rpc_copy, write_rpc_vrt
 from barpc.rpcio.acquisition import Acquisition, read_acquisition
 from barpc.rpcio.formats import files_of, find_rpc, format_for, parse_rpc, write_camera
@@ -36,8 +35,7 @@ from barpc.rpcio.sources import hidden_by, metadata_beside, shadows, sidecars
 from barpc.rpcio.text import collect_numbered, listed_numbers, number
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.image_corrections import CorrectionGrid
-from barpc.sensor.rpc import RPC
-from tests.rpcio.conftest import dimap_v2, grid, make_rpc, pixels, write_image, yaml
+from tests.rpcio.conftest import alos, dimap_v2, grid, make_rpc, pixels, write_image, yaml
 
 # --- TIFF ------------------------------------------------------------------------------------------------------
 
@@ -129,51 +127,14 @@ def test_a_tag_is_put_into_every_kind_of_tiff(options: dict[str, str], tmp_path:
     assert tags == sorted(tags)
 
 
-@pytest.mark.parametrize(("placed", "kept"), [(True, True), (False, False)])
-def test_a_geotransform_stays_where_the_image_is_placed(placed: bool, kept: bool, tmp_path: Path) -> None:
-    transform = rasterio.Affine(0.5, 0.0, 100.0, 0.0, -0.5, 200.0)
-    path = write_image(tmp_path / "a.tif", transform=transform, crs=32631)
-    put_tag(path, make_rpc(), placed=placed)
-    with open_raster(path) as dataset:
-        assert (dataset.transform == transform) == kept
-
-
 @pytest.mark.parametrize(("size", "ok"), [(0xFFFFFFFF - (1 << 16) - 15, True), (0xFFFFFFFF - (1 << 16) + 17, False)])
 def test_a_classic_tiff_of_four_gigabytes_has_no_room_for_a_tag(size: int, ok: bool, tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.tif")
     os.truncate(path, size)  # a hole
-    if ok:
+    with nullcontext() if ok else pytest.raises(ImageError, match=f"does not fit behind {size} bytes of classic TIFF"):
         put_tag(path, make_rpc())
         assert read_tag(path) == make_rpc()
-    else:
-        with pytest.raises(ImageError, match=f"does not fit behind {size} bytes of classic TIFF"):
-            put_tag(path, make_rpc())
-        assert path.stat().st_size == size
-
-
-def test_numbers_of_seventeen_digits_are_printable_and_the_camera_stays() -> None:
-    rng = np.random.default_rng(2)
-    rpc = make_rpc()
-    long = RPC(
-        rpc.coeffs + rng.normal(0, 1e-3, (4, 20)) * (np.arange(20) > 0),
-        rpc.ground_offset + rng.normal(0, 1e-4, 3),
-        rpc.ground_scale * (1 + rng.normal(0, 1e-3, 3)),
-        rpc.image_offset + rng.normal(0, 1.0, 2),
-        rpc.image_scale * (1 + rng.normal(0, 1e-3, 2)),
-    )
-    short = printable(long)
-    for name in ("ground_offset", "ground_scale", "image_offset", "image_scale"):
-        given, made = getattr(long, name), getattr(short, name)
-        np.testing.assert_array_equal(made, [float(f"{v:.15g}") for v in given])
-    np.testing.assert_allclose(short.project(grid(long)), long.project(grid(long)), rtol=0, atol=2e-11 * 1e3)
-    exaggerated = replace(
-        long,
-        image_offset=short.image_offset + 1e-4,
-        image_scale=short.image_scale,
-        ground_offset=short.ground_offset,
-    )
-    assert np.abs(exaggerated.project(grid(long)) - long.project(grid(long))).max() > 5e-5
-    assert printable(short) == short
+    assert (path.stat().st_size == size) != ok
 
 
 def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> None:
@@ -203,22 +164,9 @@ def test_coefficients_make_up_for_digits_that_are_not_printed(monkeypatch) -> No
 # --- rasters ---------------------------------------------------------------------------------------------------
 
 
-def mosaic(folder: Path) -> Path:
-    """A VRT written here: its pixels are those of scene.tif."""
-    write_image(folder / "scene.tif")
-    write_rpc_vrt(make_rpc(), folder / "scene.tif", folder / "scene.vrt")
-    return folder / "scene.vrt"
-
-
-def test_a_vrt_is_copied_with_its_pixels(tmp_path: Path) -> None:
-    rpc = make_rpc().crop(1.0, 2.0)
-    write_rpc_copy(rpc, mosaic(tmp_path), tmp_path / "copy.tif")
-    assert read_rpc(tmp_path / "copy.tif").off(rpc).max() < 1e-9
-    np.testing.assert_array_equal(pixels(tmp_path / "copy.tif"), pixels(tmp_path / "scene.tif"))
-
-
 def test_a_vrt_of_a_vrt_points_at_the_image_and_shows_the_same_part(tmp_path: Path) -> None:
-    path = mosaic(tmp_path)
+    path = tmp_path / "scene.vrt"
+    write_rpc_vrt(make_rpc(), write_image(tmp_path / "scene.tif"), path)
     write_rpc_vrt(make_rpc(), path, tmp_path / "again.vrt")
     assert "scene.tif" in (tmp_path / "again.vrt").read_text()
     text = path.read_text()
@@ -237,7 +185,7 @@ def test_a_vrt_of_a_vrt_points_at_the_image_and_shows_the_same_part(tmp_path: Pa
     ],
 )  # fmt: skip
 def test_a_window_lies_within_the_image_and_has_pixels(window: tuple[int, ...], ok: bool, tmp_path: Path) -> None:
-    image, rpc = write_image(tmp_path / "a.tif"), make_rpc()
+    image, rpc = write_image(tmp_path / "a.tif", shape=(2, 40, 60), dtype="float32", nodata=-1), make_rpc()
     col, row, width, height = window
     if not ok:
         with pytest.raises(ImageError, match="is not inside the image of 60 x 40"):
@@ -273,26 +221,11 @@ def test_no_writer_replaces_a_file_unless_it_is_told_to(tmp_path: Path) -> None:
 
 # --- files beside an image -------------------------------------------------------------------------------------
 
-_ALOS_CELLS = [
-    "006500",
-    "03550",
-    "35.6812",
-    "139.7671",
-    "0500",
-    "006501",
-    "03551",
-    "0.3000",
-    "0.3500",
-    "0510",
-]
-ALOS = "".join(f"{cell:>{width}}" for cell, width in zip(_ALOS_CELLS, 2 * (6, 5, 8, 9, 5), strict=True))
-ALOS += "".join(f"{v:+.5f}E-{i}".rjust(12) for v in (1.25, 2.25, 3.25, 4.25) for i in [*range(10)] * 2)
-
 
 @pytest.mark.parametrize("name", ["IMG-01-SCENE.tif", "IMG-SCENE.tif"])
 def test_the_text_of_an_alos_scene_goes_before_the_tag(name: str, tmp_path: Path) -> None:
     write_rpc_copy(make_rpc(), write_image(tmp_path / "plain.tif"), tmp_path / name)
-    (tmp_path / "RPC-SCENE.txt").write_text(ALOS)
+    (tmp_path / "RPC-SCENE.txt").write_text(alos())
     source = read_rpc_source(tmp_path / name)
     assert source.format == "alos"
     assert source.notes == ("not used: the image's own RPC",)
@@ -310,7 +243,7 @@ def test_the_text_of_an_alos_scene_goes_before_the_tag(name: str, tmp_path: Path
 )
 def test_short_names_have_their_files_too(image: str, beside: str, tmp_path: Path) -> None:
     write_image(tmp_path / image)
-    (tmp_path / beside).write_text(ALOS if beside.endswith("txt") else dimap_v2(make_rpc()))
+    (tmp_path / beside).write_text(alos() if beside.endswith("txt") else dimap_v2(make_rpc()))
     assert [s.path.name for s in sidecars(tmp_path / image)] == [beside]
 
 
@@ -506,24 +439,15 @@ def test_nodes_are_even_to_a_millionth_of_a_step(off: float, ok: bool, tmp_path:
     cols = np.linspace(-0.5, 999.5, 6)
     cols[2] += off * 200.0
     grid_ = DirectGrid(cols, [0.0, 1.0, 2.0], [0.0, 50.0, 100.0], np.random.default_rng(0).uniform(5, 6, (3, 3, 6, 2)))
-    if ok:
+    with nullcontext() if ok else pytest.raises(RpcError, match="not evenly spaced"):
         write_grid(grid_, tmp_path / "a_grid.tif")
         with rasterio.open(tmp_path / "a_grid.tif") as dataset:
             assert dataset.count == 6
-            assert [dataset.tags()[f"ALTITUDE_B{k}"] for k in range(6)] == [
-                "0.0",
-                "0.0",
-                "50.0",
-                "50.0",
-                "100.0",
-                "100.0",
-            ]
+            altitudes = [dataset.tags()[f"ALTITUDE_B{k}"] for k in range(6)]
+            assert altitudes == np.repeat(["0.0", "50.0", "100.0"], 2).tolist()
             np.testing.assert_array_equal(dataset.read(3), grid_.lonlat[1, ..., 0])
             np.testing.assert_array_equal(dataset.read(6), grid_.lonlat[2, ..., 1])
             assert dataset.transform[:6] == pytest.approx((200.0, 0.0, 0.0, 0.0, 1.0, 0.5))
-    else:
-        with pytest.raises(RpcError, match="not evenly spaced"):
-            write_grid(grid_, tmp_path / "a_grid.tif")
 
 
 # --- the light -----------------------------------------------------------------------------------------------------
@@ -554,24 +478,12 @@ def test_no_image_was_taken_before_there_were_satellites(day: str, stated: bool,
     assert read_acquisition(str(tmp_path / "a.tif")).time == (f"{day}T00:00:00Z" if stated else None)
 
 
-def test_a_correction_grid_whose_nodes_lie_nowhere_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rows", "words"), [(8192, "no correction grid"), (8193, "1073872896 bytes, too large for")])
+def test_a_correction_grid_is_held_to_what_its_numbers_become(rows: int, words: str, tmp_path: Path) -> None:
+    """Nodes are kept in four bytes and worked on in eight: a gigabyte of them is the most. None is written here."""
     path = tmp_path / "a_correction.tif"
-    write_correction(correction(), make_rpc(), path)
-    with rasterio.open(path, "r+") as file:
-        file.write(np.full((5, 6), 1e30, np.float32), 1)
-    with pytest.raises(RpcFormatError, match="a node of it is no image point, or has no displacement"):
+    shape = {"width": 8192, "height": rows, "count": 2, "dtype": "float32", "SPARSE_OK": True}
+    with rasterio.open(path, "w", driver="GTiff", transform=rasterio.Affine(2.0, 0.0, 0.0, 0.0, 2.0, 0.0), **shape):
+        pass
+    with pytest.raises(RpcFormatError, match=words):
         read_correction(path)
-
-
-def test_a_correction_grid_is_held_to_what_its_numbers_become(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nodes are kept in four bytes and worked on in eight."""
-    path = tmp_path / "a_correction.tif"
-    write_correction(correction(), make_rpc(), path)
-    most = 8 * correction().shift.size
-    for limit, refused in ((most, False), (most - 1, True)):
-        monkeypatch.setattr("barpc.rpcio.grids._GRID_KIND", Kind("a correction grid", limit, RpcFormatError))
-        if refused:
-            with pytest.raises(RpcFormatError, match=f"{most} bytes, too large for a correction grid"):
-                read_correction(path)
-        else:
-            assert read_correction(path)[0] == make_rpc()

@@ -16,10 +16,9 @@ from barpc.rpcio import FORMATS, read_rpc, write_camera, write_rpc
 from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.sources import stated_in_xml
 from barpc.rpcio.text import COEFFICIENTS, KEYS, fields_from_rpc
-from tests.rpcio.conftest import grid, make_rpc, rpc_domain, write_image
-from tests.rpcio.test_orders import A_ORDER
+from barpc.sensor.rpc import RPC
+from tests.rpcio.conftest import A_ORDER, grid, in_order, make_rpc, polynomials, rpc_domain, write_image, write_nitf
 
-B_ORDER = "1 L P H LP LH PH LL PP HH PLH LLL LPP LHH LLP PPP PHH LLH PPH HHH"
 UNITS = {"LINE": "pixels", "SAMP": "pixels", "LAT": "degrees", "LONG": "degrees", "HEIGHT": "meters", "ERR": "meters"}
 
 
@@ -187,18 +186,44 @@ def test_the_order_that_a_file_states_is_the_order_of_its_terms(name, old, new, 
     text = FORMATS[name].write(rpc)
     assert old in text
     found, points = read(text.replace(old, new)), grid(rpc)
-    L, P, H = ((points - rpc.ground_offset) / rpc.ground_scale).T
-    value = {"1": np.ones(len(points)), "L": L, "P": P, "H": H}
-    for order, camera in ((B_ORDER, rpc), (A_ORDER, found)):
-        terms = [np.prod([value[letter] for letter in word], axis=0) for word in order.split()]
-        col, col_den, row, row_den = rpc.coeffs @ np.array(terms)
-        expected = np.column_stack([col / col_den, row / row_den]) * rpc.image_scale + rpc.image_offset
-        np.testing.assert_allclose(camera.project(points), expected, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(rpc.project(points), in_order(rpc, points), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.project(points), in_order(rpc, points, A_ORDER), rtol=0, atol=1e-8)
     assert np.abs(found.project(points) - rpc.project(points)).max() > 1e-3
     with pytest.raises(RpcFormatError, match="only RPC00A and RPC00B are read"):
         read(text.replace(old, new.replace("RPC00A", "RPC00Z").replace("  A", "  Z")))
     if name != "geom":  # by others than the vendor
         assert read(text.replace(old, new.replace("RPC00A", "XXX"))) == rpc
+
+
+def rpc_of_fitting_numbers():
+    """Every number as the record holds it, every coefficient at work."""
+    coeffs = np.round(np.random.default_rng(9).uniform(-1, 1, (4, 20)) * 0.01, 6)
+    coeffs[1::2] *= 0.1
+    coeffs[:, 0] = [0.01, 1.0, -0.02, 1.0]
+    coeffs[0, 1], coeffs[2, 2] = 0.9, -0.9
+    return RPC(np.round(coeffs, 6), [5.4, 43.2, 500.0], [0.1, 0.2, 500.0], [999.0, 950.0], [1010.0, 980.0])
+
+
+def test_the_terms_of_an_rpc00a_record_stand_in_their_own_order(tmp_path):
+    """The record's numbers, used in the order of RPC00A (GDAL takes terms 7 to 10 otherwise: no oracle here)."""
+    rpc = rpc_of_fitting_numbers()
+    path = tmp_path / "a.ntf"
+    write_nitf(rpc, write_image(tmp_path / "scene.tif"), path)
+    data = path.read_bytes()
+    assert data.count(b"RPC00B01041") == 1
+    path.write_bytes(data.replace(b"RPC00B01041", b"RPC00A01041"))
+    found = read_rpc(path)
+    ground = grid(rpc)
+    np.testing.assert_allclose(found.project(ground), in_order(rpc, ground, A_ORDER), atol=1e-8)
+    assert np.abs(found.project(ground) - rpc.project(ground)).max() > 1.0
+
+
+def test_a_record_says_of_itself_that_it_is_valid(tmp_path):
+    path = tmp_path / "a.ntf"
+    write_nitf(rpc_of_fitting_numbers(), write_image(tmp_path / "scene.tif"), path)
+    path.write_bytes(path.read_bytes().replace(b"RPC00B010411", b"RPC00B010410"))
+    with pytest.raises(Exception, match="SUCCESS flag"):
+        read_rpc(path)
 
 
 # --- OSSIM's adjustments ----------------------------------------------------------------------------------
@@ -216,10 +241,7 @@ def adjusted(rpc, *sizes, number=0, current=0, sigma=(50, 50, 50, 50, 0.1), cent
 
 def by_ossim(rpc, points, rows, cols, row_scale, col_scale, turn):
     """ossimRpcModel::worldToLineSample, in its own letters."""
-    L, P, H = ((points - rpc.ground_offset) / rpc.ground_scale).T
-    value = {"1": np.ones(len(points)), "L": L, "P": P, "H": H}
-    terms = np.array([np.prod([value[letter] for letter in word], axis=0) for word in B_ORDER.split()])
-    pv, qv, pu, qu = rpc.coeffs @ terms
+    pv, qv, pu, qu = polynomials(rpc, points)
     u_rot, v_rot, a = pu / qu, pv / qv, np.radians(turn)
     u, v = u_rot * np.cos(a) + v_rot * np.sin(a), v_rot * np.cos(a) - u_rot * np.sin(a)
     line = u * (rpc.image_scale[1] + row_scale) + rpc.image_offset[1] + rows
@@ -278,9 +300,9 @@ def test_an_adjustment_that_is_none_is_refused(text, what, rpc):
 
 def by_line(text):
     """As readers that know no names: the n-th line is the n-th number (MicMac's ASCII mode, learned stereo)."""
-    values = [float(line.split()[1]) for line in text.splitlines()[:90]]
-    row, col, lat, lon, alt = zip(values[:5], values[5:10], strict=True)
-    return row, col, lat, lon, alt, np.array(values[10:]).reshape(4, 20)
+    values = np.array([float(line.split()[1]) for line in text.splitlines()[:90]])
+    offset, scale, coeffs = values[:5], values[5:10], values[10:].reshape(4, 20)  # row, col, lat, lon, alt
+    return RPC(coeffs[[2, 3, 0, 1]], offset[[3, 2, 4]], scale[[3, 2, 4]], offset[[1, 0]], scale[[1, 0]])
 
 
 @pytest.mark.parametrize("changes", [{}, {"err_bias": None, "err_rand": None}])
@@ -288,14 +310,7 @@ def test_a_reader_that_goes_by_the_line_finds_every_number(changes, tmp_path):
     rpc = replace(make_rpc(), **changes)
     write_rpc(rpc, tmp_path / "a_RPC.TXT")
     text = (tmp_path / "a_RPC.TXT").read_text()
-    row, col, lat, lon, alt, (row_num, row_den, col_num, col_den) = by_line(text)
-    L, P, H = ((p - o) / s for p, (o, s) in zip(grid(rpc).T, (lon, lat, alt), strict=True))
-    value = {"1": np.ones(len(L)), "L": L, "P": P, "H": H}
-    terms = np.array([np.prod([value[letter] for letter in word], axis=0) for word in B_ORDER.split()])
-    found = [
-        o + s * (num @ terms) / (den @ terms) for (o, s), num, den in ((col, col_num, col_den), (row, row_num, row_den))
-    ]
-    np.testing.assert_allclose(np.column_stack(found), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(in_order(by_line(text), grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
     behind = [line.split(":")[0] for line in text.splitlines()[90:]]
     assert [key for key in behind if key.startswith("ERR")] == (["ERR_BIAS", "ERR_RAND"] if rpc.err_bias else [])
     assert read(text) == rpc

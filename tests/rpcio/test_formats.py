@@ -13,9 +13,8 @@ from barpc.base.errors import ImageError, RpcFormatError
 from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, write_rpc
 from barpc.rpcio.formats import parse_rpc
 from barpc.rpcio.text import COEFFICIENTS, OFFSETS, SCALES, fields_from_rpc, write_rpb, write_txt
-from tests.rpcio.conftest import dimap_v1, dimap_v2, dimap_v3, enmap, envi, grid, make_rpc, yaml
+from tests.rpcio.conftest import DIALECTS, WRITABLE, alos, dimap_v2, each_written, enmap, envi, grid, make_rpc
 
-WRITABLE = [row for row in FORMATS.values() if row.write is not None]
 NAMES = [f"scene{case}" for row in WRITABLE for end in row.suffixes for case in dict.fromkeys((end, end.lower()))]
 
 
@@ -25,7 +24,7 @@ def test_what_is_written_reads_back_to_the_bit(name, rpc, tmp_path):
     assert read_rpc(tmp_path / name) == rpc
 
 
-@pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
+@each_written
 def test_an_unknown_accuracy_is_never_written_as_perfect(row):
     unknown = make_rpc(err_bias=None, err_rand=None)
     text = row.write(unknown)
@@ -48,20 +47,10 @@ def test_a_name_that_no_format_has_is_refused_with_the_ones_that_are(name, rpc, 
     assert not list(tmp_path.iterdir())
 
 
-DIALECTS = {
-    "DIMAP v1": (dimap_v1, "dimap"),
-    "DIMAP v2": (dimap_v2, "dimap"),
-    "DIMAP v3": (dimap_v3, "dimap"),
-    "orthority's YAML": (yaml, "yaml"),
-    "ENVI's header": (envi, "envi"),
-}
-
-
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", [name for name in DIALECTS if name != "enmap"])
 def test_a_dialect_that_is_only_read_gives_the_camera_that_went_in(dialect, rpc):
-    make, expected = DIALECTS[dialect]
-    found, name = parse_rpc(make(rpc).encode(), "memory")
-    assert name == expected
+    found, name = parse_rpc(DIALECTS[dialect](rpc).encode(), "memory")
+    assert name == dialect.split()[0]
     np.testing.assert_allclose(found.project(grid(rpc)), rpc.project(grid(rpc)), rtol=0, atol=1e-9)
 
 
@@ -152,8 +141,8 @@ def test_a_denominator_that_does_not_start_with_one_is_kept(rpc):
 
 def test_both_dialects_of_json_are_read(rpc):
     rpcm = FORMATS["json"].write(rpc)
-    plain = {key.lower(): v[0] if len(v) == 1 else v for key, v in _fields(rpc).items()}
-    gdal = {key: str(v[0]) if len(v) == 1 else " ".join(map(repr, v)) for key, v in _fields(rpc).items()}
+    plain = {key.lower(): v[0] if len(v) == 1 else v for key, v in fields_from_rpc(rpc).items()}
+    gdal = {key: str(v[0]) if len(v) == 1 else " ".join(map(repr, v)) for key, v in fields_from_rpc(rpc).items()}
     bare = json.loads(rpcm)["rpc"]
     for document in (json.loads(rpcm), bare, plain, {"rpcs": plain}, gdal):
         assert parse_rpc(json.dumps(document).encode(), "memory") == (rpc, "json")
@@ -168,22 +157,12 @@ def test_an_rpc_may_lie_three_objects_deep_in_json_and_no_deeper(rpc):
         parse_rpc(json.dumps(document).encode(), "memory")
 
 
-def _fields(rpc):
-    from barpc.rpcio.text import fields_from_rpc
-
-    return fields_from_rpc(rpc)
-
-
 def test_alos_columns_are_read(tmp_path):
-    offsets = ["006500", "03550", " 35.6812", " 139.7671", " 0500"]
-    scales = ["006501", "03551", "  0.3000", "   0.3500", " 0510"]
-    lists = [[f"{value:+.5f}E-{i}" for i in range(10)] * 2 for value in (1.25, 2.25, 3.25, 4.25)]
-    cells = [f"{cell:>12}" for row in lists for cell in row]
     path = tmp_path / "RPC-ALPSMW000000000-O1B1___W.txt"
-    path.write_text("".join([*offsets, *scales, *cells]) + "\r\n")
+    path.write_text(alos() + "\r\n")
     source = read_rpc_source(path)
     assert source.format == "alos"
-    np.testing.assert_array_equal(source.rpc.ground_offset, [139.7671, 35.6812, 500.0])
+    np.testing.assert_array_equal(source.rpc.ground_offset, [-139.7671, -35.6812, 500.0])
     np.testing.assert_array_equal(source.rpc.ground_scale, [0.35, 0.3, 510.0])
     np.testing.assert_array_equal(source.rpc.image_offset, [3550.0, 6500.0])
     np.testing.assert_array_equal(source.rpc.image_scale, [3551.0, 6501.0])
@@ -293,7 +272,7 @@ def test_numbers_without_names_that_are_no_rpc_are_refused_with_what_was_found(r
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
-@pytest.mark.parametrize("row", WRITABLE, ids=lambda row: row.name)
+@each_written
 def test_a_text_in_utf_16_is_read(row, encoding, rpc, tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(row.write(rpc).encode(encoding))

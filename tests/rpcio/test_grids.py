@@ -189,7 +189,7 @@ def test_uneven_nodes_are_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("what", ["no tag", "no RPC", "three bands", "NaN", "turned"])
+@pytest.mark.parametrize("what", ["no tag", "no RPC", "three bands", "NaN", "nowhere", "turned"])
 def test_a_damaged_correction_grid_is_one_line(tmp_path, what):
     path = tmp_path / f"a{CORRECTION}"
     cols, rows = np.linspace(-0.5, 199.5, 5), np.linspace(-0.5, 99.5, 3)
@@ -197,8 +197,8 @@ def test_a_damaged_correction_grid_is_one_line(tmp_path, what):
     with rasterio.open(path) as good:
         profile, tags, rpcs, data = dict(good.profile), good.tags(), good.rpcs, good.read()
     tags.pop("AREA_OR_POINT", None)
-    if what == "NaN":
-        data[0, 1, 1] = np.nan
+    if what in ("NaN", "nowhere"):
+        data[0, 1, 1] = np.nan if what == "NaN" else 1e30
     if what == "three bands":
         data, profile["count"] = np.concatenate([data, data[:1]]), 3
     if what == "turned":
@@ -211,6 +211,8 @@ def test_a_damaged_correction_grid_is_one_line(tmp_path, what):
     with pytest.raises(RpcFormatError, match=path.name) as caught:
         read_correction(path)
     assert "\n" not in str(caught.value)
+    nodes = "a node of it is no image point, or has no displacement"
+    assert (nodes in str(caught.value)) == (what in ("NaN", "nowhere"))
     if what != "no tag":
         with pytest.raises(BarpcError):
             open_camera(path)

@@ -13,19 +13,13 @@ from rasterio.transform import Affine
 
 import barpc
 from barpc.base.errors import FitError, InputError, Remark, RpcError
-from barpc.cli import main
-from barpc.rpcio.plausible import RasterFrame, doubts_of, reach_of_corners
+from barpc.rpcio.plausible import RasterFrame, doubts_of, reach
 from barpc.sensor.rpc import RPC
+from tests.rpcio.conftest import ended
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = 1000, 1000
 VIEWS = [str(ROOT / f"data_samples/view_0{i}.tif") for i in range(3)]
-
-
-def run(*words: object) -> object:
-    with pytest.raises(SystemExit) as stop:
-        main([*map(str, words)])
-    return stop.value.code
 
 
 def the_rpc(number: int = 0) -> RPC:
@@ -51,7 +45,7 @@ def test_rpcs_of_coarser_and_finer_products_are_named(times: int) -> None:
 @pytest.mark.parametrize("off", [(500, 0), (-500, 0), (0, 500), (0, -500), (500, -500)])
 def test_an_rpc_that_is_half_an_image_off_is_named(off: tuple[int, int]) -> None:
     assert kinds(the_rpc().crop(*off)) == ["ground"]
-    assert 1.5 < reach_of_corners(the_rpc().crop(*off), SIZE) < 2.0
+    assert 1.5 < reach(the_rpc().crop(*off), SIZE) < 2.0
 
 
 def test_parts_with_their_own_rpc_and_bands_are_right() -> None:
@@ -82,8 +76,8 @@ def test_right_images_have_no_doubt(shared_data: Path) -> None:
 def test_the_case_from_the_field(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rpcs = [shared_data / f"field_cases/pan_with_ms_rpc/view_0{i}_RPC.TXT" for i in range(3)]
     given = [f"{view},camera={rpc}" for view, rpc in zip(VIEWS, rpcs, strict=True)]
-    assert all(5.0 < reach_of_corners(barpc.read_rpc(rpc), SIZE) < 7.0 for rpc in rpcs)
-    assert run("adjust", *given, "-o", tmp_path / "run") == 1
+    assert all(5.0 < reach(barpc.read_rpc(rpc), SIZE) < 7.0 for rpc in rpcs)
+    assert ended("adjust", *given, "-o", tmp_path / "run") == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert "view_00.tif: its corners lie outside of the ground that its RPC was made for, 6.0 half widths from" in said
@@ -92,7 +86,7 @@ def test_the_case_from_the_field(shared_data: Path, tmp_path: Path, capsys: pyte
         barpc.ortho(given[0], tmp_path / "map", alt=200)
     with pytest.raises(RpcError, match="half widths from the middle"):
         barpc.fit(given[0])
-    assert run("info", given[0]) == 0
+    assert ended("info", given[0]) == 0
     assert "4 times coarser" in capsys.readouterr().out
 
 
@@ -136,9 +130,9 @@ def test_an_orthoimage_with_the_rpc_of_its_image_is_named(tmp_path: Path, capsys
     with pytest.raises(FitError, match="an orthoimage"):
         barpc.fit(given, tmp_path / "x_RPC.TXT")
     assert not (tmp_path / "x_RPC.TXT").exists()
-    assert run("ortho", given, "--alt", "220", "-o", tmp_path / "again") == 3
+    assert ended("ortho", given, "--alt", "220", "-o", tmp_path / "again") == 3
     assert "an orthoimage" in capsys.readouterr().err
-    assert run("convert", given, tmp_path / "y_RPC.TXT") == 0
+    assert ended("convert", given, tmp_path / "y_RPC.TXT") == 0
     assert "an orthoimage" in capsys.readouterr().err
 
 

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import os
 import shutil
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 from barpc.base.errors import ImageError, RpcError, RpcFormatError
-from barpc.rpcio import FORMATS, read_rpc, read_rpc_source, shadows, sidecars, write_rpc, write_rpc_copy, write_rpc_vrt
+from barpc.rpcio import (
+    FORMATS,
+    read_rpc,
+    read_rpc_source,
+    shadows,
+    sidecars,
+    write_rpc,
+    write_rpc_copy,
+    write_rpc_vrt,
+)
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.rpcio.sources import only_physical, stated_in_xml
+from barpc.rpcio.sources import described, only_physical
+from tests.rpcio.carriers import seen_by_gdal
 from tests.rpcio.conftest import dimap_v2, grid, rpc_domain, write_image
 
 STEM = "IMG_scene_R1C1"
@@ -54,18 +62,11 @@ def put(kind: str, folder: Path, rpc) -> Path:
 HIDING = ["rpb", "rpb in lower case", "txt", "txt in lower case", "rpc", "xml", "dimap"]
 
 
-def gdal_line_offset(image: Path) -> float:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(image) as dataset:
-            return float(dataset.rpcs.line_off)
-
-
 @pytest.mark.parametrize("kind", HIDING)
 def test_a_sidecar_that_gdal_reads_before_the_tag_is_read_named_and_found(kind, rpc, tagged):
     other = rpc.crop(300, 400)
     path = put(kind, tagged.parent, other)
-    assert gdal_line_offset(tagged) == pytest.approx(other.image_offset[1], abs=1e-9)
+    assert seen_by_gdal(tagged).line_off == pytest.approx(other.image_offset[1], abs=1e-9)
     source = read_rpc_source(tagged)
     np.testing.assert_allclose(source.rpc.image_offset, other.image_offset, rtol=0, atol=1e-9)
     assert source.path == path
@@ -76,7 +77,7 @@ def test_a_sidecar_that_gdal_reads_before_the_tag_is_read_named_and_found(kind, 
 @pytest.mark.parametrize("kind", ["geom", "pam"])
 def test_a_sidecar_that_gdal_reads_after_the_tag_is_passed_over_and_named(kind, rpc, tagged):
     path = put(kind, tagged.parent, rpc.crop(300, 400))
-    assert gdal_line_offset(tagged) == pytest.approx(rpc.image_offset[1])
+    assert seen_by_gdal(tagged).line_off == pytest.approx(rpc.image_offset[1])
     source = read_rpc_source(tagged)
     assert (source.rpc, source.format) == (rpc, "tag")
     assert source.notes == (f"not used: {path.name}",)
@@ -97,14 +98,14 @@ def test_of_several_sidecars_the_one_that_gdal_takes_is_read(rpc, tagged):
     """.RPB before the Maxar XML before _RPC.TXT before the tag."""
     for index, kind in enumerate(["txt", "xml", "rpb"], 1):
         put(kind, tagged.parent, rpc.crop(0, 100 * index))
-        assert gdal_line_offset(tagged) == pytest.approx(read_rpc(tagged).image_offset[1], abs=1e-9)
+        assert seen_by_gdal(tagged).line_off == pytest.approx(read_rpc(tagged).image_offset[1], abs=1e-9)
         assert read_rpc(tagged) == rpc.crop(0, 100 * index)
 
 
 def test_beside_an_imd_file_the_text_no_longer_hides_the_tag(rpc, tagged):
     put("txt", tagged.parent, rpc.crop(0, 100))
     (tagged.parent / f"{STEM}.IMD").write_text('version = "R";\n')
-    assert gdal_line_offset(tagged) == pytest.approx(rpc.image_offset[1])
+    assert seen_by_gdal(tagged).line_off == pytest.approx(rpc.image_offset[1])
     assert read_rpc(tagged) == rpc
 
 
@@ -113,7 +114,7 @@ def test_nothing_beside_a_vrt_hides_its_rpc_from_gdal(rpc, tagged):
     write_rpc_vrt(rpc, tagged, vrt)
     for kind in ("rpb", "txt", "xml"):
         put(kind, tagged.parent, rpc.crop(300, 400))
-    assert gdal_line_offset(vrt) == rpc.image_offset[1]
+    assert seen_by_gdal(vrt).line_off == rpc.image_offset[1]
     assert read_rpc(vrt) == rpc
     assert shadows(vrt) == []
     assert len(shadows(tagged)) == 3
@@ -208,7 +209,7 @@ def test_a_side_file_that_gdal_does_not_look_for_is_found_where_the_image_has_no
     other = rpc.crop(300, 400)
     text = FORMATS["rpb" if "rpb" in name.lower() else "txt"].write(other)
     (tagged.parent / name).write_text(text)
-    assert gdal_line_offset(tagged) == pytest.approx(rpc.image_offset[1])
+    assert seen_by_gdal(tagged).line_off == pytest.approx(rpc.image_offset[1])
     source = read_rpc_source(tagged)
     assert (source.rpc, source.notes) == (rpc, (f"not used: {name}",))
     plain = write_image(tagged)
@@ -228,7 +229,7 @@ def test_a_side_file_that_gdal_does_not_look_for_is_found_where_the_image_has_no
 )
 def test_a_vendor_s_xml_says_how_large_its_image_is(tmp_path, text, size):
     (tmp_path / "a.xml").write_text(text)
-    assert stated_in_xml(tmp_path / "a.xml") == (size, False)
+    assert described(tmp_path / "a.xml") == (size, False)
     assert not only_physical(tmp_path / "a.xml")
 
 
@@ -236,7 +237,7 @@ def test_an_xml_without_an_rpc_may_hold_a_physical_camera(tmp_path, rpc):
     (tmp_path / "a.xml").write_text("<isd><ATT><ATTLIST>1 2</ATTLIST></ATT></isd>")
     (tmp_path / "b.xml").write_text(dimap_v2(rpc))
     assert [only_physical(tmp_path / name) for name in ("a.xml", "b.xml", "c.xml")] == [True, False, False]
-    assert stated_in_xml(tmp_path / "a.xml") == (None, True)
+    assert described(tmp_path / "a.xml") == (None, True)
 
 
 @pytest.mark.parametrize(

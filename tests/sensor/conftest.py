@@ -47,12 +47,25 @@ def make_rpc(lon: float = 5.4, lat: float = 43.2, seed: int = 3) -> RPC:
     return RPC(coeffs, [lon, lat, 500.0], [0.12, 0.09, 500.0], [10000.0, 9500.0], [10100.0, 9800.0], 3.0, 0.5)
 
 
+def slopes(model: SensorModel, ground: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Central differences (N, 2, 3) of image points by lon, lat and alt, of steps (3,) or (N, 3) [deg, deg, m]."""
+    moves = np.eye(3)[:, None] * steps
+    ends = [model.project(ground + move) - model.project(ground - move) for move in moves]
+    return np.stack(ends, axis=-1) / (2.0 * moves.sum(axis=-1).T[:, None])
+
+
+def slopes_off(model: SensorModel, ground: np.ndarray, steps: np.ndarray) -> float:
+    """How far its derivatives are from central differences, at most, in parts of the largest by an axis."""
+    jacobian, numeric = model.project_jacobian(ground)[1], slopes(model, ground, steps)
+    return float((np.abs(jacobian - numeric).max(axis=(0, 1)) / np.abs(numeric).max(axis=(0, 1))).max())
+
+
 def _correction(lon: float = 5.4, lat: float = 43.2) -> Correction:
     return Correction([2e-5, -3e-5, 1e-5], [4.0, -3.0, 2.0], ecef_from_ground([lon + 2.0, lat - 1.0, 7e5]))
 
 
 def _row_spline() -> RowSpline:
-    coeffs = np.random.default_rng(5).normal(0, 0.5, (13, 2))
+    coeffs = np.random.default_rng(5).normal(0, 40.0, (13, 2))  # some hundredths of a pixel a row
     return RowSpline(coeffs, 9499.5, 9500.0)
 
 

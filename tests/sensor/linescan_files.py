@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from barpc.base.geodesy import Array, ecef_from_ground, ground_from_ecef
+from barpc.sensor.linescan import read_linescan
+from barpc.sensor.pushbroom import Pushbroom
+from barpc.sensor.samples import Linescan
 from barpc.simulate import Look, fly
 
 START = np.datetime64("2026-05-07T23:59:59.250000", "ns")
@@ -21,6 +25,13 @@ START = np.datetime64("2026-05-07T23:59:59.250000", "ns")
 SIZE = (4000, 20000)
 STEP = 0.02
 PITCH = 0.008
+
+
+def read(folder: Path, text: str, **choices: object) -> Linescan:
+    """The camera of a document."""
+    path = folder / "metadata.xml"
+    path.write_text(text)
+    return read_linescan(path, **choices)
 
 
 def words(values: Array) -> str:
@@ -82,6 +93,10 @@ class Truth:
             out.append(ground_from_ecef(o + far * d))
         return np.array(out)
 
+    def misses(self, model: Pushbroom, image: Array, alt: float = 500.0) -> float:
+        """How far off [px] a model sees the ground points of image points, at most."""
+        return float(np.abs(model.project(self.ground(image, alt)) - image).max())
+
 
 def inertial_sight(ground: Array, origin: Array, velocity: Array) -> Array:
     """The direction (3,) in which a camera sees a point: the axes stand still as ECEF does when the light arrives."""
@@ -100,7 +115,6 @@ def isd(
     angle: float = 0.0,
     along: float = 0.0,
     camera: Rotation | None = None,
-    covariance: bool = True,
 ) -> tuple[str, Truth]:
     """Maxar's XML, of a detector turned by `angle` [deg] and `along` [mm] before the axis, in a turned camera."""
     distance = PITCH * flight.look.altitude / 0.5
@@ -108,8 +122,7 @@ def isd(
     camera = camera or Rotation.identity()
     body = (flight.body * camera.inv()).as_quat()
     body[::3] *= -1  # the same rotations
-    cov = [4e-12, 0, 0, 0, 3e-12, 0, 0, 2e-12, 0, 3e-12] if covariance else []
-    eph = [0.01, 0, 0, 0.02, 0, 0.03] if covariance else []
+    cov, eph = [4e-12, 0, 0, 0, 3e-12, 0, 0, 2e-12, 0, 3e-12], [0.01, 0, 0, 0.02, 0, 0.03]
     n = range(len(flight.times))
     tables = {
         "EPH": [[k + 1, *flight.positions[k], *flight.velocities[k], *eph] for k in n],

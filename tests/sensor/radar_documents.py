@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial import polynomial
 
-from barpc.base.geodesy import ecef_from_ground, up
+from barpc.base.geodesy import ecef_from_ground, ground_from_ecef, up
 
 KINDS = ("PFA", "RGAZCOMP", "INCA", "XRGYCR", "XCTYAT", "PLANE")
 DURATION, SPEED, TURN = 6.0, 7550.0, 1.08e-3  # s, m/s, rad/s
@@ -36,8 +36,6 @@ def pass_over(scp: np.ndarray, incidence: float, side: str, squint: float) -> np
 
 
 def ground_of(ecef: np.ndarray) -> tuple[float, float, float]:
-    from barpc.base.geodesy import ground_from_ecef
-
     lon, lat, alt = ground_from_ecef(ecef)
     return float(lon), float(lat), float(alt)
 

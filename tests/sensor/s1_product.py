@@ -5,7 +5,7 @@ Truth is independent of barpc: the orbit is a formula, zero Doppler is found by 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -108,7 +108,9 @@ class Product:
 
     def _annotation(self) -> bytes:
         rough = read_annotation(self._xml(np.zeros((1, 7))), name=self.name)
-        model = _quiet(lambda: RangeDoppler.from_annotation(rough))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # its grid is not there yet
+            model = RangeDoppler.from_annotation(rough)
         step = self.lines_per_burst if self.bursts else self.lines // 9
         lines = np.arange(0, self.lines + 1, step) - np.r_[np.zeros(self.lines // step), 1]
         pixel, line = np.meshgrid(np.linspace(0, self.samples - 1, 5).round(), lines)
@@ -236,12 +238,3 @@ IW = {
 STRIPMAP = Product(swath="S3", stripmap=True, num_bursts=12, states_from=-10.0, step=1.0, num_states=60)
 
 GRD = replace(Product(), swath="IW", product_type="GRD", samples=25000)
-
-
-def _quiet(build: Callable[[], RangeDoppler]) -> RangeDoppler:
-    """The model of an annotation whose grid is not there yet."""
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return build()

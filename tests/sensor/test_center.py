@@ -98,6 +98,14 @@ def test_centres_of_real_cameras_are_where_their_satellites_fly(shared_data, nam
     assert low * 1e3 < found.altitude < high * 1e3
 
 
+def test_the_line_method_finds_the_orbit_of_the_pleiades_crops(shared_data) -> None:
+    for path in sorted((shared_data / "optical/phr_triplet_north").glob("*.tif")):
+        camera = open_camera(path)
+        line = camera_center(camera.rpc, camera.size, camera.alt_range)
+        assert line.method == "line"
+        assert line.altitude == pytest.approx(694e3, rel=0.05)
+
+
 def test_a_projective_camera_of_a_perspective_one_stands_where_it_stands() -> None:
     camera: Any = Pinhole()
     found = camera_center(camera, SIZE, ALTITUDES, "projective")

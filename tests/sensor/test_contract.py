@@ -10,6 +10,7 @@ import pytest
 
 from barpc.base.geodesy import metres_per_unit, wrap_longitude
 from barpc.sensor import SensorModel
+from tests.sensor.conftest import slopes_off
 
 
 @pytest.fixture
@@ -33,17 +34,9 @@ def test_projecting_a_localised_point_gives_it_back(case, image_alt):
 @pytest.mark.few(9)
 def test_the_jacobian_is_the_central_difference(case, image_alt):
     ground = case.model.localize(*image_alt)
-    value, jacobian = case.model.project_jacobian(ground)
+    value, _ = case.model.project_jacobian(ground)
     np.testing.assert_allclose(value, case.model.project(ground), rtol=0, atol=1e-7)
-    for axis in range(3):
-        metres = 20.0
-        step = np.zeros_like(ground)
-        step[:, axis] = metres / metres_per_unit(ground)[:, axis]
-        difference = (case.model.project(ground + step) - case.model.project(ground - step)) / (
-            2 * step[:, axis : axis + 1]
-        )
-        scale = np.abs(difference).max()
-        np.testing.assert_allclose(jacobian[..., axis], difference, rtol=0, atol=2e-5 * scale)
+    assert slopes_off(case.model, ground, 20.0 / metres_per_unit(ground)) < 2e-5
 
 
 @pytest.mark.few(5)

@@ -16,6 +16,7 @@ from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.csm import FRAME, LINESCAN, is_state, is_writable, open_state, state_text
+from tests.sensor.conftest import slopes_off
 
 State = dict[str, object]
 SIZE = (3000, 4000)
@@ -171,20 +172,15 @@ def test_pixels_look_where_the_library_says(name, tmp_path):
     assert np.isfinite(ground).all()
     assert offset(state, ground, image) < (2e-4 if state["m_modelName"] == LINESCAN else 1e-7)  # m
     np.testing.assert_allclose(model.project(ground), image, rtol=0, atol=1e-6)
-    seen, slope = model.project_jacobian(ground)
-    np.testing.assert_allclose(seen, image, rtol=0, atol=1e-6)
-    for axis, step in enumerate((1e-6, 1e-6, 0.1)):
-        move = step * np.eye(3)[axis]
-        apart = (model.project(ground + move) - model.project(ground - move)) / (2 * step)
-        np.testing.assert_allclose(slope[..., axis], apart, rtol=1e-5, atol=1e-5 * np.abs(apart).max())
+    np.testing.assert_allclose(model.project_jacobian(ground)[0], image, rtol=0, atol=1e-6)
+    assert slopes_off(model, ground, np.array([1e-6, 1e-6, 0.1])) < 1e-5
 
 
 def test_a_state_is_a_camera_whatever_stands_before_it(tmp_path):
     named = open_camera(write(frame(), tmp_path / "a.adjusted_state.json"))
     plain = open_camera(write(frame(), tmp_path / "b.json", before=""))
-    assert (named.format, named.size, named.alt_range) == ("csm", SIZE, (-500.0, 9000.0))
+    assert (named.format, named.size) == ("csm", SIZE)
     assert plain.model == named.model
-    assert open_camera(f"{tmp_path / 'b.json'},altitudes=0:2000").alt_range == (0.0, 2000.0)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -107,20 +109,6 @@ def test_few_layers_are_enough_where_the_altitudes_are_close(layers):
     image = np.random.default_rng(0).uniform(0, 20000, (500, 2))
     error = grid.project(PHYSICAL.localize(image, np.array(40.0))) - image
     assert np.abs(error).max() < (2e-3 if layers == 2 else 1e-5)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda c, r, a, v: (c[::-1], r, a, v), "ascend"),
-        (lambda c, r, a, v: (c, r, a[:1], v[:1]), "nodes"),
-        (lambda c, r, a, v: (c, r, a, v[..., :1]), "nodes"),
-        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], np.nan, v)), "no ground point"),
-    ],
-)
-def test_a_grid_that_cannot_be_is_refused(grid, change, message):
-    with pytest.raises(RpcError, match=message):
-        DirectGrid(*change(grid.cols, grid.rows, grid.alts, grid.lonlat))
 
 
 def test_a_vendor_grid_and_the_vendor_rpc_agree_inside_the_rpc_domain(shared_data):
@@ -296,24 +284,25 @@ def test_nodes_that_no_cubic_follows_are_found_again_to_the_last_one(power):
 
 
 @pytest.mark.parametrize(
-    ("change", "ok"),
+    ("change", "words"),
     [
-        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 539.0, v)), True),
-        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 541.0, v)), False),
-        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -89.9, v)), True),
-        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -90.1, v)), False),
-        (lambda c, r, a, v: (c + 1.1e9, r, a, v), False),
-        (lambda c, r, a, v: (c, r, a * 4e5, v), False),
-        (lambda c, r, a, v: (c, np.where(r == r[1], r[0], r), a, v), False),
-        (lambda c, r, a, v: (c[:1], r, a, v[:, :, :1]), False),
-        (lambda c, r, a, v: (c[:2], r[:2], a[:2], v[:2, :2, :2]), True),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 539.0, v)), ""),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], 541.0, v)), "localisation grid"),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 0], np.nan, v)), "no ground point"),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -89.9, v)), ""),
+        (lambda c, r, a, v: (c, r, a, np.where(v == v[0, 0, 0, 1], -90.1, v)), "localisation grid"),
+        (lambda c, r, a, v: (c + 1.1e9, r, a, v), "localisation grid"),
+        (lambda c, r, a, v: (c, r, a * 4e5, v), "localisation grid"),
+        (lambda c, r, a, v: (c, np.where(r == r[1], r[0], r), a, v), "localisation grid"),
+        (lambda c, r, a, v: (c[::-1], r, a, v), "ascend"),
+        (lambda c, r, a, v: (c[:1], r, a, v[:, :, :1]), "localisation grid"),
+        (lambda c, r, a, v: (c, r, a[:1], v[:1]), "nodes"),
+        (lambda c, r, a, v: (c, r, a, v[..., :1]), "nodes"),
+        (lambda c, r, a, v: (c[:2], r[:2], a[:2], v[:2, :2, :2]), ""),
     ],
 )
-def test_nodes_lie_on_earth_and_in_an_image(change, ok):
+def test_nodes_lie_on_earth_and_in_an_image(change, words):
     grid = sampled(np.linspace(0, 2000, 5), np.linspace(0, 2000, 4), np.linspace(0.0, 4900.0, 3))
     given = change(grid.cols, grid.rows, grid.alts, grid.lonlat)
-    if ok:
+    with pytest.raises(RpcError, match=words) if words else nullcontext():
         assert DirectGrid(*given).lonlat.shape[-1] == 2
-    else:
-        with pytest.raises(RpcError, match="localisation grid"):
-            DirectGrid(*given)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.sensor.centers import camera_center
 from barpc.sensor.geometry import (
     base_to_height,
     convergence_angle,
@@ -17,7 +17,7 @@ from barpc.sensor.geometry import (
     view_angles,
 )
 from barpc.sensor.rpc import RPC
-from barpc.sensor.triangulation import epipolar_offset, triangulate
+from barpc.sensor.triangulation import epipolar_offset, intersect_pair, triangulate
 
 from .conftest import make_rpc
 
@@ -29,6 +29,9 @@ def tilted_rpc(toward: tuple[float, float]) -> RPC:
     coeffs[0, 3] = toward[0] * 500 / rpc.image_scale[0]
     coeffs[2, 3] = toward[1] * 500 / rpc.image_scale[1]
     return RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale)
+
+
+SENSORS = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]
 
 
 def test_the_border_runs_clockwise_on_the_edges_of_the_outer_pixels():
@@ -64,7 +67,7 @@ def test_the_view_angles_are_those_of_the_line_of_sight():
 
 
 def test_the_convergence_angle_is_the_angle_between_the_rays():
-    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    a, b, _ = SENSORS
     ground = a.localize(np.array([9000.0, 9000.0]), np.array(500.0))
     rays = [lines_of_sight(m, m.project(ground), (490.0, 510.0))[1] for m in (a, b)]
     expected = np.degrees(np.arccos(rays[0] @ rays[1]))
@@ -94,25 +97,8 @@ def test_the_ground_sample_distance_is_how_far_neighbouring_pixels_lie_apart():
     assert mean == pytest.approx(np.sqrt(np.linalg.norm(np.cross(right - here, below - here))), rel=1e-5)
 
 
-def test_triangulation_is_the_least_squares_point_under_noise():
-    models = [tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2)), tilted_rpc((0.1, 0.5))]
-    truth = models[0].localize(np.array([[8000.0, 9000.0]]), np.array([400.0]))
-    rng = np.random.default_rng(5)
-    sigma = np.array([0.1, 0.4, 0.2])
-    xy = np.stack([m.project(truth)[0] for m in models]) + rng.normal(0, 0.3, (3, 2))
-    result = triangulate(models, [0, 1, 2], [0, 0, 0], xy, sigma)
-
-    def cost(ecef):
-        ground = ground_from_ecef(ecef)
-        return sum((((m.project(ground) - x) / s) ** 2).sum() for m, x, s in zip(models, xy, sigma, strict=True))
-
-    best = cost(result.points[0])
-    for step in 0.01 * np.vstack([np.eye(3), -np.eye(3)]):
-        assert cost(result.points[0] + step) > best
-
-
 def test_points_without_an_intersection_are_nan_and_flagged():
-    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    a, b, _ = SENSORS
     ground = a.localize(np.array([9000.0, 9000.0]), np.array(500.0))
     pa, pb = a.project(ground), b.project(ground)
     # track 0: fine; 1: one view only; 2: the same view twice, so parallel rays; 3: not finite
@@ -128,32 +114,8 @@ def test_no_tracks_give_no_points():
     assert result.points.shape == (0, 3)
 
 
-def test_the_line_method_finds_the_orbit_of_the_pleiades_crops(shared_data):
-    rasterio = pytest.importorskip("rasterio")
-    from barpc.rpcio import read_rpc
-    from barpc.sensor.rpc import altitude_range
-
-    for path in sorted((shared_data / "optical/phr_triplet_north").glob("*.tif")):
-        rpc = read_rpc(path)
-        with rasterio.open(path) as image:
-            size = (image.width, image.height)
-        line = camera_center(rpc, size, altitude_range(rpc))
-        assert line.method == "line"
-        assert line.altitude == pytest.approx(694e3, rel=0.05)
-
-
-def test_a_centre_that_cannot_be_is_replaced_by_a_nominal_one_on_the_central_ray():
-    rpc = make_rpc()  # its rays are parallel: they meet nowhere
-    center = camera_center(rpc, (20000, 19000), (0.0, 1000.0))
-    assert center.method == "nominal"
-    assert center.altitude == pytest.approx(650e3, rel=1e-5)
-    origin, direction = lines_of_sight(rpc, np.array([9999.5, 9499.5]), (0.0, 1000.0))
-    off = np.cross(center.ecef - origin, direction)
-    assert np.linalg.norm(off) < 1e-3
-
-
 def test_the_epipolar_offset_is_the_shift_across_the_epipolar_line():
-    a, b = tilted_rpc((0.6, -0.4)), tilted_rpc((-0.3, 0.2))
+    a, b, _ = SENSORS
     rng = np.random.default_rng(4)
     truth = a.localize(rng.uniform(4000, 15000, (50, 2)), rng.uniform(0, 1000, 50))
     xa, xb = a.project(truth), b.project(truth)
@@ -184,3 +146,119 @@ def test_lines_of_sight_run_between_altitudes_a_hundred_metres_apart_or_more(giv
     np.testing.assert_allclose(origin, low, atol=1e-6)
     apart = high - low
     np.testing.assert_allclose(direction, apart / np.linalg.norm(apart, axis=1)[:, None], atol=1e-9)
+
+
+# --- intersections, against scipy's least squares of the weighted reprojection errors --------------------------------
+
+
+def scene(tracks: int = 12, noise: float = 2.0):
+    rng = np.random.default_rng(6)
+    truth = SENSORS[0].localize(rng.uniform(4000, 15000, (tracks, 2)), rng.uniform(100, 900, tracks))
+    view = np.concatenate([[0, 1, 2] if p % 3 else [2, 0] for p in range(tracks)])
+    point = np.concatenate([[p] * (3 if p % 3 else 2) for p in range(tracks)])
+    xy = np.array([SENSORS[v].project(truth[p]) for v, p in zip(view, point, strict=True)])
+    order = rng.permutation(len(view))
+    sigma = rng.uniform(0.3, 3.0, len(view))
+    return truth, view[order], point[order], (xy + rng.normal(0, noise, xy.shape))[order], sigma
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_points_are_the_weighted_least_squares_ones(weighted) -> None:
+    truth, view, point, xy, sigma = scene()
+    found = triangulate(SENSORS, view, point, xy, sigma if weighted else None, alt=500.0)
+    assert found.ok.all()
+    for p in range(len(truth)):
+        rows = np.flatnonzero(point == p)
+
+        def residual(x: np.ndarray, rows: np.ndarray = rows, p: int = p) -> np.ndarray:
+            ground = ground_from_ecef(ecef_from_ground(truth[p]) + x)
+            errors = [(SENSORS[view[k]].project(ground) - xy[k]) / (sigma[k] if weighted else 1.0) for k in rows]
+            return np.concatenate(errors)
+
+        expected = least_squares(residual, np.zeros(3), diff_step=1e-4, x_scale=10.0).x
+        np.testing.assert_allclose(found.points[p] - ecef_from_ground(truth[p]), expected, atol=2e-3)
+        ground = ground_from_ecef(found.points[p])
+        for k in rows:
+            np.testing.assert_allclose(found.residuals[k], SENSORS[view[k]].project(ground) - xy[k], atol=1e-6)
+
+
+def test_the_first_guess_is_where_it_is_asked_for_and_steps_are_counted() -> None:
+    truth, view, point, xy, _ = scene(noise=0.0)
+    start = triangulate(SENSORS, view, point, xy, alt=truth[:, 2], steps=1)
+    assert np.linalg.norm(start.points - ecef_from_ground(truth), axis=1).max() < 1e-4
+    far = triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 2000.0, steps=1)
+    assert np.linalg.norm(far.points - ecef_from_ground(truth), axis=1).min() > 1e-3
+    enough = triangulate(SENSORS, view, point, xy, alt=truth[:, 2] + 2000.0)
+    assert np.abs(enough.points - ecef_from_ground(truth)).max() < 1e-5
+    assert np.abs(enough.residuals).max() < 1e-6
+
+
+@pytest.mark.parametrize(("degrees", "usable"), [(3e-4, False), (0.01, True), (1.0, True)])
+def test_rays_that_are_parallel_to_a_thousandth_of_a_degree_determine_no_point(degrees, usable) -> None:
+    """The second camera leans by so much more, half a metre a pixel."""
+    lean = 0.2 + np.radians(degrees) / 0.5
+    two = [tilted_rpc((0.2, 0.0)), tilted_rpc((lean, 0.0))]
+    ground = two[0].localize(np.array([[9000.0, 9000.0]]), np.array([500.0]))
+    xy = np.vstack([sensor.project(ground) for sensor in two])
+    found = triangulate(two, [0, 1], [0, 0], xy, alt=480.0)
+    assert found.ok.tolist() == [usable]
+    assert np.isfinite(found.points).all() == usable
+    assert np.isfinite(found.residuals).all() == usable
+
+
+def test_a_track_without_an_observation_has_no_point() -> None:
+    _, view, point, xy, _ = scene()
+    found = triangulate(SENSORS, view, np.where(point >= 5, point + 1, point), xy, alt=500.0)
+    assert np.flatnonzero(~found.ok).tolist() == [5]
+    assert np.isnan(found.points[5]).all()
+    assert np.isfinite(found.residuals).all()
+
+
+class Other:
+    """The first camera, but no RPC."""
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(SENSORS[0], name)
+
+
+class Blind(Other):
+    """It localises nothing."""
+
+    def localize(self, image: np.ndarray, alt: np.ndarray) -> np.ndarray:
+        return np.full((len(image), 3), np.nan)
+
+
+def test_it_stops_where_the_step_is_below_a_millimetre() -> None:
+    truth, view, point, xy, _ = scene(noise=0.0)
+    calls = []
+
+    class Counted(Other):
+        def project_jacobian(self, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            calls.append(1)
+            return SENSORS[0].project_jacobian(ground)
+
+    triangulate([Counted(), *SENSORS[1:]], view, point, xy, alt=truth[:, 2] + 1.0)
+    assert len(calls) in (2, 3)
+
+
+def test_matches_of_a_pair_meet_where_their_tracks_do() -> None:
+    rng = np.random.default_rng(8)
+    truth = SENSORS[0].localize(rng.uniform(4000, 15000, (60, 2)), rng.uniform(100, 900, 60))
+    image = [SENSORS[v].project(truth) + rng.normal(0, 2.0, (60, 2)) for v in (0, 1)]
+    image[0][3] = image[1][5] = np.nan
+    alt = np.full(60, 500.0)
+    tracks = np.tile([0, 1], 60), np.repeat(np.arange(60), 2), np.stack(image, axis=1).reshape(-1, 2)
+    wanted = ground_from_ecef(triangulate(SENSORS[:2], *tracks, alt=alt).points)
+    found = intersect_pair(SENSORS[:2], image, alt)
+    assert np.flatnonzero(np.isnan(found).any(axis=1)).tolist() == [3, 5]
+    assert (np.isnan(found) == np.isnan(wanted)).all()
+    known = np.isfinite(found[:, 0])
+    assert np.abs(ecef_from_ground(found[known]) - ecef_from_ground(wanted[known])).max() < 1e-6
+    assert np.abs(found[known, 2] - truth[known, 2]).max() > 1.0  # the noise counts
+    parallel = intersect_pair([SENSORS[0], SENSORS[0]], [image[0], image[0]], alt)
+    assert np.isnan(parallel).all()
+    # the first camera's guess is none: the second's counts
+    blind = [Blind(), SENSORS[1]]
+    again = intersect_pair(blind, image, alt)
+    for places in (ecef_from_ground(again), triangulate(blind, *tracks, alt=alt).points):
+        assert np.abs(places[known] - ecef_from_ground(found[known])).max() < 0.1  # residuals of 2 px

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +12,10 @@ from hypothesis import strategies as st
 
 from barpc.base.errors import RpcError
 from barpc.rpcio import read_rpc
-from barpc.sensor.rational import MONOMIALS, monomials
+from barpc.sensor.rational import monomials
 from barpc.sensor.rpc import RPC
 from tests.lanes import rest_slow
-from tests.sensor.conftest import make_rpc
+from tests.sensor.conftest import make_rpc, slopes_off
 
 VENDORS = [
     "optical/phr_triplet_north/img_01.tif",
@@ -104,14 +103,9 @@ def test_a_point_found_far_out_lies_on_the_sheet_of_the_centre(file, shared_data
 def test_the_jacobian_is_the_central_difference(file, shared_data):
     rpc = read_rpc(shared_data / file)
     ground = rpc.localize(*box(rpc, 0.9, 200))
-    value, jacobian = rpc.project_jacobian(ground)
+    value, _ = rpc.project_jacobian(ground)
     np.testing.assert_allclose(value, rpc.project(ground), rtol=0, atol=1e-9 + 1e-13 * np.abs(value).max())
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = 1e-4 * abs(rpc.ground_scale[axis])
-        numeric = (rpc.project(ground + step) - rpc.project(ground - step)) / (2 * step[axis])
-        scale = np.abs(jacobian[:, :, axis]).max()
-        np.testing.assert_allclose(jacobian[:, :, axis], numeric, rtol=0, atol=2e-6 * scale)
+    assert slopes_off(rpc, ground, 1e-4 * np.abs(rpc.ground_scale)) < 2e-6
 
 
 def test_a_chunk_border_shows_nowhere():
@@ -245,14 +239,8 @@ def test_a_point_found_far_out_may_be_off_by_the_rounding_of_its_pixel(col):
 
 def test_an_rpc_tells_its_box():
     rpc = RPC(make_rpc().coeffs, [5.0, 43.0, 500.0], [-0.25, 0.5, 400.0], [1000.0, 900.0], [-1100.0, 950.0])
-    for words in (
-        "lon 4.7500 to 5.2500",
-        "lat 42.5000 to 43.5000",
-        "100 to 900 m",
-        "col -100 to 2100",
-        "row -50 to 1850",
-    ):
-        assert words in repr(rpc)
+    ground = "lon 4.7500 to 5.2500, lat 42.5000 to 43.5000, 100 to 900 m"
+    assert repr(rpc) == f"RPC({ground}, col -100 to 2100, row -50 to 1850)"
 
 
 def test_rpcs_are_off_by_what_their_image_points_are_apart_over_the_box():
@@ -289,14 +277,12 @@ def test_a_crop_and_a_window_of_step_one_are_the_same_to_the_bit():
     np.testing.assert_array_equal(rpc.crop(3, 4).image_offset, rpc.image_offset - [3, 4])
 
 
-def test_equality_and_hash_go_by_content_and_survive_pickling():
+def test_equality_goes_by_content_of_which_the_inverse_that_is_kept_is_no_part():
+    """Of arrays, hashes and pickles: `tests/base/test_frozen.py`."""
     rpc, twin = make_rpc(), make_rpc()
-    rpc.localize([[1.0, 2.0]], [0.0])  # the inverse that is kept is no part of the content
-    assert rpc == twin
-    assert hash(rpc) == hash(twin)
-    assert pickle.loads(pickle.dumps(rpc)) == rpc
+    rpc.localize([[1.0, 2.0]], [0.0])
+    assert (rpc, hash(rpc)) == (twin, hash(twin))
     assert rpc != replace(rpc, err_bias=None)
-    assert rpc != replace(rpc, image_offset=rpc.image_offset + 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -314,25 +300,11 @@ def test_a_camera_that_cannot_be_used_is_refused_when_it_is_made(change, message
         replace(make_rpc(), **change)
 
 
-def test_the_monomials_are_those_of_rpc00b():
-    x, y, z = np.random.default_rng(0).normal(size=(3, 5))
-    values = monomials(np.stack([x, y, z]))
-    for name, row in zip(MONOMIALS, values, strict=True):
-        expected = np.ones(5)
-        for letter in name.replace("1", ""):
-            expected = expected * {"L": x, "P": y, "H": z}[letter]
-        np.testing.assert_allclose(row, expected, rtol=1e-14)
-
-
 @few_vendors
 def test_rpcm_and_the_localisation_agree(file: str, shared_data: Path):
     rpcm = pytest.importorskip("rpcm.rpc_model")
-    from barpc.rpcio.text import write_json
-
     rpc = read_rpc(shared_data / file)
-    import json
-
-    model = rpcm.RPCModel(json.loads(write_json(rpc))["rpc"], dict_format="rpcm")
+    model = rpcm.RPCModel(rpc.to_rpcm_dict(), dict_format="rpcm")
     image, alt = box(rpc, 0.9, 300)
     ground = rpc.localize(image, alt)
     col, row = model.projection(ground[:, 0], ground[:, 1], alt)

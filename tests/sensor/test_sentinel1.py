@@ -8,24 +8,18 @@ from __future__ import annotations
 import csv
 import time
 import warnings
-import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from barpc.base.errors import BarpcError, BarpcWarning, FitError, InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground
 from barpc.base.safe_io import parse_xml
-from barpc.cli import cli
 from barpc.fit import FitOptions, fit_rpc
-from barpc.rpcio import read_rpc
-from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.curve import Curve
 from barpc.sensor.document import seconds
 from barpc.sensor.geometry import view_angles
@@ -39,9 +33,12 @@ from barpc.sensor.sentinel1 import (
     open_product,
     read_annotation,
 )
+from tests.fuzz.mutate import mutate_xml
 from tests.lanes import diagonal, rest_slow
+from tests.sensor.conftest import slopes_off
 from tests.sensor.s1_product import GRD, INTERVAL, IW, SAMPLING, START, STRIPMAP, Product
 
+IW1 = IW["IW1"]
 AUXILIARY = ["20210216t151207", "20220104t170558", "20211223t051122"]
 SLC = ["20160114t054006", "20210216t151207", "20220104t170558", "20210401t052624", "20190803t164007"]
 
@@ -63,33 +60,13 @@ def scatter(model: RangeDoppler, alt: tuple[float, float], count: int = 2000) ->
 
 
 @pytest.fixture(scope="module")
-def iw1() -> Product:
-    return IW["IW1"]
-
-
-@pytest.fixture(scope="module")
-def model(iw1: Product) -> RangeDoppler:
-    return iw1.model()
+def model() -> RangeDoppler:
+    return IW1.model()
 
 
 @pytest.fixture(scope="module")
 def grd() -> RangeDoppler:
     return GRD.model()
-
-
-@pytest.fixture(scope="module")
-def safe(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A SAFE folder: three swaths, two polarisations, and files that are no annotations."""
-    folder = tmp_path_factory.mktemp("s1") / "S1A_IW_SLC__1SDV.SAFE"
-    (folder / "annotation" / "calibration").mkdir(parents=True)
-    for product in IW.values():
-        xml = product.xml()
-        (folder / "annotation" / product.name).write_bytes(xml)
-        crossed = xml.replace(b">VV<", b">VH<")
-        (folder / "annotation" / product.name.replace("-vv-", "-vh-")).write_bytes(crossed)
-        (folder / "annotation" / "calibration" / f"noise-{product.name}").write_bytes(b"<noise/>")
-    (folder / "manifest.safe").write_bytes(b"<x/>")
-    return folder
 
 
 # --- geometry against an exact orbit
@@ -116,8 +93,8 @@ def test_times_are_those_of_the_exact_orbit(product: Product) -> None:
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("delays", [{}, {"atmosphere": True}, {"bistatic": "annotated"}, {"bistatic": "full"}])
-def test_localisation_inverts_projection_from_the_dead_sea_to_everest(iw1: Product, delays: dict[str, bool]) -> None:
-    built = RangeDoppler.from_annotation(read_annotation(iw1.xml()), **delays)
+def test_localisation_inverts_projection_from_the_dead_sea_to_everest(delays: dict[str, bool]) -> None:
+    built = RangeDoppler.from_annotation(read_annotation(IW1.xml()), **delays)
     image, alt = scatter(built, (-500.0, 9000.0))
     assert np.abs(built.project(built.localize(image, alt)) - image).max() <= 1e-8
 
@@ -140,12 +117,7 @@ def test_derivatives_with_delays_are_central_differences(
     rows = (0.59 + np.arange(20)) / INTERVAL  # away from the times where polynomials of a GRD join
     image = np.stack([rng.uniform(0, built.size[0], 20), rows % (built.size[1] - 1000)], axis=1)
     ground = built.localize(image, rng.uniform(0, 3000, 20))
-    jacobian = built.project_jacobian(ground)[1]
-    for axis, step in enumerate((1e-4, 1e-4, 10.0)):
-        move = np.zeros(3)
-        move[axis] = step
-        difference = (built.project(ground + move) - built.project(ground - move)) / (2 * step)
-        assert np.abs(jacobian[..., axis] - difference).max() <= 1e-7 * np.abs(difference).max()
+    assert slopes_off(built, ground, np.array([1e-4, 1e-4, 10.0])) <= 1e-7
 
 
 def test_a_left_looking_model_sees_the_other_side_of_the_track(model: RangeDoppler) -> None:
@@ -210,26 +182,20 @@ def test_the_order_and_repetition_of_state_vectors_do_not_matter() -> None:
     assert fit_orbit(times[shuffled], position[shuffled], velocity[shuffled], (0.0, 25.0)) == orbit
 
 
-def test_a_precise_orbit_file_gives_the_same_model(iw1: Product, tmp_path: Path, model: RangeDoppler) -> None:
+def test_a_precise_orbit_file_gives_the_same_model(tmp_path: Path, model: RangeDoppler) -> None:
     path = tmp_path / "S1A_OPER_AUX_POEORB.EOF"
-    path.write_bytes(iw1.eof())
-    annotation = read_annotation(iw1.xml())
+    path.write_bytes(IW1.eof())
+    annotation = read_annotation(IW1.xml())
     precise = RangeDoppler.from_annotation(annotation, orbit=path)
     ground = model.localize(*scatter(model, (0.0, 3000.0), 200))
     assert np.abs(precise.project(ground) - model.project(ground)).max() <= 3e-4
-    path.write_bytes(iw1.eof(mission="Sentinel-1B"))
-    with pytest.raises(RpcFormatError, match="Sentinel-1B, the image is of S1A"):
-        RangeDoppler.from_annotation(annotation, orbit=path)
-    path.write_bytes(iw1.eof(start=20000.0))
+    path.write_bytes(IW1.eof(start=20000.0))
     with pytest.raises(RpcFormatError, match="take the orbit file of that day"):
         RangeDoppler.from_annotation(annotation, orbit=path)
-    path.write_bytes(iw1.eof(start=15.0))
-    with pytest.raises(RpcError, match="state vectors from"):
-        RangeDoppler.from_annotation(annotation, orbit=path)
-    path.write_bytes(iw1.eof().replace(b"EARTH_FIXED", b"MEAN_OF_DATE"))
+    path.write_bytes(IW1.eof().replace(b"EARTH_FIXED", b"MEAN_OF_DATE"))
     with pytest.raises(RpcFormatError, match="MEAN_OF_DATE"):
         RangeDoppler.from_annotation(annotation, orbit=path)
-    path.write_bytes(iw1.xml())
+    path.write_bytes(IW1.xml())
     with pytest.raises(RpcFormatError, match="not a Sentinel-1 orbit file"):
         RangeDoppler.from_annotation(annotation, orbit=path)
 
@@ -237,8 +203,8 @@ def test_a_precise_orbit_file_gives_the_same_model(iw1: Product, tmp_path: Path,
 # --- frames
 
 
-def test_bursts_are_cut_in_the_middle_of_their_overlap(iw1: Product) -> None:
-    rows = burst_rows(read_annotation(iw1.xml()))
+def test_bursts_are_cut_in_the_middle_of_their_overlap() -> None:
+    rows = burst_rows(read_annotation(IW1.xml()))
     assert [r.first_line for r in rows] == [1500 * k for k in range(9)]
     assert [r.first_row for r in rows] == [1342 * k for k in range(9)]
     assert rows[0].start == 20
@@ -250,12 +216,12 @@ def test_bursts_are_cut_in_the_middle_of_their_overlap(iw1: Product) -> None:
     assert max(abs(r.offset) for r in rows) <= 5e-4
 
 
-def test_a_burst_is_a_window_of_the_stitched_frame(iw1: Product, model: RangeDoppler) -> None:
-    annotation = read_annotation(iw1.xml())
+def test_a_burst_is_a_window_of_the_stitched_frame(model: RangeDoppler) -> None:
+    annotation = read_annotation(IW1.xml())
     rows = burst_rows(annotation)
     for k in (0, 4, 8):
         burst = RangeDoppler.from_annotation(annotation, burst=k)
-        assert burst.size == (iw1.samples, iw1.lines_per_burst)
+        assert burst.size == (IW1.samples, IW1.lines_per_burst)
         ground = burst.localize(*scatter(burst, (0.0, 2000.0), 50))
         shifted = burst.project(ground) + [0.0, rows[k].first_row + rows[k].offset]
         assert np.abs(shifted - model.project(ground)).max() <= 1e-6
@@ -266,8 +232,6 @@ def test_swaths_stand_side_by_side_in_the_mosaic() -> None:
     annotations = [read_annotation(product.xml()) for product in IW.values()]
     whole = mosaic(annotations)
     offsets = mosaic_offsets(annotations)
-    assert whole.size[0] == 45000 + 24300
-    np.testing.assert_allclose(offsets[:, 0], [0, 22000, 45000], atol=1e-6)
     for annotation, offset in zip(annotations, offsets, strict=True):
         swath = RangeDoppler.from_annotation(annotation)
         ground = swath.localize(*scatter(swath, (0.0, 2000.0), 50))
@@ -275,8 +239,8 @@ def test_swaths_stand_side_by_side_in_the_mosaic() -> None:
     assert mosaic(annotations[::-1]) == whole
 
 
-def test_the_annotated_bistatic_correction_meets_the_lines_of_the_grid(iw1: Product) -> None:
-    for product in (iw1, GRD):
+def test_the_annotated_bistatic_correction_meets_the_lines_of_the_grid() -> None:
+    for product in (IW1, GRD):
         annotation = read_annotation(product.xml())
         built = RangeDoppler.from_annotation(annotation, bistatic="annotated")
         row = seconds(annotation.line_time(annotation.grid.image[:, 1]), built.epoch) / INTERVAL
@@ -286,14 +250,14 @@ def test_the_annotated_bistatic_correction_meets_the_lines_of_the_grid(iw1: Prod
         assert 0.04 <= np.abs(plain).max() <= 0.2
 
 
-def test_a_bistatic_correction_completes_that_of_the_processor_only(iw1: Product) -> None:
-    annotation = replace(read_annotation(iw1.xml()), bistatic_applied=False)
+def test_a_bistatic_correction_completes_that_of_the_processor_only() -> None:
+    annotation = replace(read_annotation(IW1.xml()), bistatic_applied=False)
     with pytest.raises(InputError, match="no bistatic correction by the processor"):
         RangeDoppler.from_annotation(annotation, bistatic="annotated")
 
 
-def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine(iw1: Product) -> None:
-    annotation = read_annotation(iw1.xml())
+def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine() -> None:
+    annotation = read_annotation(IW1.xml())
     with_air = RangeDoppler.from_annotation(annotation, atmosphere=True)
     without = RangeDoppler.from_annotation(annotation)
     ground = without.localize(np.array([10000.0, 6000.0]), np.array([0.0, 3000.0]))
@@ -303,65 +267,6 @@ def test_the_atmosphere_lengthens_the_path_by_its_zenith_delay_over_the_cosine(i
 
 
 # --- products
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_product_opens_as_folder_manifest_or_zip(
-    safe: Path, tmp_path: Path, model: RangeDoppler, packed: bool
-) -> None:
-    paths = [safe, safe / "manifest.safe"]
-    if packed:
-        paths = [tmp_path / "product.zip"]
-        with zipfile.ZipFile(paths[0], "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in safe.rglob("*.*"):
-                archive.write(file, str(file.relative_to(safe.parent)))
-    for path in paths:
-        assert open_product(path, swath="iw1", polarisation="vv") == model
-        assert open_product(str(path), swath="IW1", polarisation="VH") == model
-        assert open_product(path, swath="mosaic").size[0] == 69300
-        assert open_product(path, swath="iw2", burst=3).size == (25000, 1500)
-    assert open_product(safe / "annotation" / IW["IW1"].name) == model
-
-
-def test_a_polarisation_that_there_is_not_is_refused(safe: Path, tmp_path: Path) -> None:
-    xml = (safe / "annotation" / IW["IW1"].name).read_text()
-    (tmp_path / "odd.xml").write_text(xml.replace("<polarisation>VV<", "<polarisation>VV VV<"))
-    with pytest.raises(RpcFormatError, match=r"odd\.xml: polarisation vv vv is none of vv, hh, vh, hv"):
-        open_product(tmp_path / "odd.xml")
-
-
-def test_a_wrong_choice_lists_what_there_is(safe: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="choose one of iw1, iw2, iw3, mosaic"):
-        open_product(safe)
-    with pytest.raises(InputError, match="no swath iw4; choose one of iw1, iw2, iw3, mosaic"):
-        open_product(safe, swath="iw4")
-    with pytest.raises(InputError, match="no polarisation hh; choose one of vv, vh"):
-        open_product(safe, swath="iw1", polarisation="hh")
-    with pytest.raises(InputError, match="no burst 9, it has 9"):
-        open_product(safe, swath="iw1", burst=9)
-    with pytest.raises(InputError, match="burst 1 of the mosaic"):
-        open_product(safe, swath="mosaic", burst=1)
-    with pytest.raises(InputError, match="jumps between swaths"):
-        open_product(safe, swath="mosaic", bistatic="full")
-    with pytest.raises(RpcFormatError, match="no Sentinel-1 annotation"):
-        open_product(tmp_path)
-    with pytest.raises(RpcFormatError, match="no such file"):
-        open_product(tmp_path / "missing.SAFE")
-    (tmp_path / "broken.zip").write_bytes(b"PK\x03\x04 and no more")
-    with pytest.raises(RpcFormatError, match=r"broken\.zip"):
-        open_product(tmp_path / "broken.zip")
-
-
-def test_a_damaged_zip_is_refused_by_name(safe: Path, tmp_path: Path) -> None:
-    path = tmp_path / "product.zip"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.write(safe / "annotation" / IW["IW1"].name, f"x.SAFE/annotation/{IW['IW1'].name}")
-    data = bytearray(path.read_bytes())
-    data[2000:2100] = bytes(100)
-    path.write_bytes(bytes(data))
-    with pytest.raises(RpcFormatError, match=r"product\.zip: s1a-iw1-.* cannot be read"):
-        open_product(path)
 
 
 def test_a_grd_is_not_taken_for_a_swath(tmp_path: Path) -> None:
@@ -383,8 +288,6 @@ def test_a_stripmap_image_is_one_frame_without_bursts(tmp_path: Path) -> None:
     path.write_bytes(STRIPMAP.xml())
     strip = open_product(path, swath="s3", bistatic="full")
     assert strip.size == (STRIPMAP.samples, STRIPMAP.lines)
-    with pytest.raises(InputError, match="a mosaic takes TOPS SLC swaths, this is a S3 SLC of S3"):
-        mosaic([path])
 
 
 # --- bad input
@@ -414,8 +317,8 @@ def _without(xml: bytes, tag: bytes) -> bytes:
 
 @pytest.mark.few(5)
 @pytest.mark.parametrize("index", range(13), ids=[what for what, _, _ in broken(IW["IW1"].xml())])
-def test_a_broken_annotation_is_refused_with_what_and_where(iw1: Product, index: int) -> None:
-    _, xml, message = list(broken(iw1.xml()))[index]
+def test_a_broken_annotation_is_refused_with_what_and_where(index: int) -> None:
+    _, xml, message = list(broken(IW1.xml()))[index]
     with pytest.raises(RpcError, match=message):
         RangeDoppler.from_annotation(read_annotation(xml, name="s1a.xml"))
 
@@ -427,7 +330,7 @@ def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant(count:
     small = replace(IW["IW1"], samples=900, num_bursts=3, lines_per_burst=60, burst_cycle=50)
     sources = [small.xml(), replace(GRD, samples=900, num_bursts=1, lines_per_burst=300).xml()]
     for k in range(count):
-        xml = mutated(sources[k % 2], rng)
+        xml = mutate_xml(sources[k % 2], rng)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", BarpcWarning)
@@ -436,25 +339,6 @@ def test_no_mutation_of_an_annotation_gets_past_the_errors_that_are_meant(count:
             built.project_jacobian(built.localize(np.array([10.0, 10.0]), np.array(0.0)))
         except BarpcError as error:
             assert "\n" not in str(error)  # noqa: PT017 - anything else must surface
-
-
-def mutated(xml: bytes, rng: np.random.Generator) -> bytes:
-    """The annotation with one to three elements removed, emptied, garbled or filled with nonsense."""
-    nonsense = ["", "0", "-1", "1e400", "nan", "x", "1 2 3", "1e-300", "9" * 20, "2021-02-16T15:12:07", "GRD"]
-    root = ElementTree.fromstring(xml)
-    parents = {child: parent for parent in root.iter() for child in parent}
-    for _ in range(rng.integers(1, 4)):
-        element = list(parents)[rng.integers(len(parents))]
-        text = list((element.text or "").strip())
-        way = rng.integers(3)
-        if way == 0 and element in parents[element]:
-            parents[element].remove(element)
-        elif way == 1 and text:
-            text[rng.integers(len(text))] = chr(rng.integers(33, 127))
-            element.text = "".join(text)
-        else:
-            element.text = nonsense[rng.integers(len(nonsense))]
-    return ElementTree.tostring(root)
 
 
 def test_too_few_state_vectors_and_extrapolation_are_refused() -> None:
@@ -476,34 +360,6 @@ def test_an_rpc_of_a_swath_keeps_a_thousandth_of_a_pixel_and_its_rows_to_the_flo
     fit = fit_rpc(model, model.size, model.alt_range)
     assert fit.rmse_ckp[0] <= 1.5e-4
     assert fit.rmse_ckp[1] <= 1e-6
-
-
-@pytest.mark.slow
-def test_an_rpc_of_a_moved_swath_is_fitted_by_the_same_function(model: RangeDoppler) -> None:
-    center = model.orbit.states(np.array([12.0]))[0][:, 0]
-    moved = Corrected(model, Correction([1e-6, -2e-6, 1e-6], [5.0, -3.0, 2.0], center))
-    fit = fit_rpc(moved, model.size, model.alt_range)
-    assert fit.rmse_ckp[0] <= 1.5e-4
-    ground = model.localize(*scatter(model, (0.0, 500.0), 20))
-    assert 0.5 <= np.abs(moved.project(ground) - model.project(ground)).max() <= 10.0
-
-
-@pytest.mark.slow
-def test_the_command_line_fits_swaths_bursts_and_mosaics(safe: Path, tmp_path: Path, model: RangeDoppler) -> None:
-    runner, out = CliRunner(), tmp_path / "iw1_RPC.TXT"
-    for choices in ("swath=iw1,pol=vh", "swath=mosaic", "swath=iw3,burst=2"):
-        command = ["fit", f"{safe},{choices}", "-o", str(out), "--overwrite"]
-        result = runner.invoke(cli, command, standalone_mode=False)
-        assert result.exception is None
-        assert "within tolerance" in result.stdout
-    eof = tmp_path / "S1A.EOF"
-    eof.write_bytes(IW["IW1"].eof())
-    spec = f"{safe},swath=iw1,orbit={eof},atmosphere=yes,bistatic=full"
-    result = runner.invoke(cli, ["fit", spec, "-o", str(out), "--overwrite"], standalone_mode=False)
-    assert result.exception is None
-    delayed = open_product(safe, swath="iw1", orbit=eof, atmosphere=True, bistatic="full")
-    ground = model.localize(*scatter(model, (0.0, 500.0), 100))
-    assert np.abs(read_rpc(out).project(ground) - delayed.project(ground)).max() <= 1e-3
 
 
 def test_a_point_costs_microseconds(model: RangeDoppler) -> None:

@@ -9,19 +9,13 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from barpc.ba import adjust_tracks
 from barpc.base.errors import InputError, RpcError, RpcFormatError
 from barpc.base.geodesy import ecef_from_ground, ground_from_ecef
 from barpc.cameras import open_camera
 from barpc.fit import fit_rpc
-from barpc.scene import Tracks, View
-from barpc.sensor.centers import camera_center
-from barpc.sensor.corrected import Corrected, Correction
 from barpc.sensor.geometry import view_angles
 from barpc.sensor.sicd import find_sicd, is_sicd, open_sicd
-from barpc.sensor.triangulation import triangulate
-from barpc.simulate import Look, fly
-from tests.sensor.radar_documents import DURATION, KINDS, SIZE, document, nitf
+from tests.sensor.radar_documents import KINDS, SIZE, document, nitf
 
 CASES = [(kind, side) for kind in KINDS for side in "RL"]
 
@@ -104,13 +98,6 @@ def test_only_the_side_that_is_looked_at_is_seen(side, model_of):
     np.testing.assert_allclose(toward, -90.0 if side == "R" else 90.0, atol=4.0)
 
 
-def test_the_centre_is_that_of_the_antenna(model_of):
-    model = model_of("PFA")
-    center = camera_center(model, model.size, model.alt_range)
-    assert center.method == "stated"
-    assert np.linalg.norm(center.ecef - model.orbit(np.array([DURATION / 2]))[0][:, 0]) < 1.0
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_part_of_an_image_and_a_nitf_are_read_as_they_are(kind, tmp_path, model_of):
     whole, part = model_of(kind), model_of(kind, first=(700, 300))
@@ -169,9 +156,7 @@ def test_an_rpc_holds_the_image(kind, model_of):
         ("<SS>0.8", "<SS>-0.8", "Grid/Row/SS is -0.8"),
         ("<NumRows>700", "<NumRows>nan", "not finite"),
         ("<Row>340", "<Row>341.5x", "not a list of numbers"),
-        ('exponent1="1"', 'exponent1="31"', "of no power from 0 to 30"),
         ('exponent1="1"', 'exponent1="-1"', "of no power from 0 to 30"),
-        ("<SCP><ECF><X>4", "<SCP><ECF><X>5", "m above the ellipsoid, not on the ground"),
         ("ARPPoly", "APPoly", "no Position/ARPPoly/X"),
         ("<CollectDuration>6.0", "<CollectDuration>0", "CollectDuration is 0"),
     ],
@@ -193,34 +178,3 @@ def test_a_nitf_that_ends_early_is_one_line(cut, tmp_path):
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(RpcError, match=r"image\.ntf"):
         open_sicd(path)
-
-
-@pytest.mark.slow
-def test_a_radar_and_two_optical_images_are_adjusted_together(model_of):
-    """Errors of a metre and a microradian, found from 300 noisy tie points; exact points agree afterwards."""
-    rng, radar = np.random.default_rng(8), model_of("PFA", squint=0.1)
-    target = np.array([5.4, 43.3, 120.0])
-    optical = [fly(target, Look(i, a), (2000, 2000), 0.5) for i, a in ((12.0, 10.0), (12.0, 190.0))]
-    views = [
-        View("a", "", (2000, 2000), optical[0], (-100.0, 400.0)),
-        View("b", "", (2000, 2000), optical[1], (-100.0, 400.0)),
-        View("r", "", SIZE, radar, (-100.0, 400.0)),
-    ]
-    centers = [camera_center(v.sensor, v.size, v.alt_range).ecef for v in views]
-    turned = [Correction(rng.normal(0, 2e-6, 3), rng.normal(0, 1.0, 3), center) for center in centers]
-    truth = [Corrected(view.sensor, turn) for view, turn in zip(views, turned, strict=True)]
-    ground = target + np.column_stack(
-        [rng.uniform(-2e-3, 2e-3, 600), rng.uniform(-2e-3, 2e-3, 600), rng.uniform(-80, 150, 600)]
-    )
-    exact = np.stack([model.project(ground) for model in truth])
-    tied, held = slice(0, 300), slice(300, None)
-    view, point = np.repeat(np.arange(3), 300), np.tile(np.arange(300), 3)
-    noisy = exact[:, tied].reshape(-1, 2) + rng.normal(0, 0.1, (900, 2))
-    found = adjust_tracks(views, Tracks(view, point, noisy, np.full(900, 0.1)))
-    rows = (view, point, exact[:, held].reshape(-1, 2))
-    before, after = (
-        np.sqrt(np.mean(np.square(triangulate(s, *rows, alt=100.0).residuals)))
-        for s in ([v.sensor for v in views], found.sensors)
-    )
-    assert before > 0.3
-    assert after < 0.02

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,11 +12,13 @@ from barpc.base.geodesy import ecef_from_ground
 from barpc.rpcio import read_rpc
 from barpc.sensor.centers import camera_center, camera_centers
 from barpc.sensor.corrected import Corrected, Correction
-from barpc.sensor.geometry import Several
+from barpc.sensor.geometry import Several, sight_enu
 from barpc.sensor.rpc import RPC, RpcStack, localize_stack
 from barpc.sensor.sampler import GRID_NODES, Sample, image_grid
 from barpc.simulate import simulate_block
 from tests.sensor.test_rpc import VENDORS, box
+
+FIELDS = "coeffs", "ground_offset", "ground_scale", "image_offset", "image_scale"
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +27,7 @@ def sensors():
     views = [view.sensor for view in simulate_block(6, 0, num_checks=0, lon=179.99).views]
     bent = views[2].coeffs.copy()
     bent[1, 1] = 2.0
-    views[2] = type(views[2])(bent, *(getattr(views[2], name) for name in (
-        "ground_offset", "ground_scale", "image_offset", "image_scale")))  # fmt: skip
+    views[2] = replace(views[2], coeffs=bent)
     views[4] = Corrected(views[4], Correction(np.full(3, 1e-5), np.zeros(3), np.array([4e6, 4e5, 5e6])))
     return views
 
@@ -76,23 +78,33 @@ def test_cameras_of_all_kinds_are_asked_as_each_alone(sensors, count):
     np.testing.assert_allclose(np.moveaxis(found[1], -1, 0), by_ground, rtol=1e-9, atol=1e-9)
 
 
-def test_a_camera_whose_points_are_certain_is_not_asked_alone(sensors, monkeypatch):
+class Mute(RPC):
+    """An RPC that localises nothing by itself."""
+
+    localize = None
+
+
+def test_a_camera_whose_points_are_certain_is_not_asked_alone(sensors):
     some, rng = [sensors[i] for i in (0, 1, 3)], np.random.default_rng(1)
     image, alt, bounds = rng.uniform(5_000, 15_000, (60, 2)), rng.uniform(200, 700, 60), np.array([0, 20, 40, 60])
     alone = [
         one.localize(image[part], alt[part]) for one, part in zip(some, map(slice, bounds, bounds[1:]), strict=False)
     ]
-    monkeypatch.setattr(RPC, "localize", None)
-    np.testing.assert_allclose(localize_stack(some, image, alt, bounds), np.concatenate(alone), rtol=0, atol=2e-12)
+    mute = [Mute(*(getattr(one, name) for name in FIELDS)) for one in some]
+    np.testing.assert_allclose(localize_stack(mute, image, alt, bounds), np.concatenate(alone), rtol=0, atol=2e-12)
 
 
-@pytest.mark.parametrize("drifts", [(1, 1, 1), (0, 1, 1)])
+@pytest.mark.parametrize("drifts", [(1, 1, 1), (0, 1, 1), (None, None, None)])
 def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
-    """One behind many corrections, or, where their drifts are of several degrees, each by itself; in any order."""
+    """One behind many corrections, or, where their drifts are of several degrees, each by itself; RPCs behind none;
+    in any order."""
     rng, rpcs = np.random.default_rng(2), [view.sensor for view in simulate_block(3, 0, num_checks=0).views]
     center = ecef_from_ground(rpcs[0].ground_offset) * 1.1
     some = []
     for k, (rpc, degree) in enumerate(zip(rpcs, drifts, strict=True)):
+        if degree is None:
+            some.append(rpc)
+            continue
         turn, move, drift = (rng.normal(0, size, shape) for size, shape in ((2e-5, 3), (3.0, 3), (1e-5, (degree, 3))))
         some.append(Corrected(rpc, Correction(turn, move, center + 9.0 * k, drift, 9e3, 8e3, 1.0 + 1e-6 * k)))
     view = rng.integers(0, 3, 60)
@@ -106,6 +118,8 @@ def test_cameras_behind_corrections_are_asked_as_each_alone(drifts):
     expected = [one.project_jacobian(point) for one, point in zip(alone, ground, strict=True)]
     np.testing.assert_allclose(seen, [one for one, _ in expected], rtol=0, atol=1e-7)
     np.testing.assert_allclose(jacobian, [one for _, one in expected], rtol=1e-8, atol=1e-9)
+    sights = [sight_enu(one, point) for one, point in zip(alone, ground, strict=True)]
+    np.testing.assert_allclose(sight_enu(many, ground), sights, rtol=0, atol=1e-9)
     asked = many.each(lambda sensor, points: points + some.index(sensor), ground)
     np.testing.assert_array_equal(asked, ground + view[:, None])
     sizes = [(20_000, 19_000), (9_000, 8_000), (5_000, 20_000)]
