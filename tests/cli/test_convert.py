@@ -15,8 +15,6 @@ from rasterio.windows import Window
 
 from barpc.base.errors import InputError, OutputError, Remark, UsageError
 from barpc.cameras import open_camera
-from barpc.cli import terminal as printing
-from barpc.cli.convert import _tell_readings
 from barpc.pipeline.verify_outputs import Reading
 from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
 from barpc.scene import Camera
@@ -24,16 +22,9 @@ from barpc.sensor.sampler import Scattered
 from barpc.verbs import converting as module
 from barpc.verbs.converting import Converted, box_of, check_target, convert, window_of
 from tests.cli.test_main import run
-from tests.rpcio.conftest import make_rpc, write_image
+from tests.rpcio.conftest import make_rpc
 
 NAN = float("nan")
-
-
-@pytest.fixture
-def image(tmp_path: Path) -> Path:
-    raw = write_image(tmp_path / "raw.tif", shape=(1, 200, 300))
-    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
-    return tmp_path / "in" / "scene.tif"
 
 
 @pytest.fixture
@@ -49,10 +40,7 @@ def file(tmp_path: Path) -> Path:
     ("words", "told"),
     [
         (["a", "-o", "d", "--window", "0", "0", "1", "1"], "--window goes with a TARGET, not with -o"),
-        (
-            ["a", "-o", "d", "--bbox", "0", "0", "1", "1", "--images", "vrt"],
-            "--images goes with whole images",
-        ),
+        (["a", "-o", "d", "--bbox", "0", "0", "1", "1", "--images", "vrt"], "--images goes with whole images"),
         (["a"], "give SOURCE and TARGET, or images and -o DIR"),
         (["a", "b", "c"], "give SOURCE and TARGET, or images and -o DIR"),
         (["a", "b", "--rpc", "c"], "give SOURCE and TARGET, or images and -o DIR"),
@@ -263,16 +251,7 @@ def test_a_box_is_cut_out_of_every_image_that_shows_it(
 ) -> None:
     paths, box = four
     before = {path: Path(path).read_bytes() for path in paths}
-    words = [
-        "convert",
-        *paths,
-        "-o",
-        str(tmp_path / "crops"),
-        "--bbox",
-        *map(str, box),
-        "--rpc-format",
-        "txt",
-    ]
+    words = ["convert", *paths, "-o", tmp_path / "crops", "--bbox", *box, "--rpc-format", "txt"]
     assert run(*words) == 0
     said = capsys.readouterr()
     found = sorted(p.name for p in (tmp_path / "crops").iterdir() if not p.name.startswith("."))
@@ -316,6 +295,8 @@ def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.Ca
     found = json.loads(capsys.readouterr().out)
     assert found.pop("max_px") < 1e-9
     assert found == {"path": target, "window": [50, 60, 100, 80]}
+    assert run("convert", image, tmp_path / "x.tif", "--window", 590, 0, 100, 80) == 1
+    assert not (tmp_path / "x.tif").exists()
 
 
 @pytest.mark.parametrize("name", ["w.vrt", "w.ntf", "w.png", "w_RPC.TXT", "w"])
@@ -381,20 +362,6 @@ def test_a_grid_that_does_not_hold_the_camera_ends_with_3(
 # --- a folder ---------------------------------------------------------------------------------------------
 
 
-def test_what_readers_see_is_a_line_or_a_row_each(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    readings = [Reading(Path("a"), "gdal", 1.3e-9), Reading(Path("b"), "rpcm", NAN, "no field")]
-    _tell_readings(readings)
-    assert capsys.readouterr().out == "a: gdal 1.3e-09 px\nb: rpcm no field\n"
-    monkeypatch.setattr(printing, "wants_json", lambda: True)
-    _tell_readings(readings)
-    assert json.loads(capsys.readouterr().out) == [
-        {"path": "a", "consumer": "gdal", "max_px": 1.3e-9, "note": ""},
-        {"path": "b", "consumer": "rpcm", "max_px": None, "note": "no field"},
-    ]
-
-
 @pytest.mark.parametrize(("errors", "said"), [
     ((1e-13, 8e-13, 0.0), "2 images written, all readers agree to 8e-13 px."),
     ((1e-13, 0.25, 0.0), "2 images written, all readers differ from the camera by up to 0.2 px."),
@@ -421,6 +388,9 @@ def test_names_of_a_hand_off_are_checked_first(image: Path, tmp_path: Path) -> N
         handed([b, a.with_name("y.tif")], a.parent)
     with pytest.raises(InputError):
         handed([a], Path(str(tmp_path / "a\0b")))
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match=r"no RPC of scene\.tif there"):
+        handed([image], out)
     assert not out.exists()
 
 
@@ -456,7 +426,7 @@ def test_a_hand_off_writes_the_formats_named_and_tells_what_is_wrong(
     words = ("-o", str(out), "--rpc", str(tmp_path / "rpc.geom"), "--rpc-format", " txt,,json ")
     assert run("convert", str(image.parent), *words) == 3
     alts = open_camera(str(tmp_path / "rpc.geom")).alt_range
-    assert asked == [(["scene.rpc.json", "scene.vrt", "scene_RPC.TXT"], (300, 200), alts, True)]
+    assert asked == [(["scene.rpc.json", "scene.vrt", "scene_RPC.TXT"], (600, 400), alts, True)]
     assert read_rpc(out / "scene_RPC.TXT") == make_rpc()
     said = capsys.readouterr()
     *lines, last = said.out.splitlines()

@@ -137,21 +137,6 @@ def _from(cause: BaseException, error: BaseException) -> BaseException:
     return error
 
 
-@pytest.fixture
-def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
-    """Sets what every call of the group does: it returns a value or raises an error."""
-
-    def does(what: object) -> None:
-        def called(**_: object) -> object:
-            if isinstance(what, BaseException):
-                raise what
-            return what() if callable(what) else what
-
-        monkeypatch.setattr(cli, "main", called)
-
-    return does
-
-
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
@@ -281,5 +266,6 @@ def test_how_much_is_logged(
     assert how["level"] == level
     (handler,) = how["handlers"]  # type: ignore[misc]
     assert handler.stream is sys.stderr
-    assert bool(handler.filter(logging.LogRecord("gcsfs", 40, "", 0, "x", (), None))) == all_of_it
+    for name, shown in (("barpc.a", True), ("gcsfs", all_of_it)):
+        assert bool(handler.filter(logging.LogRecord(name, 40, "", 0, "x", (), None))) == shown
     assert warnings.showwarning is before

@@ -15,22 +15,15 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import Remark
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc
 from barpc.scene import Camera
 from barpc.sensor.triangulation import triangulate
 from barpc.verbs.moving import moved
 from tests.cli.test_main import run
-from tests.rpcio.conftest import make_rpc, write_image
+from tests.rpcio.conftest import make_rpc
 
 pytestmark = pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")  # the motion and the refit are told
 SAMPLES = Path(__file__).parents[2] / "data_samples"
-
-
-@pytest.fixture
-def image(tmp_path: Path) -> Path:
-    raw = write_image(tmp_path / "raw.tif", shape=(1, 200, 300))
-    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
-    return tmp_path / "in" / "scene.tif"
 
 
 def _seen(camera, count=50):

@@ -24,7 +24,6 @@ from barpc.base.errors import InputError
 from barpc.cli.terminal import MINUTE, Lines, progress_told
 from barpc.verbs.workers import THREADS, executor_for
 from tests.lanes import rest_slow
-from tests.reliability.conftest import pristine  # noqa: F401
 
 
 class Told:
@@ -37,6 +36,7 @@ class Told:
 
 def test_a_line_comes_when_a_minute_is_over_and_not_before() -> None:
     told = Told()
+    told.lines.look()  # nothing has begun
     told.lines("match", 0, 40)
     told.now += MINUTE - 0.1
     told.lines("match", 3, 40)
@@ -72,7 +72,7 @@ def test_of_what_nothing_is_done_no_end_is_told() -> None:
 
 @pytest.mark.slow
 @pytest.mark.landing(6)
-def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:  # noqa: F811
+def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:
     screen, side = pytest.importorskip("pty").openpty()
     with subprocess.Popen([sys.executable, "-m", "barpc", "check", *pristine[:2]], stdout=side, stderr=side):
         os.close(side)

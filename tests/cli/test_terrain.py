@@ -13,20 +13,13 @@ import rasterio
 
 from barpc.base.errors import Remark
 from barpc.cameras import open_camera
-from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import Camera
 from barpc.verbs.points import altitude_of, exchanged
 from tests import geotiffs
 from tests.cli.test_images import run
 from tests.report.conftest import run_of_block, written
-from tests.rpcio.conftest import make_rpc, write_image
-
-
-@pytest.fixture
-def image(tmp_path: Path) -> Path:
-    raw = write_image(tmp_path / "raw.tif", shape=(1, 400, 600))
-    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
-    return tmp_path / "in" / "scene.tif"
+from tests.rpcio.conftest import make_rpc
 
 
 @pytest.fixture
@@ -106,7 +99,9 @@ def test_a_dem_is_asked_where_one_is_given(image, dem, tmp_path, capsys):
     rpc = read_rpc(image)
     assert run("info", image, "--dem", dem, "--json") == 0
     captured = capsys.readouterr()
-    lon, lat = json.loads(captured.out)[0]["center_deg"]
+    (found,) = json.loads(captured.out)
+    lon, lat = found["center_deg"]
+    assert found["center_alt_m"] == pytest.approx(60 + 1000 * (lon - 5.4), abs=2e-3)
     seen = rpc.project([lon, lat, 60 + 1000 * (lon - 5.4)])
     np.testing.assert_allclose(seen, [299.5, 199.5], atol=1e-2)
     assert captured.err == ""
@@ -134,9 +129,13 @@ def test_an_altitude_and_a_dem_contradict_each_other(verb, image, dem, tmp_path,
     assert "--geoid goes with --dem" in capsys.readouterr().err
 
 
-def test_a_dem_without_a_height_there_is_an_error(image, dem, tmp_path, capsys):
+@pytest.mark.parametrize("how", ["outside", "in a void"])
+def test_a_dem_without_a_height_there_is_an_error(how, image, dem, capsys):
     with rasterio.open(dem, "r+") as out:
-        out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
+        if how == "outside":
+            out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
+        else:
+            out.write(np.full(out.shape, np.nan), 1)
     assert run("info", image, "--dem", dem) == 1
     assert "dem.tif: has no height at the images' position" in capsys.readouterr().err
 
@@ -187,13 +186,7 @@ class Map:
 
 
 def a_map(**changes) -> Camera:
-    usual = {
-        "model": Map(),
-        "path": Path("map"),
-        "format": "rpb",
-        "size": (200, 100),
-        "alt_range": (0.0, 50.0),
-    }
+    usual = {"model": Map(), "path": Path("map"), "format": "rpb", "size": (200, 100), "alt_range": (0.0, 50.0)}
     return Camera(**{**usual, **changes})
 
 
