@@ -92,6 +92,8 @@ def test_one_bad_image_of_many_is_named_and_left_out_when_asked(pristine, tmp_pa
     assert not (tmp_path / "out").exists()
     said = barpc("adjust", *pristine, bad, "-o", tmp_path / "out", "--keep-going", "--json")
     assert said.code == 3
+    assert "bad.tif" in said.err
+    assert (tmp_path / "out/view_00.vrt").exists()
     summary = json.loads(said.out)
     assert [Path(left["path"]).name for left in summary["left_out"]] == ["bad.tif"]
     assert len(summary["views"]) == 3
