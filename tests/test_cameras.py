@@ -9,25 +9,16 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 import barpc
-from barpc import cameras
 from barpc.base.errors import ImageError, InputError
-from barpc.base.geodesy import (
-    Array,
-    ecef_from_ground,
-    ecef_from_ground_jacobian,
-    enu_basis,
-    ground_from_ecef,
-)
+from barpc.base.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian, enu_basis, ground_from_ecef
 from barpc.base.remote import Remote
 from barpc.cameras import EVERYWHERE as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
 from barpc.cli import cli
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.rpcio.grids import write_correction
+from barpc.rpcio.grids import write_correction, write_grid
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import open_state
@@ -141,13 +132,10 @@ def test_a_camera_that_is_no_rpc_says_so_where_an_rpc_is_needed(frame, tmp_path,
     assert not (tmp_path / "a.RPB").exists()
 
 
-def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
+def test_a_localisation_grid_is_a_camera(tmp_path):
     case = MODELS["localisation grid"]()
-    monkeypatch.setattr("barpc.pointio.correspondences.read_grid", lambda path, altitudes: _nodes(case.model))
-    path = write_image(tmp_path / "grid.tif")
-    with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "r+") as dataset:
-        dataset.update_tags(ALTITUDE_B0="0")
-    camera = open_camera(path)
+    write_grid(case.model, tmp_path / "grid.tif")
+    camera = open_camera(tmp_path / "grid.tif")
     assert camera.format == "grid"
     assert camera.model == case.model
     assert camera.alt_range == (-100.0, 1100.0)
@@ -172,14 +160,6 @@ def test_a_correction_grid_is_a_camera_of_the_image_that_it_spans(tmp_path):
     assert (camera.format, camera.size, camera.alt_range) == ("correction", (100, 80), altitude_range(rpc))
     ground = rpc.localize(np.array([[50.0, 30.0]]), np.array([200.0]))
     np.testing.assert_allclose(camera.model.project(ground), [[50.25, 29.5]], atol=1e-4)
-
-
-def _nodes(grid):
-    from barpc.pointio.correspondences import Correspondences
-
-    alt, row, col = np.meshgrid(grid.alts, grid.rows, grid.cols, indexing="ij")
-    ground = np.concatenate([grid.lonlat, alt[..., None]], axis=-1)
-    return Correspondences(ground.reshape(-1, 3), np.stack([col, row], axis=-1).reshape(-1, 2))
 
 
 @pytest.mark.slow
@@ -301,30 +281,24 @@ def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
 
 
 def test_a_physical_model_is_for_the_altitudes_of_the_rpc_beside_it_or_for_all_ground_on_earth(tmp_path):
-    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == (-500.0, 9000.0)
+    (tmp_path / "DIM_A.XML").write_text(isd(Flight(size=(60, 40), swing=0.0))[0])
+    assert open_camera(tmp_path / "DIM_A.XML", model="physical").alt_range == (-500.0, 9000.0)
     rpc = make_rpc()
     write_rpc(rpc, tmp_path / "other.RPB")
     (tmp_path / "other.RPB").rename(tmp_path / "RPC_A.XML")
-    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == altitude_range(rpc)
+    assert open_camera(tmp_path / "DIM_A.XML", model="physical").alt_range == altitude_range(rpc)
 
 
 @pytest.mark.parametrize(
     ("text", "taken"),
-    [
-        ("-10000:100000", True),
-        ("-10001:0", False),
-        ("0:100001", False),
-        ("5:5", False),
-        ("6:5", False),
-        ("0:1:2", False),
-    ],
+    [("-10000:100000", True), *((text, False) for text in ("-10001:0", "0:100001", "5:5", "6:5", "0:1:2"))],
 )
 def test_altitudes_are_an_interval_that_ground_may_lie_in(text, taken):
     if taken:
-        assert cameras.OPENERS["csm"].choices["altitudes"](text) == (-1e4, 1e5)
+        assert OPENERS["csm"].choices["altitudes"](text) == (-1e4, 1e5)
     else:
         with pytest.raises(ValueError):
-            cameras.OPENERS["csm"].choices["altitudes"](text)
+            OPENERS["csm"].choices["altitudes"](text)
 
 
 @pytest.mark.parametrize("physical", [True, False])
