@@ -93,14 +93,6 @@ def test_terrain_at_an_end_of_the_range_is_ground(tmp_path, alt):
     np.testing.assert_allclose(plain[:, 2], alt, atol=2e-4)
 
 
-@pytest.mark.parametrize(("alt", "said"), [(800.0, "800 to 800 m"), (-40.0, "-40 to -40 m")])
-def test_a_dem_outside_the_cameras_altitudes_says_so(tmp_path, alt, said):
-    terrain, image = dem(tmp_path, np.full((9, 200), alt)), np.array([[50.0, 3.0], [80.5, 4.5]])
-    with pytest.warns(BarpcWarning, match=rf"heights here are {said}, .* made for 0 to 500 m: 2 of 2 lines"):
-        found = localize_on_terrain(Oblique(0.5), image, terrain, (0.0, 500.0))
-    assert np.isnan(found).all()
-
-
 def test_of_a_dem_half_outside_the_points_inside_are_found(tmp_path):
     heights = np.full((9, 200), 100.0)
     heights[:, 100:] = 900.0

@@ -39,13 +39,6 @@ def ties(pristine, tmp_path_factory):
     return folder / "matches.csv"
 
 
-@pytest.mark.slow  # before a commit: the main job in test_adjust
-def test_a_good_run_ends_with_0_and_no_word_on_stderr(pristine, ties, tmp_path):
-    said = command("adjust", *pristine, "--matches", ties, "--matches-only", "-o", tmp_path / "out")
-    assert said.code == 0, said
-    assert said.err == ""
-
-
 @pytest.mark.slow
 def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):
     head, *rows = ties.read_text().splitlines()
@@ -102,10 +95,6 @@ def test_control_points_that_do_not_count_end_with_3(fault, tmp_path):
     said = command(*given, tmp_path / "out", "--keep-going")
     assert_told(said, "ground points need review", "rejected" if fault == "rejected" else "not in this run")
     assert not CONTROL.search(said.out + said.err)
-
-
-def test_other_verbs_end_with_3_and_say_why(pristine, tmp_path):
-    assert_told(command("project", pristine[0], "5.4", "43.3", "nan"), "1 of 1 points could not be projected")
 
 
 # --- the terminal -----------------------------------------------------------------------------------------

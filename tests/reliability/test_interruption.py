@@ -269,13 +269,6 @@ def test_a_cache_that_cannot_be_written_is_named(crops, tmp_path):
     assert (tmp_path / "out/.barpc/cache").read_text() == "in the way"
 
 
-def test_results_never_take_the_place_of_an_input(crops):
-    before = hashes(crops)
-    said = barpc("adjust", *crops, "-o", crops[0].parent, "--overwrite", "--images", "copy")
-    assert_one_line(said, 1, "view_00.tif", "input")
-    assert hashes(crops) == before
-
-
 @pytest.fixture
 def fails_with(monkeypatch) -> Callable[[Exception], None]:
     """Sets what the adjustment of every run raises."""

@@ -39,7 +39,7 @@ def assert_untouched(folder: Path, before: dict[Path, str], said: Said, *words: 
 # -- the folder of the images --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("more", [(), ("--overwrite",)])
+@pytest.mark.parametrize("more", [(), ("--overwrite",), ("--overwrite", "--images", "copy")])
 @pytest.mark.parametrize("formats", ["txt", "rpb", "geom"])
 def test_the_folder_of_the_images_is_refused_before_any_work(crops, tmp_path, formats, more):
     before = hashes([tmp_path])
