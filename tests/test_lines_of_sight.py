@@ -26,10 +26,7 @@ class Oblique:
 
     def project(self, ground):
         return np.stack(
-            [
-                (ground[..., 0] - WEST) / STEP - self.slope * ground[..., 2] / 30.0,
-                (NORTH - ground[..., 1]) / STEP,
-            ],
+            [(ground[..., 0] - WEST) / STEP - self.slope * ground[..., 2] / 30.0, (NORTH - ground[..., 1]) / STEP],
             axis=-1,
         )
 

@@ -18,11 +18,7 @@ def test_what_is_no_value_is_refused(value):
 
 def test_values_come_back_to_the_bit(tmp_path):
     rng = np.random.default_rng(1)
-    value = {
-        "a": (1, 2.5, None, True, "é\n"),
-        "b": [rng.normal(size=(3, 2)), np.arange(4, dtype=np.uint8)],
-        "c": {},
-    }
+    value = {"a": (1, 2.5, None, True, "é\n"), "b": [rng.normal(size=(3, 2)), np.arange(4, dtype=np.uint8)], "c": {}}
     np.savez(tmp_path / "x.npz", **to_arrays(value))
     with np.load(tmp_path / "x.npz", allow_pickle=False) as data:
         back = from_arrays({name: data[name] for name in data.files})

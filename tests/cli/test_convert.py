@@ -22,6 +22,7 @@ from barpc.sensor.sampler import Scattered
 from barpc.verbs import converting as module
 from barpc.verbs.converting import Converted, box_of, check_target, convert, window_of
 from tests.cli.test_main import run
+from tests.cli.test_terrain import Map
 from tests.rpcio.conftest import make_rpc
 
 NAN = float("nan")
@@ -140,19 +141,7 @@ def test_an_image_may_get_its_own_rpc_as_a_file_beside_it(image: Path) -> None:
 # --- windows ----------------------------------------------------------------------------------------------
 
 
-class Flat:
-    """A camera over a map: 100 columns a degree from 10 E, 100 rows a degree from 50 N southwards."""
-
-    def project(self, ground: Any) -> np.ndarray:
-        ground = np.asarray(ground)
-        lean = ground[..., 2] / 1000.0  # a column for a kilometre
-        return np.stack([(ground[..., 0] - 10) * 100 + lean, (50 - ground[..., 1]) * 100], axis=-1)
-
-    def localize(self, image: Any, alt: Any) -> np.ndarray:
-        return np.stack([10 + (image[..., 0] - alt / 1000.0) / 100, 50 - image[..., 1] / 100, alt], axis=-1)
-
-
-CAMERA = Camera(Flat(), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type: ignore[arg-type]
+CAMERA = Camera(Map(lean=1.0), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type: ignore[arg-type]
 
 
 def window(bbox: Any, alt: float | None = 0.0, dem: Any = None, camera: Camera = CAMERA) -> Any:
@@ -192,11 +181,11 @@ def test_a_box_beside_the_image_is_wrong_usage(bbox: Any) -> None:
 
 
 def test_a_box_may_lie_across_the_antimeridian() -> None:
-    class East(Flat):
+    class East(Map):
         def project(self, ground: Any) -> np.ndarray:
-            return super().project(np.asarray(ground) - [169.5, 0, 0])
+            return super().project(ground - [169.5, 0, 0])
 
-    camera = replace(CAMERA, model=East())  # from 179.5 E
+    camera = replace(CAMERA, model=East(lean=1.0))  # from 179.5 E
     assert window((179.8, 49.6, -179.8, 49.8), camera=camera) == (30, 20, 41, 21)
 
 

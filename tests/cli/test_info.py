@@ -23,11 +23,11 @@ from tests.rpcio.conftest import make_rpc
 SIZE = (2000, 1900)
 
 
-def tilted(across: float = 0.0, along: float = 0.0, **changes: Any) -> RPC:
-    rpc = make_rpc(**changes)
+def tilted(across: float = 0.0, along: float = 0.0) -> RPC:
+    """A camera that looks from another side."""
+    rpc = make_rpc()
     coeffs = np.array(rpc.coeffs)
-    coeffs[0, 3] += across
-    coeffs[2, 3] += along
+    coeffs[[0, 2], 3] += across, along
     return replace(rpc, coeffs=coeffs)
 
 

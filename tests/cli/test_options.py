@@ -104,12 +104,7 @@ def test_a_shell_completes_the_choices() -> None:
 
 
 @pytest.mark.parametrize(
-    ("target", "name"),
-    [
-        ("rpc_formats", "--rpc-format"),
-        ("adjust.jitter", "--jitter"),
-        ("aoi", "--aoi"),
-    ],
+    ("target", "name"), [("rpc_formats", "--rpc-format"), ("adjust.jitter", "--jitter"), ("aoi", "--aoi")]
 )
 def test_a_flag_has_the_field_s_name(target: str, name: str) -> None:
     assert flag_name(target) == name
@@ -185,10 +180,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     assert (found.tie.band, found.adjust.model, found.adjust.jitter) == (9, "shift", "off")
     assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, ("d.tif",))
     alone = run_options(flags, None)
-    assert (alone.tie, alone.adjust) == (
-        TieOptions(band=9),
-        AdjustOptions(jitter="off"),
-    )
+    assert (alone.tie, alone.adjust) == (TieOptions(band=9), AdjustOptions(jitter="off"))
     assert run_options({"flag_adjust_drift": 0}, None).adjust.drift == 0  # 0 is a value
     assert given_flags({"alt": 0.0, "dem": None, "overwrite": False}) == {"alt": 0.0, "overwrite": False}
     with pytest.raises(InputError, match="command line"):
@@ -198,17 +190,9 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
 def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tmp_path: Path) -> None:
     whole = run_options({"paper": True}, None)
     told = whole.adjust
-    assert (told.model, told.center, told.drift, told.jitter) == (
-        "rotation+translation",
-        "projective",
-        0,
-        "off",
-    )
+    assert (told.model, told.center, told.drift, told.jitter) == ("rotation+translation", "projective", 0, "off")
     assert (whole.fit.method, whole.fit.space) == ("lcurve-joint", "ground")
-    assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (
-        TieOptions(),
-        RunOptions(),
-    )
+    assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (TieOptions(), RunOptions())
     file = tmp_path / "a.toml"
     file.write_text("[adjust]\nnoise_floor = 0.03\n")
     mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))

@@ -14,6 +14,7 @@ from barpc.base.errors import InputError
 from barpc.cli.project import given_points
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
+from tests.cli.test_info import tilted
 from tests.cli.test_main import run
 from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
@@ -190,15 +191,11 @@ def test_a_dem_tells_the_altitudes_of_projected_points(
 @pytest.fixture
 def three(tmp_path: Path) -> tuple[list[str], list[RPC]]:
     """Three cameras that look from three sides."""
-    found = []
-    for number, tilt in enumerate((0.0, 0.09, -0.12)):
-        rpc = make_rpc()
-        coeffs = np.array(rpc.coeffs)
-        coeffs[0, 3] += tilt
-        coeffs[2, 3] -= tilt
-        found.append(RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale))
-        write_rpc(found[-1], tmp_path / f"{number}.RPB")
-    return [str(tmp_path / f"{number}.RPB") for number in range(3)], found
+    found = [tilted(tilt, -tilt) for tilt in (0.0, 0.09, -0.12)]
+    files = [str(tmp_path / f"{number}.RPB") for number in range(3)]
+    for file, rpc in zip(files, found, strict=True):
+        write_rpc(rpc, file)
+    return files, found
 
 
 def test_triangulate_takes_the_images_that_see_a_point(
@@ -253,11 +250,7 @@ def test_triangulate_tells_the_root_mean_square_over_the_images(
     ],
 )
 def test_triangulate_needs_a_point_of_each_of_two_images(
-    count: int,
-    words: list[str],
-    told: str,
-    three: tuple[list[str], list[RPC]],
-    capsys: pytest.CaptureFixture[str],
+    count: int, words: list[str], told: str, three: tuple[list[str], list[RPC]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("triangulate", *three[0][:count], *words) == 2
     assert told in capsys.readouterr().err

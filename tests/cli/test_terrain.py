@@ -169,17 +169,19 @@ def test_what_a_box_loses_at_the_border_is_said(image, tmp_path, capsys):
 
 
 class Map:
-    """100 columns a degree from 10 E, 100 rows a degree from 50 N southwards; 5 px for 100 m."""
+    """100 columns a degree from 10 E, 100 rows a degree from 50 N southwards; 5 px for 100 m, but a `lean` [px/km]."""
 
-    def __init__(self) -> None:
-        self.asked = []
+    def __init__(self, lean: float = 0.0) -> None:
+        self.lean, self.asked = lean / 1000, []
 
     def localize(self, image, alt):
         self.asked.append((image.tolist(), np.asarray(alt).tolist()))
-        return np.stack([10 + image[..., 0] / 100, 50 - image[..., 1] / 100, alt], axis=-1)
+        return np.stack([10 + (image[..., 0] - self.lean * alt) / 100, 50 - image[..., 1] / 100, alt], axis=-1)
 
     def project(self, ground):
-        return np.stack([(ground[..., 0] - 10) * 100, (50 - ground[..., 1]) * 100], axis=-1)
+        return np.stack(
+            [(ground[..., 0] - 10) * 100 + self.lean * ground[..., 2], (50 - ground[..., 1]) * 100], axis=-1
+        )
 
     def project_jacobian(self, ground):
         return self.project(ground), np.array([[1.0, 2.0, 0.03], [3.0, 4.0, -0.04]])

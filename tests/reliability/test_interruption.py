@@ -102,11 +102,7 @@ def wide(tmp_path_factory) -> list[Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "jobs"),
-    [
-        (signal.SIGINT, 1),
-        (signal.SIGTERM, 2),
-        pytest.param(signal.SIGINT, 2, marks=pytest.mark.nightly),
-    ],
+    [(signal.SIGINT, 1), (signal.SIGTERM, 2), pytest.param(signal.SIGINT, 2, marks=pytest.mark.nightly)],
 )
 def test_an_interrupted_run_leaves_its_work_and_says_how_to_go_on(wide, tmp_path, number, jobs):
     command = ("adjust", *wide, "-o", tmp_path / "out", "-j", jobs)
@@ -306,9 +302,7 @@ def test_debug_shows_the_traceback_of_a_bug(crops, out, fails_with):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("whole", "share"),
-    [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.nightly)],
-    ids=["part", "whole"],
+    ("whole", "share"), [(False, 0.7), pytest.param(True, 0.95, marks=pytest.mark.nightly)], ids=["part", "whole"]
 )
 def test_stages_are_told_with_seconds_and_memory(crops, tmp_path, caplog, whole, share):
     """What no stage has, the command line and the notes of the run's state, is a part of a small run."""

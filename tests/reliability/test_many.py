@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +30,9 @@ def shifted(source: Path, folder: Path, count: int) -> list[Path]:
         offset = rpc.ground_offset + np.array([step * n, 0.0, 0.0])
         path = folder / f"view_{n:04d}.vrt"
         shade = rewrite(Path(shutil.copy(source, path.with_suffix(".tif"))), pixels=lambda v, n=n: v + n)
-        write_rpc_vrt(type(rpc)(**{**fields_of(rpc), "ground_offset": offset}), shade, path)
+        write_rpc_vrt(replace(rpc, ground_offset=offset), shade, path)
         found.append(path)
     return found
-
-
-def fields_of(rpc) -> dict[str, object]:
-    from dataclasses import fields
-
-    return {f.name: getattr(rpc, f.name) for f in fields(rpc) if f.init}
 
 
 PROGRAM = """

@@ -8,9 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
-import click
 import pytest
 
 from barpc import __version__
@@ -18,6 +16,7 @@ from barpc.base import errors
 from barpc.base.errors import BarpcError, ImageError, InputError, out_of_memory
 from barpc.pipeline import verify_outputs
 from barpc.pipeline.executor import run_batch
+from tests.cli.conftest import verb  # noqa: F401
 from tests.cli.test_main import run
 from tests.reliability.trials import SAMPLES, crop
 
@@ -79,15 +78,11 @@ def room(request, monkeypatch) -> bool:
 
 
 @pytest.fixture
-def told(monkeypatch, capsys) -> Callable[[BaseException], str]:
+def told(verb, capsys) -> Callable[[BaseException], str]:  # noqa: F811
     """What the command says of a verb that ends in an error."""
 
     def ends_in(error: BaseException) -> str:
-        def fail() -> None:
-            raise error
-
-        verb = SimpleNamespace(info=click.Command("info", callback=fail))
-        monkeypatch.setitem(sys.modules, "barpc.cli.info", verb)
+        verb(error)
         assert run("info") == 1
         return capsys.readouterr().err.removeprefix("barpc: ")
 
@@ -157,12 +152,12 @@ def test_a_worker_says_what_its_own_memory_is(room) -> None:
 @pytest.mark.landing(2)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems bound no address space")
 @pytest.mark.parametrize("megabytes", [250, 550, 350, 450, 500, 600, 625, 650, 700, 800, 1000])
-@pytest.mark.parametrize("verb", ["adjust", "verify"])
-def test_a_bound_on_memory_is_one_line_that_says_so(tmp_path, verb, megabytes) -> None:
+@pytest.mark.parametrize("word", ["adjust", "verify"])
+def test_a_bound_on_memory_is_one_line_that_says_so(tmp_path, word, megabytes) -> None:
     """OpenBLAS waited for ever, deaf to signals; a loader's word was a bug, a file not reopened a full disk."""
     images = [crop(path, tmp_path / path.name) for path in SAMPLES[:2]]
     command = [sys.executable, "-m", "barpc", "-q", "adjust", *map(str, images), "-o", str(tmp_path / "out")]
-    if verb == "verify":
+    if word == "verify":
         assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode in (0, 3)
         command = [sys.executable, "-m", "barpc", "-q", "verify", str(tmp_path / "out")]
     limit = megabytes << 20

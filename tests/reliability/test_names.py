@@ -49,11 +49,7 @@ KEPT = [
     "x_RPC", "y_RPC.TXT",
 ]  # fmt: skip
 THREES = [
-    [
-        '"><img src=x>',
-        "$(touch x)",
-        "=1+1, cafe\u0301",
-    ],  # what a page, a shell and a table would take for their own
+    ['"><img src=x>', "$(touch x)", "=1+1, cafe\u0301"],  # what a page, a shell and a table would take for their own
     *[KEPT[i : i + 3] for i in range(0, len(KEPT) - 2, 3)],
     KEPT[-3:],
 ]
