@@ -12,7 +12,7 @@ import pytest
 
 import barpc
 from barpc.base.errors import ImageError, InputError
-from barpc.base.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian, enu_basis, ground_from_ecef
+from barpc.base.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian
 from barpc.base.remote import Remote
 from barpc.cameras import EVERYWHERE as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
@@ -25,6 +25,7 @@ from barpc.sensor.csm import open_state
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import altitude_range
 from tests.cli.test_main import run
+from tests.fit.models import Frame
 from tests.pipeline.known import part
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 from tests.sensor.conftest import MODELS
@@ -36,58 +37,23 @@ from tests.sensor.test_csm import write as write_state
 # --- a camera that barpc does not know: an aerial frame camera, in one class and one row --------------------
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A pinhole that looks straight down: one instant, one focal length [px]."""
-
-    lon: float
-    lat: float
-    alt: float
-    focal: float
-    size: tuple[int, int]
-
-    def _pose(self) -> tuple[Array, Array]:
-        """Its place (3,) [m], ECEF, and the axes (3, 3): rows along columns, along rows, towards the ground."""
-        ground = np.array([self.lon, self.lat, self.alt])
-        east, north, up = enu_basis(ground)
-        return ecef_from_ground(ground), np.stack([east, -north, -up])
-
-    def _inside(self, ground: Array) -> tuple[Array, Array]:
-        place, axes = self._pose()
-        return (ecef_from_ground(ground) - place) @ axes.T, axes
-
-    def project(self, ground: Array) -> Array:
-        seen, _ = self._inside(np.asarray(ground, dtype=np.float64))
-        with np.errstate(all="ignore"):
-            image = self.focal * seen[..., :2] / seen[..., 2:]
-        return np.where(seen[..., 2:] > 0, image + (np.array(self.size) - 1) / 2, np.nan)
+class Pinhole(Frame):
+    """One that looks straight down: one instant, one focal length [px]; with the derivatives that a camera has."""
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        ground = np.asarray(ground, dtype=np.float64)
-        (seen, axes), by_ground = self._inside(ground), ecef_from_ground_jacobian(ground)
-        x, y, z = np.moveaxis(seen, -1, 0)
+        place, axes = self._pose()
+        x, y, z = np.moveaxis((ecef_from_ground(ground) - place) @ axes.T, -1, 0)
         zero = np.zeros_like(z)
         by_seen = self.focal * np.stack(
             [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], -2
         )
-        return self.project(ground), by_seen @ axes @ by_ground
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
-        place, axes = self._pose()
-        offset = (image - (np.array(self.size) - 1) / 2) / self.focal
-        ray = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1) @ axes
-        depth = np.broadcast_to(self.alt - alt, ray.shape[:-1]).astype(np.float64)
-        for _ in range(8):  # the ray's altitude is nearly linear in its length
-            ground = ground_from_ecef(place + depth[..., None] * ray)
-            depth = depth + (ground[..., 2] - alt)
-        return np.concatenate([ground[..., :2], np.broadcast_to(alt, ray.shape[:-1])[..., None]], axis=-1)
+        return self.project(ground), by_seen @ axes @ ecef_from_ground_jacobian(ground)
 
 
 def _open_frame(path: Path, higher: float = 0.0) -> Camera:
     values = json.loads(path.read_text())["frame"]
     size = (values["size"][0], values["size"][1])
-    model = Frame(values["lon"], values["lat"], values["alt"] + higher, values["focal"], size)
+    model = Pinhole(values["lon"], values["lat"], values["alt"] + higher, values["focal"], size)
     return Camera(model, path, "frame", model.size, (-100.0, 400.0))
 
 
