@@ -123,17 +123,6 @@ def moved_away(scene: Scene, degrees: float = 1.0) -> list[Path]:
     return found
 
 
-def everywhere(**where: float) -> Prepare:
-    """Both images are moved: an offset of a degree of longitude is the same scene elsewhere."""
-
-    def prepare(scene: Scene) -> Args:
-        for path in (scene.a, scene.b):
-            rewrite(path, camera=lambda rpcs: [setattr(rpcs, k, v) for k, v in where.items()])
-        return [scene.a, scene.b]
-
-    return prepare
-
-
 def dem(path: Path, west: float, north: float, height: float, crs: str | None = "EPSG:4979") -> Path:
     place = rasterio.Affine(0.01, 0, west, 0, -0.01, north)
     return write_image(path, np.full((50, 50), height, np.float32), transform=place, crs=crs)
