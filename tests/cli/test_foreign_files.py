@@ -17,9 +17,9 @@ from barpc.cli.flags import flag_name
 from tests.geotiffs import write_image
 from tests.pointio.test_gcp_formats import geopackage_of, shapefile_of
 from tests.reliability.conftest import barpc
+from tests.reliability.trials import SAMPLES
 
-SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
-IMAGES = [str(path) for path in sorted(SAMPLES.glob("view_*.tif"))]
+IMAGES = [str(path) for path in SAMPLES]
 RNG = np.random.default_rng(1)
 
 

@@ -20,10 +20,10 @@ from barpc.scene import Camera
 from barpc.sensor.triangulation import triangulate
 from barpc.verbs.moving import moved
 from tests.cli.test_main import run
+from tests.reliability.trials import SAMPLES
 from tests.rpcio.conftest import make_rpc
 
 pytestmark = pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")  # the motion and the refit are told
-SAMPLES = Path(__file__).parents[2] / "data_samples"
 
 
 def _seen(camera, count=50):
@@ -165,8 +165,7 @@ def test_vendors_rpcs_follow_a_motion_over_all_their_ground(
 @pytest.mark.few(1)
 @pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "")])
 def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Path, words):
-    files = sorted(SAMPLES.glob("view_0?.tif"))
-    old = [open_camera(file).model for file in files]
+    old = [open_camera(file).model for file in SAMPLES]
     rng = np.random.default_rng(1)
     alt = rng.uniform(150, 250, 20)
     ground = old[0].localize(rng.uniform(200, 800, (20, 2)), alt)
@@ -174,8 +173,8 @@ def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Pa
     matrix = _similarity(ecef.mean(axis=0), 1.00001)
     flag, value = words
     value = value or _saved(matrix, tmp_path)
-    assert run("convert", *files, "-o", tmp_path / "out", flag, value) == 0
-    new = [read_rpc(tmp_path / "out" / f"{file.stem}_RPC.TXT") for file in files]
+    assert run("convert", *SAMPLES, "-o", tmp_path / "out", flag, value) == 0
+    new = [read_rpc(tmp_path / "out" / f"{file.stem}_RPC.TXT") for file in SAMPLES]
     seen = np.stack([model.project(ground) for model in old])
     point, view = np.tile(np.arange(20), 3), np.repeat(np.arange(3), 20)
     found = triangulate(new, view, point, seen.reshape(-1, 2)).points

@@ -18,13 +18,12 @@ from barpc.cli import process
 from barpc.cli.process import Interrupt, interruptible
 from tests.cli.test_main import run
 from tests.lanes import rest_slow
+from tests.reliability.test_interruption import ROOT, posix
 from tests.reliability.trials import SAMPLES, crop, outputs
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMAND = f"{sys.executable} -m barpc"
 FULL = Path("/dev/full")
 TOLD = "barpc: interrupted; nothing was kept\n"
-posix = pytest.mark.skipif(os.name != "posix", reason="a shell's redirections, and signals")
 
 
 # --- streams ----------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ class Told:
 
 def test_a_line_comes_when_a_minute_is_over_and_not_before() -> None:
     told = Told()
-    told.lines.look()  # nothing has begun
+    told.lines.look(now=True)  # nothing has begun
     told.lines("match", 0, 40)
     told.now += MINUTE - 0.1
     told.lines("match", 3, 40)

@@ -100,19 +100,24 @@ def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, na
     assert_untouched(tmp_path, before, said, name, "give another -o")
 
 
-@pytest.mark.parametrize("verb", rest_slow(["adjust", "match"]))
+WORDS = {"adjust": ("{a}", "{b}"), "convert": ("{a}", "--rpc", "{b}"), "match": ("{a}", "{b}")}
+
+
+@pytest.mark.parametrize("verb", rest_slow(WORDS, 2))
 def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, out, tmp_path, verb):
-    if verb == "match":
+    command = (verb, *(word.format(a=crops[0], b=crops[1]) for word in WORDS[verb]), "-o", out)
+    if verb != "adjust":
         kept = (tmp_path / "out").rename(tmp_path / "kept") / ".barpc/cache"
         shutil.copytree(kept, out / ".barpc/cache")
-        assert barpc(verb, *crops, "-o", out).code == 0
-    edited = out / {"adjust": "view_00_RPC.TXT", "match": "asp/view_00__view_01.txt"}[verb]
+        assert barpc(*command).code == 0
+    assert_one_line(barpc(*command), 1, "--overwrite")
+    edited = out / ("asp/view_00__view_01.txt" if verb == "match" else "view_00_RPC.TXT")
     edited.write_text(edited.read_text() + "\n")
     before = hashes([tmp_path])
-    assert_one_line(barpc(verb, *crops, "-o", out, "--overwrite"), 1, edited.name, "changed since")
+    assert_one_line(barpc(*command, "--overwrite"), 1, edited.name, "changed since", "not replaced")
     assert hashes([tmp_path]) == before
     edited.unlink()
-    assert barpc(verb, *crops, "-o", out, "--overwrite").code == 0
+    assert barpc(*command, "--overwrite").code == 0
     assert edited.is_file()
 
 
@@ -225,19 +230,6 @@ def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
         said = barpc(verb.split()[0], *words, "--overwrite")
         assert_one_line(said, 1, target.name, "never replaced")
         assert hashes([crops[0].parent]) == before
-
-
-def test_convert_replaces_its_own_files_only(crops, tmp_path):
-    out = tmp_path / "out"
-    command = ("convert", crops[0], "--rpc", crops[1], "-o", out)
-    assert barpc(*command).code == 0
-    assert_one_line(barpc(*command), 1, "--overwrite")
-    assert barpc(*command, "--overwrite").code == 0
-    mine = out / "view_00_RPC.TXT"
-    mine.write_text("mine")
-    before = hashes([out])
-    assert_one_line(barpc(*command, "--overwrite"), 1, mine.name, "not replaced")
-    assert hashes([out]) == before
 
 
 def test_convert_adds_to_a_folder_and_hides_no_input(crops, tmp_path):
