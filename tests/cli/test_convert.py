@@ -23,6 +23,7 @@ from barpc.verbs import converting as module
 from barpc.verbs.converting import Converted, box_of, check_target, convert, window_of
 from tests.cli.test_main import run
 from tests.cli.test_terrain import Map
+from tests.reliability.conftest import assert_one_line, barpc
 from tests.rpcio.conftest import make_rpc
 
 NAN = float("nan")
@@ -49,11 +50,8 @@ def file(tmp_path: Path) -> Path:
         ([], "Missing argument"),
     ],
 )
-def test_what_does_not_go_together_is_wrong_usage(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("convert", *words) == 2
-    assert told in capsys.readouterr().err
+def test_what_does_not_go_together_is_wrong_usage(words: list[str], told: str) -> None:
+    assert_one_line(barpc("convert", *words), 2, told)
 
 
 def test_the_help_lists_the_formats(capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,7 +74,7 @@ def test_an_rpc_is_copied_as_it_is_and_read_back(file: Path, capsys: pytest.Capt
     assert row == {"source": str(file), "format": "rpb", "target": str(target), "max_px": 0.0}
 
 
-def test_a_format_may_be_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_format_may_be_named(file: Path) -> None:
     target = file.parent / "c_RPC.TXT"
     assert run("convert", str(file), str(target), "--rpc-format", "txt") == 0
     assert read_rpc(target) == read_rpc(file)
@@ -322,10 +320,8 @@ def test_a_grid_goes_into_an_rpc_where_one_holds_it(
     at = np.array([[100.0, 200.0], [550.0, 30.0]])
     seen = read_rpc(target).project(make_rpc().localize(at, 150.0))
     np.testing.assert_allclose(seen, at, atol=2e-2)
-    assert run("convert", str(grid), str(grid), "--overwrite") == 1
-    assert "belongs to the input and is never replaced" in capsys.readouterr().err
-    assert run("convert", str(file), str(file), "--overwrite") == 1
-    assert "belongs to the input and is never replaced" in capsys.readouterr().err
+    assert_one_line(barpc("convert", grid, grid, "--overwrite"), 1, "belongs to the input and is never replaced")
+    assert_one_line(barpc("convert", file, file, "--overwrite"), 1, "belongs to the input and is never replaced")
     poor = type("Fit", (), {"verdict": lambda self, tolerance: f"misses {tolerance == options.tolerance}"})()
     options = module.FitOptions()
     monkeypatch.setattr("barpc.verbs.moving.fit_rpc", lambda *_, **__: poor)

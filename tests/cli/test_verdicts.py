@@ -15,6 +15,7 @@ from barpc.export import targets
 from barpc.rpcio import write_rpc
 from barpc.verbs import fitting, runs
 from tests.cli.test_main import run
+from tests.reliability.conftest import assert_one_line, barpc
 from tests.report.made import a_summary
 from tests.rpcio.conftest import make_rpc
 
@@ -141,9 +142,8 @@ def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
 # --- check, report, adjust --------------------------------------------------------------------------------
 
 
-def test_the_summary_of_one_run_is_not_printed_again(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("report", "one", "--json") == 2
-    assert "--json goes with two runs" in capsys.readouterr().err
+def test_the_summary_of_one_run_is_not_printed_again() -> None:
+    assert_one_line(barpc("report", "one", "--json"), 2, "--json goes with two runs")
 
 
 @pytest.fixture
