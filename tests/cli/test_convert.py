@@ -277,6 +277,8 @@ def test_a_window_is_cut_and_told(image: Path, tmp_path: Path, capsys: pytest.Ca
     said = capsys.readouterr().out
     assert said.startswith(f"{target}: col 50, row 60, 100 x 80 px (read back: ")
     np.testing.assert_allclose(read_rpc(target).image_offset, read_rpc(image).image_offset - [50, 60], atol=1e-9)
+    with rasterio.open(target) as cut:
+        assert (cut.width, cut.height) == (100, 80)
     assert run("convert", str(image), target, *words) == 1
     assert run("convert", str(image), target, *words, "--overwrite", "--json") == 0
     found = json.loads(capsys.readouterr().out)
