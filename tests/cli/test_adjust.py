@@ -72,6 +72,17 @@ def test_images_can_be_copied_or_left_out_and_formats_chosen(crops, twice, tmp_p
     assert not list(twice[1].glob("*.vrt"))
 
 
+@pytest.mark.slow
+def test_an_existing_folder_needs_overwrite(crops, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/notes.txt").write_text("mine")
+    command = ("adjust", *crops, "-o", tmp_path / "out")
+    assert_one_line(barpc(*command), 1, "--overwrite")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["notes.txt"]
+    assert barpc(*command, "--overwrite").code == 0
+    assert (tmp_path / "out/notes.txt").read_text() == "mine"
+
+
 @pytest.mark.landing(2)
 @pytest.mark.slow  # before a commit: what is matched in them, in tests/tie/test_simulated
 @pytest.mark.parametrize("kind", ["float32", "uint8", "int16", "uint16 with empty bands"])

@@ -386,7 +386,7 @@ AT_WORK = (  # told or borne after much work or waiting, or after dask is import
 )  # fmt: skip
 
 
-@pytest.mark.few(34)
+@pytest.mark.few(44)
 @pytest.mark.parametrize(
     "name",
     [
