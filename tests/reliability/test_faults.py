@@ -390,7 +390,7 @@ AT_WORK = (  # told or borne after much work or waiting, or after dask is import
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK) + [pytest.mark.costs(6)] * (name == NOISE))
+        pytest.param(name, marks=[pytest.mark.slow] * (name in AT_WORK) + [pytest.mark.costs(4)] * (name == NOISE))
         for name in FAULTS
     ],
 )
