@@ -171,10 +171,16 @@ def test_a_camera_that_is_no_rpc_says_where_it_is() -> None:
         ("looks", "12.35 deg off the vertical, from 98.77 deg (north is 0)"),
         ("sensor", "694.3 km high, by its orbit"),
     ]
+    for method, words in (
+        ("line", "where the rays of an image line meet"),
+        ("nominal", "assumed, as the rays of an image line meet in no orbit"),
+    ):
+        assert told(camera_altitude_m={"value": 7e5, "method": method})[-1] == ("sensor", f"700.0 km high, {words}")
 
 
 def test_an_rpc_says_what_it_is_made_for() -> None:
     lines = dict(told(**BOX))
+    assert " ".join(lines) == "camera note image altitudes made for accuracy denominators centre pixel looks sensor"
     assert lines["camera"] == "RPC (rpb) in a in b.RPB"
     assert lines["made for"] == "lon 5.00000 to 6.00000, lat 43.00000 to 44.00000 deg"
     assert lines["accuracy"] == "3 m common to the image"

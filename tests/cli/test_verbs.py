@@ -28,31 +28,8 @@ def test_info_says_where_the_rpc_comes_from_and_what_was_passed_over(image, caps
     write_rpc(make_rpc(), image.with_suffix(".RPB"))
     assert run("info", image, "--json") == 0
     (report,) = json.loads(capsys.readouterr().out)
-    assert report["rpc"].startswith("rpb in ")
+    assert report["rpc"] == f"rpb in {image.with_suffix('.RPB')}"
     assert report["notes"] == ["not used: the image's own RPC"]
-    assert report["size_px"] == [600, 400]
-    assert report["err_bias_m"] == 3.1
-    assert 0.9 < report["smallest_denominator"] <= 1.0
-    assert 0 < report["incidence_deg"] < 60
-    assert run("info", image) == 0
-    told = capsys.readouterr().out
-    (lon_min, lon_max), (lat_min, lat_max) = report["domain"]["lon_deg"], report["domain"]["lat_deg"]
-    low, high = report["altitude_range_m"]
-    gsd, stand, least = report["gsd_m"], report["camera_altitude_m"]["value"], report["smallest_denominator"]
-    (lon, lat), angle, side = report["center_deg"], report["incidence_deg"], report["azimuth_deg"]
-    assert told.splitlines()[1:] == [
-        f"  camera       RPC (rpb) in {image.with_suffix('.RPB')}",
-        "  note         not used: the image's own RPC",
-        "  image        600 x 400 px; (0, 0) is the centre of the first pixel",
-        f"  altitudes    {low:.5g} to {high:.5g} m above the ellipsoid",
-        f"  made for     lon {lon_min:.5f} to {lon_max:.5f}, lat {lat_min:.5f} to {lat_max:.5f} deg",
-        "  accuracy     3.1 m common to the image, 0.7 m of each point",
-        f"  denominators at least {least:.3g} of their value at the centre: no pole",
-        f"  centre       lon {lon:.6f}, lat {lat:.6f} deg at {(low + high) / 2:.5g} m",
-        f"  pixel        {gsd['col']:.3f} m a column, {gsd['row']:.3f} m a row on the ground",
-        f"  looks        {angle:.2f} deg off the vertical, from {side:.2f} deg (north is 0)",
-        f"  sensor       {stand / 1e3:.1f} km high, assumed, as the rays of an image line meet in no orbit",
-    ]
 
 
 def test_info_says_in_words_what_is_not_known_of_a_camera(tmp_path, capsys):
