@@ -122,7 +122,7 @@ def test_an_input_is_never_written(tmp_path):
     image.parent.mkdir()
     image.write_bytes(b"pixels")
     with Workspace(image.parent, overwrite=True, keep=frozenset([image])) as run:
-        with pytest.raises(OutputError, match="input"):
+        with pytest.raises(OutputError, match="is an input and is never written"):
             run.write_text("a.tif", "x")
     assert image.read_bytes() == b"pixels"
 

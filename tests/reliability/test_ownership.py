@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ from barpc.rpcio import read_rpc, read_rpc_source, write_rpc
 from tests.lanes import diagonal, rest_slow
 
 from .conftest import Said, assert_one_line, barpc, hashes
-from .test_interruption import ROOT, posix, relative
+from .test_interruption import posix, relative, sweep
 from .trials import outputs
 
 OTHERS = (
@@ -174,10 +172,7 @@ def test_stopped_between_two_outputs_the_same_command_finishes(crops, ran, out, 
 @pytest.mark.parametrize("step", [5, 1])
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
     """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
-    command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    for name, found in json.loads(done.stdout).items():
+    for name, found in sweep("--every-output", step).items():
         assert found["identical"] == found["killed"], name
         assert found["killed"] >= found["outputs"] // step, name
 
@@ -186,9 +181,7 @@ def test_killed_between_any_two_outputs_the_same_command_finishes(step):
 @pytest.mark.nightly
 def test_commands_on_finished_runs_that_are_killed_at_random_end_with_the_same_bytes():
     """Of `--add-to`, with `--update`, `ortho`, `dsm` beside and in its run, `calibrate`."""
-    command = [sys.executable, "-m", "tests.reliability.trials", "20", "--of-runs", "--seed", "3"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    found = json.loads(done.stdout)
+    found = sweep(20, "--of-runs", "--seed", 3)
     assert len(found) == 6
     for name, one in found.items():
         assert one["odd"] == [], name
