@@ -35,10 +35,7 @@ CONSTANTS: dict[type[Options], dict[str, tuple[str, ...]]] = {
         "tolerance": ("barpc.ba.robust.rounds.TOLERANCE",),
         "min_observations": ("barpc.ba.constraints.block.MIN_OBSERVATIONS",),
     },
-    FitOptions: {
-        "tau": ("barpc.fit.system.TAU", "barpc.fit.methods.TAU"),
-        "weighted": ("barpc.fit.methods.WEIGHTED",),
-    },
+    FitOptions: {"tau": ("barpc.fit.system.TAU", "barpc.fit.methods.TAU"), "weighted": ("barpc.fit.methods.WEIGHTED",)},
 }
 """Record -> name -> where the constant is read."""
 
@@ -99,15 +96,9 @@ SIZES = {
     "tracks_in_tables": ("barpc.report.outcome.MAX_TRACKS",),
     "observations_intersected": ("barpc.report.outcome.CHUNK",),
     "matches_measured": ("barpc.report.measures.pairs.MAX_PER_PAIR",),
-    "shown": (
-        "barpc.report.maps.MAX_SHOWN",
-        "barpc.report.page.MAX_SHOWN",
-    ),
+    "shown": ("barpc.report.maps.MAX_SHOWN", "barpc.report.page.MAX_SHOWN"),
     "pictures": ("barpc.report.maps.MAX_PICTURES",),
-    "images_together": (
-        "barpc.pipeline.loading.GROUP",
-        "barpc.pipeline.executor.GROUP",
-    ),
+    "images_together": ("barpc.pipeline.loading.GROUP", "barpc.pipeline.executor.GROUP"),
     "surface_block": ("barpc.dsm.surface.BLOCK_SIZE",),
     "windows_together": ("barpc.tie.patches.oriented.PIECE",),
 }

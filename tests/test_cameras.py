@@ -9,31 +9,23 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning
 
 import barpc
-from barpc import cameras
 from barpc.base.errors import ImageError, InputError
-from barpc.base.geodesy import (
-    Array,
-    ecef_from_ground,
-    ecef_from_ground_jacobian,
-    enu_basis,
-    ground_from_ecef,
-)
+from barpc.base.geodesy import Array, ecef_from_ground, ecef_from_ground_jacobian
 from barpc.base.remote import Remote
 from barpc.cameras import EVERYWHERE as ON_EARTH
 from barpc.cameras import OPENERS, Opener, open_camera
 from barpc.cli import cli
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.rpcio.grids import write_correction
+from barpc.rpcio.grids import write_correction, write_grid
 from barpc.scene import Camera
 from barpc.sensor import SensorModel
 from barpc.sensor.csm import open_state
 from barpc.sensor.image_corrections import CorrectionGrid
 from barpc.sensor.rpc import altitude_range
 from tests.cli.test_main import run
+from tests.fit.models import Frame
 from tests.pipeline.known import part
 from tests.rpcio.conftest import dimap_v2, make_rpc, write_image
 from tests.sensor.conftest import MODELS
@@ -45,58 +37,23 @@ from tests.sensor.test_csm import write as write_state
 # --- a camera that barpc does not know: an aerial frame camera, in one class and one row --------------------
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A pinhole that looks straight down: one instant, one focal length [px]."""
-
-    lon: float
-    lat: float
-    alt: float
-    focal: float
-    size: tuple[int, int]
-
-    def _pose(self) -> tuple[Array, Array]:
-        """Its place (3,) [m], ECEF, and the axes (3, 3): rows along columns, along rows, towards the ground."""
-        ground = np.array([self.lon, self.lat, self.alt])
-        east, north, up = enu_basis(ground)
-        return ecef_from_ground(ground), np.stack([east, -north, -up])
-
-    def _inside(self, ground: Array) -> tuple[Array, Array]:
-        place, axes = self._pose()
-        return (ecef_from_ground(ground) - place) @ axes.T, axes
-
-    def project(self, ground: Array) -> Array:
-        seen, _ = self._inside(np.asarray(ground, dtype=np.float64))
-        with np.errstate(all="ignore"):
-            image = self.focal * seen[..., :2] / seen[..., 2:]
-        return np.where(seen[..., 2:] > 0, image + (np.array(self.size) - 1) / 2, np.nan)
+class Pinhole(Frame):
+    """One that looks straight down: one instant, one focal length [px]; with the derivatives that a camera has."""
 
     def project_jacobian(self, ground: Array) -> tuple[Array, Array]:
-        ground = np.asarray(ground, dtype=np.float64)
-        (seen, axes), by_ground = self._inside(ground), ecef_from_ground_jacobian(ground)
-        x, y, z = np.moveaxis(seen, -1, 0)
+        place, axes = self._pose()
+        x, y, z = np.moveaxis((ecef_from_ground(ground) - place) @ axes.T, -1, 0)
         zero = np.zeros_like(z)
         by_seen = self.focal * np.stack(
             [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], -2
         )
-        return self.project(ground), by_seen @ axes @ by_ground
-
-    def localize(self, image: Array, alt: Array) -> Array:
-        image, alt = np.asarray(image, dtype=np.float64), np.asarray(alt, dtype=np.float64)
-        place, axes = self._pose()
-        offset = (image - (np.array(self.size) - 1) / 2) / self.focal
-        ray = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1) @ axes
-        depth = np.broadcast_to(self.alt - alt, ray.shape[:-1]).astype(np.float64)
-        for _ in range(8):  # the ray's altitude is nearly linear in its length
-            ground = ground_from_ecef(place + depth[..., None] * ray)
-            depth = depth + (ground[..., 2] - alt)
-        return np.concatenate([ground[..., :2], np.broadcast_to(alt, ray.shape[:-1])[..., None]], axis=-1)
+        return self.project(ground), by_seen @ axes @ ecef_from_ground_jacobian(ground)
 
 
 def _open_frame(path: Path, higher: float = 0.0) -> Camera:
     values = json.loads(path.read_text())["frame"]
     size = (values["size"][0], values["size"][1])
-    model = Frame(values["lon"], values["lat"], values["alt"] + higher, values["focal"], size)
+    model = Pinhole(values["lon"], values["lat"], values["alt"] + higher, values["focal"], size)
     return Camera(model, path, "frame", model.size, (-100.0, 400.0))
 
 
@@ -141,13 +98,10 @@ def test_a_camera_that_is_no_rpc_says_so_where_an_rpc_is_needed(frame, tmp_path,
     assert not (tmp_path / "a.RPB").exists()
 
 
-def test_a_localisation_grid_is_a_camera(tmp_path, monkeypatch):
+def test_a_localisation_grid_is_a_camera(tmp_path):
     case = MODELS["localisation grid"]()
-    monkeypatch.setattr("barpc.pointio.correspondences.read_grid", lambda path, altitudes: _nodes(case.model))
-    path = write_image(tmp_path / "grid.tif")
-    with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "r+") as dataset:
-        dataset.update_tags(ALTITUDE_B0="0")
-    camera = open_camera(path)
+    write_grid(case.model, tmp_path / "grid.tif")
+    camera = open_camera(tmp_path / "grid.tif")
     assert camera.format == "grid"
     assert camera.model == case.model
     assert camera.alt_range == (-100.0, 1100.0)
@@ -172,14 +126,6 @@ def test_a_correction_grid_is_a_camera_of_the_image_that_it_spans(tmp_path):
     assert (camera.format, camera.size, camera.alt_range) == ("correction", (100, 80), altitude_range(rpc))
     ground = rpc.localize(np.array([[50.0, 30.0]]), np.array([200.0]))
     np.testing.assert_allclose(camera.model.project(ground), [[50.25, 29.5]], atol=1e-4)
-
-
-def _nodes(grid):
-    from barpc.pointio.correspondences import Correspondences
-
-    alt, row, col = np.meshgrid(grid.alts, grid.rows, grid.cols, indexing="ij")
-    ground = np.concatenate([grid.lonlat, alt[..., None]], axis=-1)
-    return Correspondences(ground.reshape(-1, 3), np.stack([col, row], axis=-1).reshape(-1, 2))
 
 
 @pytest.mark.slow
@@ -301,30 +247,24 @@ def test_views_with_one_s_own_model_are_adjusted_as_files_are(tmp_path):
 
 
 def test_a_physical_model_is_for_the_altitudes_of_the_rpc_beside_it_or_for_all_ground_on_earth(tmp_path):
-    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == (-500.0, 9000.0)
+    (tmp_path / "DIM_A.XML").write_text(isd(Flight(size=(60, 40), swing=0.0))[0])
+    assert open_camera(tmp_path / "DIM_A.XML", model="physical").alt_range == (-500.0, 9000.0)
     rpc = make_rpc()
     write_rpc(rpc, tmp_path / "other.RPB")
     (tmp_path / "other.RPB").rename(tmp_path / "RPC_A.XML")
-    assert cameras._stated_altitudes(tmp_path / "DIM_A.XML") == altitude_range(rpc)
+    assert open_camera(tmp_path / "DIM_A.XML", model="physical").alt_range == altitude_range(rpc)
 
 
 @pytest.mark.parametrize(
     ("text", "taken"),
-    [
-        ("-10000:100000", True),
-        ("-10001:0", False),
-        ("0:100001", False),
-        ("5:5", False),
-        ("6:5", False),
-        ("0:1:2", False),
-    ],
+    [("-10000:100000", True), *((text, False) for text in ("-10001:0", "0:100001", "5:5", "6:5", "0:1:2"))],
 )
 def test_altitudes_are_an_interval_that_ground_may_lie_in(text, taken):
     if taken:
-        assert cameras.OPENERS["csm"].choices["altitudes"](text) == (-1e4, 1e5)
+        assert OPENERS["csm"].choices["altitudes"](text) == (-1e4, 1e5)
     else:
         with pytest.raises(ValueError):
-            cameras.OPENERS["csm"].choices["altitudes"](text)
+            OPENERS["csm"].choices["altitudes"](text)
 
 
 @pytest.mark.parametrize("physical", [True, False])

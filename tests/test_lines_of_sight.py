@@ -26,10 +26,7 @@ class Oblique:
 
     def project(self, ground):
         return np.stack(
-            [
-                (ground[..., 0] - WEST) / STEP - self.slope * ground[..., 2] / 30.0,
-                (NORTH - ground[..., 1]) / STEP,
-            ],
+            [(ground[..., 0] - WEST) / STEP - self.slope * ground[..., 2] / 30.0, (NORTH - ground[..., 1]) / STEP],
             axis=-1,
         )
 
@@ -91,14 +88,6 @@ def test_terrain_at_an_end_of_the_range_is_ground(tmp_path, alt):
         plain = localize_on_terrain(Oblique(0.5), image, lambda lon, lat: np.full(np.shape(lon), alt), (0.0, 500.0))
     np.testing.assert_allclose(found[:, 2], alt, atol=2e-4)
     np.testing.assert_allclose(plain[:, 2], alt, atol=2e-4)
-
-
-@pytest.mark.parametrize(("alt", "said"), [(800.0, "800 to 800 m"), (-40.0, "-40 to -40 m")])
-def test_a_dem_outside_the_cameras_altitudes_says_so(tmp_path, alt, said):
-    terrain, image = dem(tmp_path, np.full((9, 200), alt)), np.array([[50.0, 3.0], [80.5, 4.5]])
-    with pytest.warns(BarpcWarning, match=rf"heights here are {said}, .* made for 0 to 500 m: 2 of 2 lines"):
-        found = localize_on_terrain(Oblique(0.5), image, terrain, (0.0, 500.0))
-    assert np.isnan(found).all()
 
 
 def test_of_a_dem_half_outside_the_points_inside_are_found(tmp_path):

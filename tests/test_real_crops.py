@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,12 +99,11 @@ def test_a_crop_that_never_shows_enough_points_is_skipped_with_the_reason(made: 
 
 def test_images_must_be_connected_by_pairs_of_enough_points() -> None:
     images = tuple(image(name, (200, 200), (10000, 9000)) for name in ("a", "b", "c"))
-    points = np.tile(np.linspace(20, 180, 40)[:, None], (1, 4))
-    everything = Case("crop 1", dict.fromkeys(range(3), (0, 0, 200, 200)), real_crops.MARGIN)
-    chain = Block("chain", images, (Pair(0, 1, points), Pair(1, 2, points), Pair(0, 2, points[:5])))
-    apart = Block("apart", images, (Pair(0, 1, points), Pair(1, 2, points[:29]), Pair(0, 2, points[:5])))
-    assert not real_crops._unconnected(chain, everything)
-    assert "b c 29" in real_crops._unconnected(apart, everything)
+    points = np.tile(np.linspace(20, 180, 4000)[:, None], (1, 4))
+    few = Pair(0, 2, points[:5])
+    drawn(Block("chain", images, (Pair(0, 1, points), Pair(1, 2, points), few)), 1)
+    apart = Block("apart", images, (Pair(0, 1, points), Pair(1, 2, points[:: len(points) // 28]), few))
+    assert re.search(r"b c \d+", str(real_crops.draw(apart, 1, 0)))
 
 
 def test_the_rpc_of_a_crop_gives_the_same_pixel_less_the_corner(made: Block, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 import barpc.cli
 from tests.pipeline.known import part
-from tests.reliability.conftest import assert_one_line, crops, hashes, pristine  # noqa: F401
+from tests.reliability.conftest import assert_one_line, hashes
 from tests.reliability.conftest import barpc as command
 
 CLI = Path(barpc.cli.__file__).parent
@@ -31,7 +31,7 @@ def assert_told(said, *words):
 
 
 @pytest.fixture(scope="module")
-def ties(pristine, tmp_path_factory):  # noqa: F811
+def ties(pristine, tmp_path_factory):
     """Tie points of three crops."""
     folder = tmp_path_factory.mktemp("ties") / "out"
     said = command("match", *pristine, "-o", folder)
@@ -39,15 +39,8 @@ def ties(pristine, tmp_path_factory):  # noqa: F811
     return folder / "matches.csv"
 
 
-@pytest.mark.slow  # before a commit: the main job in test_adjust
-def test_a_good_run_ends_with_0_and_no_word_on_stderr(pristine, ties, tmp_path):  # noqa: F811
-    said = command("adjust", *pristine, "--matches", ties, "--matches-only", "-o", tmp_path / "out")
-    assert said.code == 0, said
-    assert said.err == ""
-
-
 @pytest.mark.slow
-def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
+def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):
     head, *rows = ties.read_text().splitlines()
     few = [row for row in rows if not row.startswith("view_02")]
     few += [row for row in rows if row.startswith("view_02")][:20]
@@ -56,7 +49,7 @@ def test_a_weak_view_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
     assert_told(said, "1 of 3 images needs review", "view_02: weakly connected")
 
 
-def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # noqa: F811
+def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):
     said = command("-q", "check", *pristine[:2])
     assert_told(said, "view_00: needs review", "Adjust the cameras")
     assert said.out == ""
@@ -64,7 +57,7 @@ def test_doubtful_cameras_end_with_3_and_say_so_even_when_quiet(pristine):  # no
 
 
 @pytest.mark.slow
-def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
+def test_a_file_left_out_ends_with_3(pristine, tmp_path):
     (tmp_path / "bad.tif").write_bytes(b"nothing")
     said = command("match", *pristine[:2], tmp_path / "bad.tif", "--keep-going", "-o", tmp_path / "out", "--json")
     assert_told(said, "bad.tif was left out")
@@ -72,7 +65,7 @@ def test_a_file_left_out_ends_with_3(pristine, tmp_path):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path):  # noqa: F811
+def test_a_fit_that_misses_its_tolerance_ends_with_3(pristine, ties, tmp_path):
     (tmp_path / "o.toml").write_text("[fit]\ntolerance = 1e-15\n")
     given = ("adjust", *pristine, "--matches", ties, "--matches-only", "--options", tmp_path / "o.toml", "-o")
     assert command(*given, tmp_path / "none").code == 1
@@ -104,10 +97,6 @@ def test_control_points_that_do_not_count_end_with_3(fault, tmp_path):
     assert not CONTROL.search(said.out + said.err)
 
 
-def test_other_verbs_end_with_3_and_say_why(pristine, tmp_path):  # noqa: F811
-    assert_told(command("project", pristine[0], "5.4", "43.3", "nan"), "1 of 1 points could not be projected")
-
-
 # --- the terminal -----------------------------------------------------------------------------------------
 
 
@@ -120,7 +109,7 @@ def test_nothing_but_the_door_prints():
 
 
 @pytest.mark.parametrize("debug", [[], ["--debug"]])
-def test_no_control_character_of_a_file_reaches_the_terminal(debug, crops, tmp_path):  # noqa: F811
+def test_no_control_character_of_a_file_reaches_the_terminal(debug, crops, tmp_path):
     before = hashes(crops)
     folder = tmp_path / "side"
     folder.mkdir()
@@ -151,7 +140,7 @@ def test_no_control_character_of_a_file_reaches_the_terminal(debug, crops, tmp_p
     assert hashes(crops) == before
 
 
-def test_the_log_and_warnings_are_single_printable_lines(crops, tmp_path):  # noqa: F811
+def test_the_log_and_warnings_are_single_printable_lines(crops, tmp_path):
     bad = Path(shutil.copy(crops[0], tmp_path / "bad.tif"))
     bad.write_bytes(b"nothing")
     said = command("-vv", "match", *crops, bad, "--keep-going", "-o", tmp_path / "out")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import struct
@@ -15,18 +13,18 @@ import pytest
 
 from barpc.base.declarations import declared
 from barpc.base.options import RunOptions
-from barpc.cli import main
 from barpc.cli.flags import flag_name
 from tests.geotiffs import write_image
 from tests.pointio.test_gcp_formats import geopackage_of, shapefile_of
+from tests.reliability.conftest import barpc
+from tests.reliability.trials import SAMPLES
 
-SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
-IMAGES = [str(path) for path in sorted(SAMPLES.glob("view_*.tif"))]
+IMAGES = [str(path) for path in SAMPLES]
 RNG = np.random.default_rng(1)
 
 
-def picture(path: Path, driver: str) -> None:
-    write_image(path, np.full((64, 64), 7, np.uint8), driver=driver)
+def picture(driver: str) -> Callable[[Path], object]:
+    return lambda path: write_image(path, np.full((64, 64), 7, np.uint8), driver=driver)
 
 
 def written(data: bytes) -> Callable[[Path], object]:
@@ -34,11 +32,11 @@ def written(data: bytes) -> Callable[[Path], object]:
 
 
 FOREIGN: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "raster": ("a.tif", lambda path: picture(path, "GTiff")),
+    "raster": ("a.tif", picture("GTiff")),
     "shapefile": ("left.shp", lambda path: shapefile_of(path.parent, kind=0)),
     "empty": ("empty.csv", written(b"")),
     "folder": ("folder", lambda path: path.mkdir()),
-    "JPEG": ("a.jpg", lambda path: picture(path, "JPEG")),
+    "JPEG": ("a.jpg", picture("JPEG")),
     "random": ("a.bin", written(RNG.bytes(30_000))),
     "pipe": ("pipe", os.mkfifo),
     "letter": ("letter.txt", written(b"To whom it may concern:\nnothing is here.\n")),
@@ -95,14 +93,6 @@ FAST = {("adjust --gcp", "heights"), ("adjust --gcp", "random"), ("adjust --chec
         ("adjust --matches", "empty")}  # fmt: skip
 
 
-def said_by(words: list[str]) -> tuple[object, str]:
-    """Exit code and what is said on stderr."""
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()), pytest.raises(SystemExit) as end:
-        main(words)
-    return end.value.code, said.getvalue().strip()
-
-
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
@@ -122,8 +112,9 @@ def test_a_file_of_another_kind_is_one_line(name: str, kind: str, tmp_path: Path
     words = [word.format(file=path, dem=tmp_path / "N43E005.hgt") for word in COMMANDS[name]]
     words += ["-o", str(tmp_path / "out")] if words[0] in OUTPUT else []
     before = None if path.is_dir() or path.is_fifo() else path.read_bytes()
-    code, said = said_by(words)
-    assert code in (1, 2), said
+    ended = barpc(*words)
+    said = ended.err.strip()
+    assert ended.code in (1, 2), said
     *above, line = said.splitlines()
     assert line.startswith("barpc: "), said
     assert not [one for one in above if not one.startswith("barpc: ")], said

@@ -18,17 +18,16 @@ from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
 from barpc.verbs.describe import described, outlines_geojson
 from tests.cli.test_main import run
-from tests.cli.test_points import a_slope
 from tests.rpcio.conftest import make_rpc
 
 SIZE = (2000, 1900)
 
 
-def tilted(across: float = 0.0, along: float = 0.0, **changes: Any) -> RPC:
-    rpc = make_rpc(**changes)
+def tilted(across: float = 0.0, along: float = 0.0) -> RPC:
+    """A camera that looks from another side."""
+    rpc = make_rpc()
     coeffs = np.array(rpc.coeffs)
-    coeffs[0, 3] += across
-    coeffs[2, 3] += along
+    coeffs[[0, 2], 3] += across, along
     return replace(rpc, coeffs=coeffs)
 
 
@@ -155,13 +154,13 @@ BOX: dict[str, Any] = {
 }
 
 
-def told(**changes: Any) -> dict[str, str]:
-    report = {key: value for key, value in {**REPORT, **changes}.items() if value is not ...}
-    return {label: line for label, line in _labelled_sentences(report) if label != "note"}
+def told(**changes: Any) -> list[tuple[str, str]]:
+    """What is said of the report, changed; `...` leaves a key out."""
+    return list(_labelled_sentences({key: value for key, value in {**REPORT, **changes}.items() if value is not ...}))
 
 
 def test_a_camera_that_is_no_rpc_says_where_it_is() -> None:
-    assert list(_labelled_sentences(REPORT)) == [
+    assert told() == [
         ("camera", "rpb in a in b.RPB"),
         ("note", "one"),
         ("note", "two"),
@@ -172,29 +171,34 @@ def test_a_camera_that_is_no_rpc_says_where_it_is() -> None:
         ("looks", "12.35 deg off the vertical, from 98.77 deg (north is 0)"),
         ("sensor", "694.3 km high, by its orbit"),
     ]
+    for method, words in (
+        ("line", "where the rays of an image line meet"),
+        ("nominal", "assumed, as the rays of an image line meet in no orbit"),
+    ):
+        assert told(camera_altitude_m={"value": 7e5, "method": method})[-1] == ("sensor", f"700.0 km high, {words}")
 
 
 def test_an_rpc_says_what_it_is_made_for() -> None:
-    lines = told(**BOX)
+    lines = dict(told(**BOX))
+    assert " ".join(lines) == "camera note image altitudes made for accuracy denominators centre pixel looks sensor"
     assert lines["camera"] == "RPC (rpb) in a in b.RPB"
     assert lines["made for"] == "lon 5.00000 to 6.00000, lat 43.00000 to 44.00000 deg"
     assert lines["accuracy"] == "3 m common to the image"
     assert lines["denominators"] == "at least 0.5 of their value at the centre: no pole"
     for least in (0.0, -0.25):
-        assert "a pole may lie" in told(**{**BOX, "smallest_denominator": least})["denominators"]
-    accuracy = told(**{**BOX, "err_bias_m": 0.0, "err_rand_m": 1.2345})["accuracy"]
+        assert "a pole may lie" in dict(told(**{**BOX, "smallest_denominator": least}))["denominators"]
+    accuracy = dict(told(**{**BOX, "err_bias_m": 0.0, "err_rand_m": 1.2345}))["accuracy"]
     assert accuracy == "0 m common to the image, 1.23 m of each point"
-    assert told(**{**BOX, "err_bias_m": None})["accuracy"] == "not stated"
+    assert dict(told(**{**BOX, "err_bias_m": None}))["accuracy"] == "not stated"
 
 
 def test_what_cannot_be_told_is_left_out() -> None:
-    lines = told(size_px=..., center_deg=...)
+    lines = dict(told(size_px=..., center_deg=..., notes=[]))
     assert list(lines) == ["camera", "image", "altitudes"]
     assert "size unknown" in lines["image"]
-    lines = told(problem="none there")
-    assert list(lines) == ["camera", "image", "altitudes", "problem"]
+    assert list(dict(told(problem="none there", notes=[]))) == ["camera", "image", "altitudes", "problem"]
     pairs = [{"with": "b", "convergence_deg": 12.345, "b_over_h": 0.2166}]
-    assert told(pairs=pairs)["pair"] == "with b: 12.35 deg between the rays, B/H 0.217"
+    assert dict(told(pairs=pairs))["pair"] == "with b: 12.35 deg between the rays, B/H 0.217"
 
 
 class Blind:
@@ -217,31 +221,11 @@ def test_a_camera_that_sees_no_ground_has_a_problem(pair: list[str]) -> None:
 # --- altitudes and outlines -------------------------------------------------------------------------------
 
 
-def test_without_a_size_no_height_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_rpc(make_rpc(), tmp_path / "a.RPB")
-    assert run("info", str(tmp_path / "a.RPB")) == 0
-    said = capsys.readouterr()
-    assert "size unknown" in said.out
-    assert said.err == ""
-
-
-def test_a_dem_is_asked_in_the_middle_of_the_image(
-    pair: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("info", pair[1], "--dem", str(a_slope(tmp_path / "d.tif", rise=100.0)), "--json") == 0
-    (found,) = json.loads(capsys.readouterr().out)
-    lon, lat = found["center_deg"]
-    assert found["center_alt_m"] == pytest.approx(100.0 + 1e4 * (lon - 5.4) + 50 * (44 - lat), abs=2e-3)
-    seen = open_camera(pair[1]).model.project(np.array([lon, lat, found["center_alt_m"]]))
-    assert seen == pytest.approx([999.5, 949.5], abs=1e-2)
-    hole = a_slope(tmp_path / "hole.tif", np.s_[70:90, 30:50])
-    assert run("info", pair[1], "--dem", str(hole)) == 1
-    assert f"barpc: {hole}: has no height at the images' position" in capsys.readouterr().err
-
-
 def test_outlines_name_their_images(pair: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", "--footprint", *pair, "--alt", "60") == 0
-    features = json.loads(capsys.readouterr().out)["features"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["type"] == "FeatureCollection"
+    features = document["features"]
     assert [one["properties"]["name"] for one in features] == ["left", "right"]
     assert [one["properties"]["path"] for one in features] == [spec.split(",")[0] for spec in pair]
     assert [one["properties"]["alt"] for one in features] == [60.0, 60.0]
@@ -261,3 +245,8 @@ def test_the_page_has_an_image_s_name_and_its_lines_behind(pair: list[str], caps
     (report,) = json.loads(capsys.readouterr().out)
     assert "pairs" not in report
     assert report["center_alt_m"] == 60.0
+    at = (5.402, 43.199, 80.0)
+    assert run("info", pair[0], "--alt", "60", "--at", *at, "--json") == 0
+    (elsewhere,) = json.loads(capsys.readouterr().out)
+    assert elsewhere["incidence_deg"] == describe(pair[0], 60.0, at)["incidence_deg"] != report["incidence_deg"]
+    assert run("info") == 2

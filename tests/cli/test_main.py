@@ -14,7 +14,7 @@ import click
 import pytest
 
 from barpc.base.errors import BarpcWarning, InputError
-from barpc.cli import COMMANDS, Verbs, cli, main
+from barpc.cli import COMMANDS, cli, main
 from barpc.cli.process import interruptible
 from barpc.verbs.workers import THREADS
 
@@ -27,13 +27,13 @@ def run(*args: object) -> int:
     return stop.value.code
 
 
-def refused(*args: str) -> str:
-    """What is said of a command line before its verb is called."""
+def resolved(*words: str) -> tuple[list[str], dict[str, object]]:
+    """What is left of a command line before its verb is called, and the flags that every verb has."""
     context = click.Context(cli, **cli.context_settings)
     context.params = {"verbose": 0, "quiet": False, "debug": False}
-    with pytest.raises(click.UsageError) as error:
-        cli.resolve_command(context, list(args))
-    return error.value.message
+    name, command, rest = cli.resolve_command(context, list(words))
+    assert command is not None
+    return [str(name), *rest], context.params
 
 
 # --- words ------------------------------------------------------------------------------------------------
@@ -47,7 +47,9 @@ def refused(*args: str) -> str:
     ],
 )  # fmt: skip
 def test_a_word_that_is_not_known_is_met_with_the_one_that_is(words: list[str], told: str) -> None:
-    assert refused(*words) == told
+    with pytest.raises(click.UsageError) as error:
+        resolved(*words)
+    assert error.value.message == told
 
 
 @pytest.mark.parametrize(
@@ -63,15 +65,11 @@ def test_a_word_that_is_not_known_is_met_with_the_one_that_is(words: list[str], 
     ],
 )
 def test_other_words_are_left_to_click(words: list[str]) -> None:
-    context = click.Context(cli, **cli.context_settings)
-    context.params = {"verbose": 0, "quiet": False, "debug": False}
     if words[0].startswith("-"):
         with pytest.raises(click.UsageError, match="No such"):
-            cli.resolve_command(context, words)
-        return
-    name, command, rest = cli.resolve_command(context, words)
-    assert (name, rest) == (words[0], words[1:])
-    assert command is not None
+            resolved(*words)
+    else:
+        assert resolved(*words)[0] == words
 
 
 @pytest.mark.parametrize(
@@ -87,19 +85,17 @@ def test_other_words_are_left_to_click(words: list[str]) -> None:
     ],
 )
 def test_flags_of_every_verb_are_taken_out_of_its_words(words: str, rest: str, params: tuple[int, bool, bool]) -> None:
-    context = click.Context(cli, **cli.context_settings)
-    context.params = {"verbose": 0, "quiet": False, "debug": False}
-    assert isinstance(cli, Verbs)
-    name, _, others = cli.resolve_command(context, words.split())
-    assert [name, *others] == rest.split()
-    assert (context.params["verbose"], context.params["quiet"], context.params["debug"]) == params
+    others, flags = resolved(*words.split())
+    assert others == rest.split()
+    assert (flags["verbose"], flags["quiet"], flags["debug"]) == params
 
 
 def test_there_is_no_verb_beside_the_table() -> None:
-    assert cli.get_command(click.Context(cli, **cli.context_settings), "nothing") is None
-    assert cli.list_commands(click.Context(cli, **cli.context_settings)) == list(COMMANDS)
+    context = click.Context(cli, **cli.context_settings)
+    assert cli.get_command(context, "nothing") is None
+    assert cli.list_commands(context) == list(COMMANDS)
     for name in ("match", "report", "localize", "export"):
-        command = cli.get_command(click.Context(cli, **cli.context_settings), name)
+        command = cli.get_command(context, name)
         assert command is not None
         assert command.name == name
         assert "\b\n" in str(command.help)
@@ -135,21 +131,6 @@ def _os_error(number: int, text: str, name: str | None) -> OSError:
 def _from(cause: BaseException, error: BaseException) -> BaseException:
     error.__cause__ = cause
     return error
-
-
-@pytest.fixture
-def verb(monkeypatch: pytest.MonkeyPatch) -> Callable[[object], None]:
-    """Sets what every call of the group does: it returns a value or raises an error."""
-
-    def does(what: object) -> None:
-        def called(**_: object) -> object:
-            if isinstance(what, BaseException):
-                raise what
-            return what() if callable(what) else what
-
-        monkeypatch.setattr(cli, "main", called)
-
-    return does
 
 
 @pytest.mark.parametrize(
@@ -281,5 +262,6 @@ def test_how_much_is_logged(
     assert how["level"] == level
     (handler,) = how["handlers"]  # type: ignore[misc]
     assert handler.stream is sys.stderr
-    assert bool(handler.filter(logging.LogRecord("gcsfs", 40, "", 0, "x", (), None))) == all_of_it
+    for name, shown in (("barpc.a", True), ("gcsfs", all_of_it)):
+        assert bool(handler.filter(logging.LogRecord(name, 40, "", 0, "x", (), None))) == shown
     assert warnings.showwarning is before

@@ -15,22 +15,16 @@ from scipy.spatial.transform import Rotation
 from barpc.base.errors import Remark
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.cameras import open_camera
-from barpc.rpcio import read_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc
 from barpc.scene import Camera
 from barpc.sensor.triangulation import triangulate
 from barpc.verbs.moving import moved
 from tests.cli.test_main import run
-from tests.rpcio.conftest import make_rpc, write_image
+from tests.reliability.conftest import assert_one_line, barpc
+from tests.reliability.trials import SAMPLES
+from tests.rpcio.conftest import make_rpc
 
 pytestmark = pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")  # the motion and the refit are told
-SAMPLES = Path(__file__).parents[2] / "data_samples"
-
-
-@pytest.fixture
-def image(tmp_path: Path) -> Path:
-    raw = write_image(tmp_path / "raw.tif", shape=(1, 200, 300))
-    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
-    return tmp_path / "in" / "scene.tif"
 
 
 def _seen(camera, count=50):
@@ -48,13 +42,13 @@ def _similarity(at, scale):
     return matrix
 
 
-_IMAGES_ALONE = "md_ov", "ssc1d3"
-"""OrbView-3's denominators are those of no turned RPC; SkySat's states two degrees of ground for an image of 2 km."""
-
-
 def _saved(matrix, folder: Path) -> str:
     np.savetxt(folder / "t.txt", matrix, fmt="%.17g")
     return str(folder / "t.txt")
+
+
+_IMAGES_ALONE = "md_ov", "ssc1d3"
+"""OrbView-3's denominators are those of no turned RPC; SkySat's states two degrees of ground for an image of 2 km."""
 
 
 def test_the_cameras_show_points_after_a_move_where_they_showed_them_before(image: Path, tmp_path: Path, capsys):
@@ -80,9 +74,8 @@ def test_a_matrix_is_followed_to_the_last_digit(image: Path, tmp_path: Path, sca
     ground, xy = _seen(open_camera(image))
     ecef = ecef_from_ground(ground)
     matrix = _similarity(ecef.mean(axis=0), scale)
-    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
     out = tmp_path / "out"
-    assert run("convert", str(image), "-o", str(out), "--transform", str(tmp_path / "t.txt"), "--json") == 0
+    assert run("convert", image, "-o", out, "--transform", _saved(matrix, tmp_path), "--json") == 0
     there = ground_from_ecef(ecef @ matrix[:3, :3].T + matrix[:3, 3])
     np.testing.assert_allclose(read_rpc(out / "scene_RPC.TXT").project(there), xy, rtol=0, atol=1e-7)
     said = capsys.readouterr()
@@ -94,12 +87,10 @@ def test_a_matrix_is_followed_to_the_last_digit(image: Path, tmp_path: Path, sca
 def test_back_and_forth_is_where_it_was(image: Path, tmp_path: Path):
     ground, xy = _seen(open_camera(image))
     matrix = _similarity(ecef_from_ground(ground[0]), 1.00001)
-    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
     np.savetxt(tmp_path / "back.txt", np.linalg.inv(matrix)[:3], fmt="%.17g", delimiter=",")
     once, twice = tmp_path / "once", tmp_path / "twice"
-    assert run("convert", str(image), "-o", str(once), "--transform", str(tmp_path / "t.txt")) == 0
-    words = ("--rpc", str(once), "-o", str(twice), "--transform", str(tmp_path / "back.txt"))
-    assert run("convert", str(image), *words) == 0
+    assert run("convert", image, "-o", once, "--transform", _saved(matrix, tmp_path)) == 0
+    assert run("convert", image, "--rpc", once, "-o", twice, "--transform", tmp_path / "back.txt") == 0
     np.testing.assert_allclose(read_rpc(twice / "scene.vrt").project(ground), xy, rtol=0, atol=1e-6)
 
 
@@ -111,8 +102,7 @@ def test_the_rpc_of_a_crop_still_holds_all_the_ground_that_it_was_made_for(image
     ground = rpc.ground_offset + np.random.default_rng(0).uniform(-1, 1, (500, 3)) * rpc.ground_scale
     matrix = _similarity(ecef_from_ground(ground).mean(axis=0), 1.00001)
     matrix[:3, 3] *= 1.0 + length / 6.4e6
-    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
-    assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 0
+    assert run("convert", image, "-o", tmp_path / "o", "--transform", _saved(matrix, tmp_path)) == 0
     there = ground_from_ecef(ecef_from_ground(ground) @ matrix[:3, :3].T + matrix[:3, 3])
     after = open_camera(tmp_path / "o" / "scene.vrt")
     np.testing.assert_allclose(after.rpc.project(there), rpc.project(ground), rtol=0, atol=1e-6)
@@ -174,20 +164,18 @@ def test_vendors_rpcs_follow_a_motion_over_all_their_ground(
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "t.txt")])
+@pytest.mark.parametrize("words", [("--move", "200,-100,50"), ("--transform", "")])
 def test_rays_of_three_images_meet_where_the_motion_takes_the_point(tmp_path: Path, words):
-    files = sorted(SAMPLES.glob("view_0?.tif"))
-    old = [open_camera(file).model for file in files]
+    old = [open_camera(file).model for file in SAMPLES]
     rng = np.random.default_rng(1)
     alt = rng.uniform(150, 250, 20)
     ground = old[0].localize(rng.uniform(200, 800, (20, 2)), alt)
     ecef = ecef_from_ground(ground)
     matrix = _similarity(ecef.mean(axis=0), 1.00001)
-    np.savetxt(tmp_path / "t.txt", matrix, fmt="%.17g")
     flag, value = words
-    value = str(tmp_path / value) if flag == "--transform" else value
-    assert run("convert", *map(str, files), "-o", str(tmp_path / "out"), flag, value) == 0
-    new = [read_rpc(tmp_path / "out" / f"{file.stem}_RPC.TXT") for file in files]
+    value = value or _saved(matrix, tmp_path)
+    assert run("convert", *SAMPLES, "-o", tmp_path / "out", flag, value) == 0
+    new = [read_rpc(tmp_path / "out" / f"{file.stem}_RPC.TXT") for file in SAMPLES]
     seen = np.stack([model.project(ground) for model in old])
     point, view = np.tile(np.arange(20), 3), np.repeat(np.arange(3), 20)
     found = triangulate(new, view, point, seen.reshape(-1, 2)).points
@@ -221,9 +209,8 @@ def test_few_digits_are_told_in_metres(image: Path, tmp_path: Path, capsys):
         ("602000,4795000,100", "above -22000 and below 22000 [m]"),
     ],
 )
-def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, capsys, move: str, told: str):
-    assert run("convert", str(image), "-o", str(tmp_path / "o"), "--move", move) == 2
-    assert told in capsys.readouterr().err
+def test_a_move_is_three_numbers_of_metres(image: Path, tmp_path: Path, move: str, told: str):
+    assert_one_line(barpc("convert", image, "-o", tmp_path / "o", "--move", move), 2, told)
     assert not (tmp_path / "o").exists()
 
 
@@ -237,12 +224,8 @@ def test_a_longitude_and_latitude_in_the_images_is_no_move(image: Path, tmp_path
 
 def test_a_matrix_that_leaves_the_earth_writes_nothing(image: Path, tmp_path: Path, capsys):
     matrix = np.eye(4)
-    for matrix[:3, :3] in (
-        2.0 * np.eye(3),
-        1.01 * np.eye(3),
-    ):  # as of map coordinates in feet, or of a local frame
-        np.savetxt(tmp_path / "t.txt", matrix)
-        assert run("convert", str(image), "-o", str(tmp_path / "o"), "--transform", str(tmp_path / "t.txt")) == 1
+    for matrix[:3, :3] in (2.0 * np.eye(3), 1.01 * np.eye(3)):  # as of map coordinates in feet, or of a local frame
+        assert run("convert", image, "-o", tmp_path / "o", "--transform", _saved(matrix, tmp_path)) == 1
         assert "a matrix of other coordinates than ECEF?" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
@@ -251,5 +234,4 @@ def test_a_motion_goes_with_a_folder_and_there_is_one(image: Path, tmp_path: Pat
     assert run("convert", str(image), str(tmp_path / "a_RPC.TXT"), "--move", "1,2,3") == 2
     assert "with it: --rpc, --images, --move, --transform" in capsys.readouterr().err
     both = ("--move", "1,2,3", "--transform", "t.txt")
-    assert run("convert", str(image), "-o", str(tmp_path / "o"), *both) == 2
-    assert "give either --move or --transform" in capsys.readouterr().err
+    assert_one_line(barpc("convert", image, "-o", tmp_path / "o", *both), 2, "give either --move or --transform")

@@ -14,6 +14,7 @@ from barpc.base.errors import InputError
 from barpc.cli.project import given_points
 from barpc.rpcio import write_rpc
 from barpc.sensor.rpc import RPC
+from tests.cli.test_info import tilted
 from tests.cli.test_main import run
 from tests.rasters.test_dem import write_dem
 from tests.rpcio.conftest import make_rpc
@@ -47,6 +48,7 @@ def test_numbers_are_points_one_behind_the_other(
 @pytest.mark.parametrize(
     ("numbers", "fill", "told"),
     [((), None, "0 numbers; give LON LAT ALT of"), ((1, 2, 3, 4), None, "4 numbers; give LON LAT ALT of"),
+     ((1, 2), None, "2 numbers; give LON LAT ALT of"),
      ((), 0.0, "0 numbers; give LON LAT of"), ((1, 2, 3), 0.0, "3 numbers; give LON LAT of")],
 )  # fmt: skip
 def test_numbers_that_are_no_whole_points_are_wrong_usage(
@@ -87,6 +89,7 @@ def test_a_table_has_a_header_or_its_columns_in_order(
     [
         ("lon,lat\n1,2\n", None, "columns lon, lat, alt expected, found lon, lat"),
         ("lon,alt\n1,2\n", 7.0, "columns lon, lat, alt expected, found lon, alt"),
+        ("x,y,z\n1,2,3\n", None, "columns lon, lat, alt expected, found x, y, z"),
         ("1,2,3\n1,x,3\n", None, "point 2: 'x' is no number"),
         ("1,2,3\n4,5\n", None, "point 2 has 2 columns, expected lon, lat, alt"),
         ("1\n", 7.0, "point 1 has 1 columns, expected lon, lat, alt"),
@@ -97,9 +100,6 @@ def test_a_table_that_lacks_something_says_what(text: str, fill: float | None, t
     with pytest.raises(InputError) as error:
         table(tmp_path, text, fill)
     assert str(error.value) == f"{tmp_path / 't.csv'}: {told}"
-
-
-# --- what goes out ----------------------------------------------------------------------------------------
 
 
 # --- the verbs --------------------------------------------------------------------------------------------
@@ -139,14 +139,15 @@ def test_localize_prints_ten_digits_of_degrees_and_four_of_metres(
 
 
 def test_altitudes_of_a_table_count_and_the_others_are_the_one_given(
-    rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, rpc = rpc_file
     (tmp_path / "t.csv").write_text("100,200,50\n300,400\n")
     assert run("localize", str(file), "--points", str(tmp_path / "t.csv"), "--alt", "80") == 0
     found = rows(capsys.readouterr().out)
     np.testing.assert_allclose(found, rpc.localize([[100.0, 200.0], [300.0, 400.0]], [50.0, 80.0]), atol=1e-9)
-    assert run("localize", str(file), "--points", str(tmp_path / "t.csv")) == 0
+    monkeypatch.setattr("sys.stdin", io.StringIO((tmp_path / "t.csv").read_text()))
+    assert run("localize", str(file), "--points", "-") == 0
     told = capsys.readouterr()
     assert rows(told.out)[:, 2].tolist() == pytest.approx([50.0, rpc.ground_offset[2]], abs=1e-4)
     assert "terrain height unknown" in told.err
@@ -156,8 +157,8 @@ def test_a_point_without_a_value_is_nan_or_null_and_the_exit_code_3(
     rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, rpc = rpc_file
-    words = ("project", str(file), "5.4", "43.2", "120", "nan", "43.2", "120", "5.4", "43.2", "inf")
-    col, row = rpc.project([5.4, 43.2, 120.0])
+    words = ("project", str(file), "5.4", "43.2", "-3.5", "nan", "43.2", "120", "5.4", "43.2", "inf")
+    col, row = rpc.project([5.4, 43.2, -3.5])
     assert run(*words) == 3
     assert capsys.readouterr() == (
         f"col,row\n{col:.6f},{row:.6f}\nnan,nan\nnan,nan\n",
@@ -168,40 +169,33 @@ def test_a_point_without_a_value_is_nan_or_null_and_the_exit_code_3(
     assert json.loads(capsys.readouterr().out) == [{"col": round(col, 6), "row": round(row, 6)}, nothing, nothing]
     assert run("localize", str(file), "100", "200", "--alt", "3.00004", "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["alt"] == 3.0
+    assert run("localize", str(file), "1e12", "0", "--json") == 3
+    told = capsys.readouterr()
+    assert json.loads(told.out)[0]["lon"] is None
+    assert "1 of 1 points have no ground point" in told.err
     (tmp_path / "none.csv").write_text("lon,lat,alt\n")
     assert run("project", str(file), "--points", str(tmp_path / "none.csv")) == 0
     assert capsys.readouterr() == ("col,row\n", "")
-
-
-def a_slope(path: Path, *holes: tuple[slice, slice], rise: float = 1.0) -> Path:
-    """A DEM of 100 m at 5.4 E, 44 N: up by `rise` a hundredth of a degree to the east, by half a metre to the south."""
-    row, col = np.mgrid[:101, :61]
-    heights = (100.0 + rise * (col - 40) + 0.5 * row).astype(np.float32)
-    for hole in holes:
-        heights[hole] = -9999.0
-    return write_dem(path, 4979, heights)
 
 
 def test_a_dem_tells_the_altitudes_of_projected_points(
     rpc_file: tuple[Path, RPC], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, rpc = rpc_file
-    assert run("project", str(file), "5.404", "43.203", "--dem", str(a_slope(tmp_path / "d.tif"))) == 0
+    row, col = np.mgrid[:101, :61]  # 100 m at 5.4 E, 44 N; a hundredth of a degree apart
+    dem = write_dem(tmp_path / "d.tif", 4979, (60.0 + col + 0.5 * row).astype(np.float32))
+    assert run("project", str(file), "5.404", "43.203", "--dem", str(dem)) == 0
     np.testing.assert_allclose(rows(capsys.readouterr().out)[0], rpc.project([5.404, 43.203, 140.25]), atol=6e-6)
 
 
 @pytest.fixture
 def three(tmp_path: Path) -> tuple[list[str], list[RPC]]:
     """Three cameras that look from three sides."""
-    found = []
-    for number, tilt in enumerate((0.0, 0.09, -0.12)):
-        rpc = make_rpc()
-        coeffs = np.array(rpc.coeffs)
-        coeffs[0, 3] += tilt
-        coeffs[2, 3] -= tilt
-        found.append(RPC(coeffs, rpc.ground_offset, rpc.ground_scale, rpc.image_offset, rpc.image_scale))
-        write_rpc(found[-1], tmp_path / f"{number}.RPB")
-    return [str(tmp_path / f"{number}.RPB") for number in range(3)], found
+    found = [tilted(tilt, -tilt) for tilt in (0.0, 0.09, -0.12)]
+    files = [str(tmp_path / f"{number}.RPB") for number in range(3)]
+    for file, rpc in zip(files, found, strict=True):
+        write_rpc(rpc, file)
+    return files, found
 
 
 def test_triangulate_takes_the_images_that_see_a_point(
@@ -230,9 +224,13 @@ def test_triangulate_tells_the_root_mean_square_over_the_images(
     three: tuple[list[str], list[RPC]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files, rpcs = three
-    seen = np.array([rpc.project([5.4, 43.2, 150.0]) for rpc in rpcs]) + [[2, -1], [-1, 2], [0.5, 1]]
-    words = [word for pair in seen for word in ("--at", repr(float(pair[0])), repr(float(pair[1])))]
-    assert run("triangulate", *files, *words, "--json") == 3  # they are pixels apart
+    exact = np.array([rpc.project([5.4, 43.2, 150.0]) for rpc in rpcs])
+    seen = exact + [[2, -1], [-1, 2], [0.5, 1]]
+    there, apart = ([word for col, row in at.tolist() for word in ("--at", col, row)] for at in (exact, seen))
+    assert run("triangulate", *files, *there, "--json") == 0
+    (point,) = json.loads(capsys.readouterr().out)
+    assert [*point.values()] == pytest.approx([5.4, 43.2, 150.0, 0.0], abs=1e-4)
+    assert run("triangulate", *files, *apart, "--json") == 3  # they are pixels apart
     told = capsys.readouterr()
     (point,) = json.loads(told.out)
     assert told.err.startswith("barpc: needs review (exit code 3): 1 of 1 points do not meet: they are up to 1.6")
@@ -252,11 +250,7 @@ def test_triangulate_tells_the_root_mean_square_over_the_images(
     ],
 )
 def test_triangulate_needs_a_point_of_each_of_two_images(
-    count: int,
-    words: list[str],
-    told: str,
-    three: tuple[list[str], list[RPC]],
-    capsys: pytest.CaptureFixture[str],
+    count: int, words: list[str], told: str, three: tuple[list[str], list[RPC]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("triangulate", *three[0][:count], *words) == 2
     assert told in capsys.readouterr().err

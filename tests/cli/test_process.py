@@ -14,17 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from barpc.cli import cli, main, process
+from barpc.cli import process
 from barpc.cli.process import Interrupt, interruptible
+from tests.cli.test_main import run
 from tests.lanes import rest_slow
-from tests.reliability.conftest import pristine  # noqa: F401
+from tests.reliability.test_interruption import ROOT, posix
 from tests.reliability.trials import SAMPLES, crop, outputs
 
-ROOT = Path(__file__).resolve().parents[2]
 COMMAND = f"{sys.executable} -m barpc"
 FULL = Path("/dev/full")
 TOLD = "barpc: interrupted; nothing was kept\n"
-posix = pytest.mark.skipif(os.name != "posix", reason="a shell's redirections, and signals")
 
 
 # --- streams ----------------------------------------------------------------------------------------------
@@ -77,10 +76,7 @@ def test_a_stream_that_is_closed_full_or_broken(words: str, how: str) -> None:
 @pytest.mark.parametrize("how", ENDS)
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_what_is_written_to_files_is_whole_whatever_becomes_of_the_streams(
-    pristine: list[Path],  # noqa: F811
-    tmp_path: Path,
-    jobs: int,
-    how: str,
+    pristine: list[Path], tmp_path: Path, jobs: int, how: str
 ) -> None:
     needed(how)
     for path in pristine[:2]:
@@ -201,20 +197,18 @@ def test_a_signal_after_the_last_word_has_no_word_and_changes_no_code(ended, cod
 
 
 @pytest.mark.parametrize("error", [RuntimeError("x"), ImportError("x"), KeyboardInterrupt()])
-def test_what_an_interruption_makes_of_other_code_is_no_error(monkeypatch, capsys, error: BaseException) -> None:
+def test_what_an_interruption_makes_of_other_code_is_no_error(verb, capsys, error: BaseException) -> None:
     """Class bodies, callbacks of C, imports turn it into theirs."""
 
-    def work(**_: object) -> None:
+    def work() -> None:
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt:
             signal.raise_signal(signal.SIGTERM)  # in its clean-up
             raise error from None
 
-    monkeypatch.setattr(cli, "main", work)
-    with pytest.raises(SystemExit) as stop:
-        main(["info"])
-    assert stop.value.code == 130
+    verb(work)
+    assert run("info") == 130
     assert capsys.readouterr().err == TOLD
 
 
@@ -251,9 +245,7 @@ def test_ctrl_c_pressed_again_is_one_line_and_loses_nothing(tmp_path: Path, jobs
             shutil.rmtree(tmp_path / "out")
             continue
         assert (run.returncode, out) == (130, "")
-        if (
-            "Ran out of input" in err
-        ):  # a worker that Python was just starting says so, and nothing can keep it from that
+        if "Ran out of input" in err:  # a worker that Python was just starting says so; nothing can keep it from that
             assert jobs > 1
             assert TOLD[:18] in err
         else:

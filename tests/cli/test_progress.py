@@ -24,7 +24,6 @@ from barpc.base.errors import InputError
 from barpc.cli.terminal import MINUTE, Lines, progress_told
 from barpc.verbs.workers import THREADS, executor_for
 from tests.lanes import rest_slow
-from tests.reliability.conftest import pristine  # noqa: F401
 
 
 class Told:
@@ -37,6 +36,7 @@ class Told:
 
 def test_a_line_comes_when_a_minute_is_over_and_not_before() -> None:
     told = Told()
+    told.lines.look(now=True)  # nothing has begun
     told.lines("match", 0, 40)
     told.now += MINUTE - 0.1
     told.lines("match", 3, 40)
@@ -46,6 +46,10 @@ def test_a_line_comes_when_a_minute_is_over_and_not_before() -> None:
     told.lines.look()
     assert told.said == ["match: 3 of 40, about 12.3 min left"]
     assert MINUTE == 60.0
+    told.lines("detect", 0, 40)  # of what nothing is done no end is told
+    told.now += MINUTE
+    told.lines.look()
+    assert told.said[1:] == ["detect: 0 of 40"]
 
 
 def test_the_time_left_counts_from_the_beginning_of_the_stage() -> None:
@@ -62,17 +66,25 @@ def test_the_time_left_counts_from_the_beginning_of_the_stage() -> None:
     assert told.said == ["match: 1 of 2, about 1.0 min left"]
 
 
-def test_of_what_nothing_is_done_no_end_is_told() -> None:
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0, "0 s"), (1.6, "2 s"), (59.0, "59 s"), (60.0, "1.0 min"), (90.0, "1.5 min"), (3599.0, "60.0 min"),
+     (3600.0, "1.0 h"), (9000.0, "2.5 h")],
+)  # fmt: skip
+def test_a_single_task_tells_how_long_it_is_at_work_in_a_time_of_its_unit(seconds: float, text: str) -> None:
     told = Told()
-    told.lines("match", 0, 40)
-    told.now += 60.0
-    told.lines.look()
-    assert told.said == ["match: 0 of 40"]
+    told.lines("adjustment", 0, 1)
+    told.now += seconds
+    told.lines("adjustment", 0, 1)
+    assert told.said == [f"adjustment: at work for {text}"] * (seconds >= MINUTE)
+    told.said.clear()
+    told.lines.look(now=True)
+    assert told.said == [f"adjustment: at work for {text}"]
 
 
 @pytest.mark.slow
 @pytest.mark.landing(6)
-def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:  # noqa: F811
+def test_the_verdict_begins_a_line_behind_the_last_bar(pristine) -> None:
     screen, side = pytest.importorskip("pty").openpty()
     with subprocess.Popen([sys.executable, "-m", "barpc", "check", *pristine[:2]], stdout=side, stderr=side):
         os.close(side)
@@ -93,14 +105,6 @@ def test_tenths_are_told_only_where_they_are_asked_for() -> None:
     assert said == []
 
 
-def test_a_single_task_tells_how_long_it_is_at_work() -> None:
-    told = Told()
-    told.lines("adjustment", 0, 1)
-    told.now += 90.0
-    told.lines("adjustment", 0, 1)
-    assert told.said == ["adjustment: at work for 1.5 min"]
-
-
 def test_with_v_a_line_comes_at_every_tenth_of_more_than_one_task() -> None:
     told = Told(groups=True)
     for done in range(21):
@@ -114,19 +118,6 @@ def test_with_v_a_line_comes_at_every_tenth_of_more_than_one_task() -> None:
     assert told.said == ["detect: 2 of 20, about 0 s left"]
     told.lines("few", 1, 2)
     assert told.said[1:] == ["few: 1 of 2, about 0 s left"]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.0, "0 s"), (1.6, "2 s"), (59.0, "59 s"), (60.0, "1.0 min"), (90.0, "1.5 min"), (3599.0, "60.0 min"),
-     (3600.0, "1.0 h"), (9000.0, "2.5 h")],
-)  # fmt: skip
-def test_a_time_is_told_in_its_unit(seconds: float, text: str) -> None:
-    told = Told()
-    told.lines("adjustment", 0, 1)
-    told.now += seconds
-    told.lines.look(now=True)
-    assert told.said == [f"adjustment: at work for {text}"]
 
 
 def test_passes_of_an_unknown_number_are_told_without_a_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,10 +273,7 @@ def test_a_worker_leaves_with_its_parent() -> None:
 
 def test_a_cluster_needs_its_package_and_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with (
-        pytest.raises(InputError, match=r"-j tcp://a:1: an address needs the extra"),
-        executor_for("tcp://a:1"),
-    ):
+    with pytest.raises(InputError, match=r"-j tcp://a:1: an address needs the extra"), executor_for("tcp://a:1"):
         pass
     asked, closed = list[tuple[str, float]](), list[bool]()
 
@@ -305,10 +293,7 @@ def test_a_cluster_needs_its_package_and_an_answer(monkeypatch: pytest.MonkeyPat
             return "executor"
 
     monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=Client))
-    with (
-        pytest.raises(InputError, match=r"no scheduler answers there \(refused\)"),
-        executor_for("tcp://no:1"),
-    ):
+    with pytest.raises(InputError, match=r"no scheduler answers there \(refused\)"), executor_for("tcp://no:1"):
         pass
     with executor_for("tcp://yes:1") as executor:
         assert (executor, closed) == ("executor", [])

@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from barpc.cli import COMMANDS
-from tests.reliability.conftest import barpc, pristine, ran  # noqa: F401
+from tests.reliability.conftest import barpc
 
 DONE = {
     "adjust": ("{in}/view_00.tif", "{in}/view_01.tif", "-o", "{new}"),
@@ -37,7 +37,7 @@ SLOW = ("adjust", "match", "check", "convert -o", "dsm")
 
 
 @pytest.fixture
-def places(ran, tmp_path):  # noqa: F811
+def places(ran, tmp_path):
     """A run of one's own, and a name for what is new."""
     shutil.copytree(ran, tmp_path / "ran")
     return {"in": tmp_path / "ran/in", "out": tmp_path / "ran/out", "new": tmp_path / "new"}

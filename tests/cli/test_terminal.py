@@ -5,16 +5,19 @@ from __future__ import annotations
 import io
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
 import click
 import pytest
 
-from barpc.cli import terminal
+from barpc.cli import cli, terminal
 from barpc.cli.terminal import Formatter, layout, output_width, print_comparison, print_summary, tell_gate
 from barpc.report.summary.block import DATUM, DatumEntry
 from barpc.report.summary.ground_points import GCP_CAPTION
+from tests.cli.test_progress import Window
 from tests.report.made import a_gcp, a_pair, a_summary, a_view
 
 NUMBERS = [["image", "error [px]", "tie points"], ["a", "0.5", "12"], ["bb", "10.25", "3"]]
@@ -78,11 +81,6 @@ def test_a_row_of_another_length_is_no_table(width: int | None) -> None:
             layout(table, width)
 
 
-class Window(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 def test_only_a_terminal_has_a_width(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "57")
     monkeypatch.setattr(sys, "stdout", Window())
@@ -133,10 +131,15 @@ def spoken(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict[str, Any]]]:
     return found
 
 
-def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
-    spoken: list[tuple[str, dict[str, Any]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
+@contextmanager
+def verbose() -> Iterator[None]:
+    """As behind `-v`."""
+    with click.Context(cli) as context:
+        context.params["verbose"] = 1
+        yield
+
+
+def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(spoken: list[tuple[str, dict[str, Any]]]) -> None:
     summary = a_summary(
         [a_view("A"), a_view("B", rmse_before=3.0)],
         [a_pair("A", "B", 77)],
@@ -146,7 +149,8 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
         gcps=tuple(a_gcp(f"g{n}", 5.0, 43.0) for n in range(2)),
         out_dir="out",
     )
-    print_summary(summary)
+    with verbose():
+        print_summary(summary)
     titles = [text for text, style in spoken if style.get("bold")]
     assert titles[:2] == [
         "Images: tie points, and the RMS of their residuals",
@@ -165,22 +169,17 @@ def test_a_summary_is_tables_a_headline_in_colour_and_the_verdict(
     ]
 
 
-def test_what_holds_the_scene_is_a_table_where_several_sources_do(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
+def test_what_holds_the_scene_is_a_table_where_several_sources_do(capsys: pytest.CaptureFixture[str]) -> None:
     entry = DatumEntry("east", 0.5, 0.7, 0.0, 0.0, 0.3, 0.0)
-    print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
+    with verbose():
+        print_summary(a_summary([], scene=SimpleNamespace(datum=(entry,))))
     title, head, row, *_ = capsys.readouterr().out.splitlines()
     assert title == DATUM
-    assert [word in head for word in ("motion", "cameras", "earlier run")] == [
-        True,
-        True,
-        False,
-    ]
+    assert [word in head for word in ("motion", "cameras", "earlier run")] == [True, True, False]
     assert row.split() == ["east", "0.50", "70%", "30%"]
     for alone in ((), (DatumEntry("east", 0.5, 0.996, 0.0, 0.0, 0.004, 0.0),)):  # the verdict says it
-        print_summary(a_summary([], scene=SimpleNamespace(datum=alone)))
+        with verbose():
+            print_summary(a_summary([], scene=SimpleNamespace(datum=alone)))
         assert capsys.readouterr().out == "All well.\n"
 
 
@@ -195,8 +194,8 @@ def test_what_is_empty_is_not_shown_and_lines_end_at_the_terminal_s_width(
         ("All of it well.", {"err": False, "bold": True, "fg": colour}),
         ("five\ntie-points\nof a view", {"err": False}),
     ]
-    monkeypatch.setattr(terminal, "_general", lambda name: name == "verbose")
-    print_summary(a_summary([a_view("A")], status=status))
+    with verbose():
+        print_summary(a_summary([a_view("A")], status=status))
     assert spoken[2][0] == "Images: tie\npoints, and\nthe RMS of\ntheir\nresiduals"
 
 

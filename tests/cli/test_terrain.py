@@ -13,20 +13,14 @@ import rasterio
 
 from barpc.base.errors import Remark
 from barpc.cameras import open_camera
-from barpc.rpcio import read_rpc, write_rpc, write_rpc_copy
+from barpc.rpcio import read_rpc, write_rpc
 from barpc.scene import Camera
 from barpc.verbs.points import altitude_of, exchanged
 from tests import geotiffs
 from tests.cli.test_images import run
+from tests.reliability.conftest import assert_one_line, barpc
 from tests.report.conftest import run_of_block, written
-from tests.rpcio.conftest import make_rpc, write_image
-
-
-@pytest.fixture
-def image(tmp_path: Path) -> Path:
-    raw = write_image(tmp_path / "raw.tif", shape=(1, 400, 600))
-    write_rpc_copy(make_rpc().crop(900, 900), raw, tmp_path / "in" / "scene.tif")
-    return tmp_path / "in" / "scene.tif"
+from tests.rpcio.conftest import make_rpc
 
 
 @pytest.fixture
@@ -106,7 +100,9 @@ def test_a_dem_is_asked_where_one_is_given(image, dem, tmp_path, capsys):
     rpc = read_rpc(image)
     assert run("info", image, "--dem", dem, "--json") == 0
     captured = capsys.readouterr()
-    lon, lat = json.loads(captured.out)[0]["center_deg"]
+    (found,) = json.loads(captured.out)
+    lon, lat = found["center_deg"]
+    assert found["center_alt_m"] == pytest.approx(60 + 1000 * (lon - 5.4), abs=2e-3)
     seen = rpc.project([lon, lat, 60 + 1000 * (lon - 5.4)])
     np.testing.assert_allclose(seen, [299.5, 199.5], atol=1e-2)
     assert captured.err == ""
@@ -126,19 +122,21 @@ def test_a_dem_is_asked_where_one_is_given(image, dem, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("verb", ["info", "localize", "convert"])
-def test_an_altitude_and_a_dem_contradict_each_other(verb, image, dem, tmp_path, capsys):
+def test_an_altitude_and_a_dem_contradict_each_other(verb, image, dem, tmp_path):
     more = {"localize": (1, 2), "convert": (tmp_path / "x.tif", "--bbox", 5, 43, 6, 44)}.get(verb, ())
     expected = 0 if verb == "localize" else 2  # there --alt is for points of a table
     assert run(verb, image, *more, "--alt", 5, "--dem", dem) == expected
-    assert run(verb, image, *more, "--geoid", dem) == 2
-    assert "--geoid goes with --dem" in capsys.readouterr().err
+    assert_one_line(barpc(verb, image, *more, "--geoid", dem), 2, "--geoid goes with --dem")
 
 
-def test_a_dem_without_a_height_there_is_an_error(image, dem, tmp_path, capsys):
+@pytest.mark.parametrize("how", ["outside", "in a void"])
+def test_a_dem_without_a_height_there_is_an_error(how, image, dem):
     with rasterio.open(dem, "r+") as out:
-        out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
-    assert run("info", image, "--dem", dem) == 1
-    assert "dem.tif: has no height at the images' position" in capsys.readouterr().err
+        if how == "outside":
+            out.transform = rasterio.Affine(0.002, 0, 15.2, 0, -0.002, 43.5)
+        else:
+            out.write(np.full(out.shape, np.nan), 1)
+    assert_one_line(barpc("info", image, "--dem", dem), 1, "dem.tif: has no height at the images' position")
 
 
 def test_exchanged_coordinates_are_recognised(image, tmp_path, capsys):
@@ -149,11 +147,9 @@ def test_exchanged_coordinates_are_recognised(image, tmp_path, capsys):
     said = capsys.readouterr().err
     assert "1 of 1 points lie beyond the image by more than its size" in said
     assert "latitude exchanged" not in said
-    assert run("info", image, "--at", 43.1995, 5.4005, 200) == 1
-    assert "exchanged" in capsys.readouterr().err
+    assert_one_line(barpc("info", image, "--at", 43.1995, 5.4005, 200), 1, "exchanged")
     box = (43.1993, 5.3995, 43.2, 5.4005)
-    assert run("convert", image, tmp_path / "part.tif", "--alt", 100, "--bbox", *box) == 2
-    assert "exchanged" in capsys.readouterr().err
+    assert_one_line(barpc("convert", image, tmp_path / "part.tif", "--alt", 100, "--bbox", *box), 2, "exchanged")
 
 
 def test_what_a_box_loses_at_the_border_is_said(image, tmp_path, capsys):
@@ -170,30 +166,26 @@ def test_what_a_box_loses_at_the_border_is_said(image, tmp_path, capsys):
 
 
 class Map:
-    """100 columns a degree from 10 E, 100 rows a degree from 50 N southwards; 5 px for 100 m."""
+    """100 columns a degree from 10 E, 100 rows a degree from 50 N southwards; 5 px for 100 m, but a `lean` [px/km]."""
 
-    def __init__(self) -> None:
-        self.asked = []
+    def __init__(self, lean: float = 0.0) -> None:
+        self.lean, self.asked = lean / 1000, []
 
     def localize(self, image, alt):
         self.asked.append((image.tolist(), np.asarray(alt).tolist()))
-        return np.stack([10 + image[..., 0] / 100, 50 - image[..., 1] / 100, alt], axis=-1)
+        return np.stack([10 + (image[..., 0] - self.lean * alt) / 100, 50 - image[..., 1] / 100, alt], axis=-1)
 
     def project(self, ground):
-        return np.stack([(ground[..., 0] - 10) * 100, (50 - ground[..., 1]) * 100], axis=-1)
+        return np.stack(
+            [(ground[..., 0] - 10) * 100 + self.lean * ground[..., 2], (50 - ground[..., 1]) * 100], axis=-1
+        )
 
     def project_jacobian(self, ground):
         return self.project(ground), np.array([[1.0, 2.0, 0.03], [3.0, 4.0, -0.04]])
 
 
 def a_map(**changes) -> Camera:
-    usual = {
-        "model": Map(),
-        "path": Path("map"),
-        "format": "rpb",
-        "size": (200, 100),
-        "alt_range": (0.0, 50.0),
-    }
+    usual = {"model": Map(), "path": Path("map"), "format": "rpb", "size": (200, 100), "alt_range": (0.0, 50.0)}
     return Camera(**{**usual, **changes})
 
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
+from barpc.base.options import FitOptions
 from barpc.base.verb_options import ExportOptions
-from barpc.cli import fit as fitting
-from barpc.cli.adjust import _tell_result
-from barpc.cli.fit import _certificate
 from barpc.export import targets
 from barpc.rpcio import write_rpc
+from barpc.verbs import fitting, runs
 from tests.cli.test_main import run
+from tests.reliability.conftest import assert_one_line, barpc
 from tests.report.made import a_summary
 from tests.rpcio.conftest import make_rpc
 
@@ -32,8 +32,33 @@ def a_fit(**changes: Any) -> Any:
     return SimpleNamespace(**{**usual, **changes})
 
 
-def test_a_certificate_has_a_figure_in_every_line() -> None:
-    assert _certificate(a_fit(), "").split("\n") == [
+@pytest.fixture
+def source(tmp_path: Path) -> str:
+    write_rpc(make_rpc(), tmp_path / "a.RPB")
+    return f"{tmp_path / 'a.RPB'},size=600:500"
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """What every fit is asked for (size, altitudes, options), and what may be put in the place of camera and fit."""
+    stand = SimpleNamespace(asked=[], fit=fitting.fit_rpc, camera=None)
+
+    def fit_rpc(model: Any, size: Any, alts: Any, *, options: Any, strict: bool) -> Any:
+        stand.asked.append((size, tuple(alts), options, strict))
+        return stand.fit(model, size, alts, options=options, strict=strict)
+
+    real = fitting.open_camera
+    monkeypatch.setattr(fitting, "fit_rpc", fit_rpc)
+    monkeypatch.setattr(fitting, "open_camera", lambda source: stand.camera or real(source))
+    return stand
+
+
+def test_a_certificate_has_a_figure_in_every_line(
+    source: str, fits: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fits.fit = lambda *_, **__: a_fit(verdict=lambda tolerance: "")
+    assert run("fit", source) == 0
+    assert capsys.readouterr().out.splitlines() == [
         "method        ridge, 4 passes, h 1e-06 0.25",
         "points        1000 control, 500 check, 98% of the image covered",
         "              col [px]     row [px]",
@@ -46,52 +71,29 @@ def test_a_certificate_has_a_figure_in_every_line() -> None:
         "round trip    1e-09 px; the camera's own 3e-09",
         "verdict       within tolerance",
     ]
-    given = _certificate(a_fit(beyond=1.0), "it misses").split("\n")
+    fits.fit = lambda *_, **__: a_fit(beyond=1.0, verdict=lambda tolerance: "it misses")
+    assert run("fit", source) == 3
+    given = capsys.readouterr().out.splitlines()
     assert not any(line.startswith("beyond") for line in given)
     assert given[-1] == "verdict       it misses"
 
 
-@pytest.fixture
-def source(tmp_path: Path) -> str:
-    write_rpc(make_rpc(), tmp_path / "a.RPB")
-    return f"{tmp_path / 'a.RPB'},size=600:500"
-
-
-@pytest.fixture
-def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """What every fit is asked for: size, altitudes, options."""
-    from barpc.verbs import fitting as fit
-
-    asked, real = list[tuple[Any, ...]](), fit.fit_rpc
-
-    def fit_rpc(model: Any, size: Any, alts: Any, *, options: Any, strict: bool) -> Any:
-        asked.append((size, tuple(alts), options, strict))
-        return real(model, size, alts, options=options, strict=strict)
-
-    monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
-    return asked
-
-
 def test_a_fit_measures_writes_and_is_quiet_when_told(
-    source: str, tmp_path: Path, fitted: list[tuple[Any, ...]], capsys: pytest.CaptureFixture[str]
+    source: str, tmp_path: Path, fits: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("fit", source) == 0
     said = capsys.readouterr()
     assert said.out.splitlines()[-1] == "verdict       within tolerance"
     assert said.err == ""
-    (size, alts, options, strict) = fitted[0]
-    assert (size, strict, options.tolerance) == (
-        (600, 500),
-        False,
-        fitting.run_options({}, None).fit.tolerance,
-    )
+    (size, alts, options, strict) = fits.asked[0]
+    assert (size, strict, options.tolerance) == ((600, 500), False, FitOptions().tolerance)
     assert alts == pytest.approx((166.6667 - 142.8571, 166.6667 + 142.8571))
     out = tmp_path / "b.geom"
     assert run("-q", "fit", source, "-o", str(out), "--alt-range", "10", "400", "--tolerance", "0.5") == 0
     assert capsys.readouterr().out == ""
     assert out.is_file()
-    assert fitted[1][1] == (10.0, 400.0)
-    assert fitted[1][2].tolerance == 0.5
+    assert fits.asked[1][1] == (10.0, 400.0)
+    assert fits.asked[1][2].tolerance == 0.5
     assert run("fit", source, "-o", str(out)) == 1
     assert run("fit", source, "-o", str(out), "--overwrite") == 0
     said = capsys.readouterr()
@@ -119,62 +121,51 @@ def test_a_miss_writes_nothing_unless_told_to(source: str, tmp_path: Path, capsy
 
 @pytest.mark.parametrize(("wide", "count"), [("", 1), ("too far", 2)])
 def test_all_ground_on_earth_is_tried_first_where_a_camera_asks_for_it(
-    wide: str, count: int, source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    wide: str, count: int, source: str, fits: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from barpc.verbs import fitting as fit
-
-    asked = list[Any]()
-
-    def fit_rpc(model: Any, size: Any, alts: Any, *, options: Any, strict: bool) -> Any:
-        asked.append((alts, options.grid))
-        return a_fit(verdict=lambda tolerance: wide if alts == (-500.0, 9000.0) else "")
-
-    ground = SimpleNamespace(all_ground=(-500.0, 9000.0))
+    everywhere, own = (-500.0, 9000.0), (1.0, 200.5)
     usable = {"doubts": (), "require_usable": lambda _: None}
-    camera = SimpleNamespace(model=ground, extent=(5, 5), size=(5, 5), alt_range=(1.0, 200.5), **usable)
-    monkeypatch.setattr(fit, "fit_rpc", fit_rpc)
-    monkeypatch.setattr(fit, "open_camera", lambda _: camera)
+    model = SimpleNamespace(all_ground=everywhere)
+    fits.camera = SimpleNamespace(model=model, extent=(5, 5), size=(5, 5), alt_range=own, **usable)
+    fits.fit = lambda model, size, alts, **_: a_fit(verdict=lambda tolerance: wide if alts == everywhere else "")
     assert run("fit", source) == 0
-    assert [alts for alts, _ in asked] == [(-500.0, 9000.0), (1.0, 200.5)][:count]
+    assert [alts for _, alts, *_ in fits.asked] == [everywhere, own][:count]
     error = capsys.readouterr().err
     assert ("fitted over the scene's altitudes, 1 to 200.5 m" in error) == (count == 2)
-    asked.clear()
+    fits.asked.clear()
     assert run("fit", source, "--alt-range", "0", "9") == 0
-    assert [alts for alts, _ in asked] == [(0.0, 9.0)]
     assert run("fit", f"{source},swath=MOSAIC") == 0
-    assert asked[-1][1] == (20, 20, 10) != asked[0][1]
+    assert [alts for _, alts, *_ in fits.asked][:2] == [(0.0, 9.0), everywhere]
+    assert fits.asked[-1][2].grid == (20, 20, 10) != fits.asked[0][2].grid
 
 
 # --- check, report, adjust --------------------------------------------------------------------------------
 
 
-def test_the_summary_of_one_run_is_not_printed_again(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("report", "one", "--json") == 2
-    assert "--json goes with two runs" in capsys.readouterr().err
+def test_the_summary_of_one_run_is_not_printed_again() -> None:
+    assert_one_line(barpc("report", "one", "--json"), 2, "--json goes with two runs")
+
+
+@pytest.fixture
+def result(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """What `barpc check` finds."""
+    found = SimpleNamespace(summary={"a": 1}, record=a_summary([], verdict=("One.",)), passed=True, root="")
+    monkeypatch.setattr(runs, "check", lambda *_, **__: found)
+    return found
 
 
 @pytest.mark.parametrize(
-    ("quiet", "as_json", "out"),
-    [(False, False, "All well.\nOne.\n"), (True, False, ""), (True, True, '{\n "a": 1\n}\n')],
+    ("flags", "out"), [((), "All well.\nOne.\n"), (("-q",), ""), (("-q", "--json"), '{\n "a": 1\n}\n')]
 )
 def test_a_result_is_printed_once_and_its_exit_code_says_whether_it_passes(
-    quiet: bool,
-    as_json: bool,
-    out: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    flags: tuple[str, ...], out: str, result: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for place in ("adjust", "terminal"):
-        monkeypatch.setattr(f"barpc.cli.{place}.wants_json", lambda: as_json)
-        monkeypatch.setattr(f"barpc.cli.{place}.is_quiet", lambda: quiet)
-    record = a_summary([], verdict=("One.",))
-    result: Any = SimpleNamespace(summary={"a": 1}, record=record, passed=True, root="")
-    assert _tell_result(result) == 0
+    assert run("check", "a.tif", *flags) == 0
     assert capsys.readouterr() == (out, "")
     result.passed, result.record = False, a_summary([], verdict=("One.",), reasons=("One.",), passed=False)
     out = out.replace("well.", "well (exit code 3).")
-    assert _tell_result(result) == 3
-    headline = "" if quiet else "All well. "
+    assert run("check", "a.tif", *flags) == 3
+    headline = "" if flags else "All well. "
     assert capsys.readouterr() == (out, f"barpc: needs review (exit code 3): {headline}One.\n")
 
 

@@ -19,7 +19,6 @@ from barpc.export.shots import read_scene
 from barpc.pipeline import proof, remake
 from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.rpcio import read_rpc, write_rpc
-from barpc.workspace import Workspace
 from tests.reliability.conftest import barpc
 from tests.reliability.trials import SAMPLES, crop
 from tests.sealing import files, seal
@@ -99,8 +98,13 @@ def edits(data: bytes) -> dict[str, bytes]:
     return {**flipped, "cut": data[:-1], "empty": b"", "longer": data + b"\n"}
 
 
-def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatch) -> None:
-    monkeypatch.setattr(proof, "_verify_cameras", lambda summary, folder: ())  # the hashes alone find it
+@pytest.fixture
+def hashes_alone(monkeypatch) -> None:
+    """No camera is compared with the certified one."""
+    monkeypatch.setattr(proof, "_verify_cameras", lambda summary, folder: ())
+
+
+def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, hashes_alone) -> None:
     root, names = root_of(run), files(run)
     assert len(names) > 20
     for name in names:
@@ -120,8 +124,7 @@ def test_every_edit_of_every_file_is_named_and_so_is_its_absence(run, monkeypatc
     assert wrong(run, root) == set()
 
 
-def test_every_consistent_edit_is_found_by_the_root_alone(run, monkeypatch) -> None:
-    monkeypatch.setattr(proof, "_verify_cameras", lambda summary, folder: ())
+def test_every_consistent_edit_is_found_by_the_root_alone(run, hashes_alone) -> None:
     root = root_of(run)
     for name in set(files(run)) - {SUMS, "summary.json"}:
         data, sums = (run / name).read_bytes(), (run / SUMS).read_bytes()
@@ -248,10 +251,17 @@ def test_a_report_that_is_made_again_is_the_same_file(run) -> None:
     assert root_of(run) == root
 
 
-def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> None:
-    roots, page = [root_of(run)], remake.page_of
+@pytest.fixture
+def of_release(monkeypatch) -> Callable[[str], None]:
+    """Sets what a release makes of a report: what it is now, and a text."""
+    page = remake.page_of
+    return lambda text: monkeypatch.setattr(remake, "page_of", lambda files: page(files) + text)
+
+
+def test_later_commands_add_layers_and_every_root_is_known(run, of_release) -> None:
+    roots = [root_of(run)]
     for text in ("<!-- another release -->", "<!-- one more -->"):
-        monkeypatch.setattr(remake, "page_of", lambda files, text=text: page(files) + text)
+        of_release(text)
         assert barpc("report", run).code == 0
         roots.append(root_of(run))
     assert barpc("convert", SAMPLES[2], "-o", run, "--rpc-format", "rpb").code == 0
@@ -271,33 +281,38 @@ def test_later_commands_add_layers_and_every_root_is_known(run, monkeypatch) -> 
     assert {barpc("verify", run, "--expect", root).code for root in roots} == {3}
 
 
-def test_a_later_command_hides_no_earlier_edit(run, monkeypatch) -> None:
+def test_a_later_command_hides_no_earlier_edit(run, of_release) -> None:
     root = root_of(run)
     (run / "view_00_RPC.TXT").write_bytes((run / "view_01_RPC.TXT").read_bytes())
-    monkeypatch.setattr(remake, "page_of", lambda files: "of another release")
+    of_release("of another release")
     assert barpc("report", run).code == 0
     assert root_of(run) != root
     assert wrong(run) == wrong(run, root) == {("view_00_RPC.TXT", "changed")}
     sums = (run / SUMS).read_text().replace("# barpc 0", "# barpc 9", 1)
     (run / SUMS).write_text(sums)
-    monkeypatch.setattr(remake, "page_of", lambda files: "of one more")
+    of_release("of one more")
     assert barpc("report", run).code == 1
     assert (run / SUMS).read_text() == sums  # changed by somebody: nothing is built on it
     assert (SUMS, "changed") in wrong(run)
 
 
-def test_a_command_that_is_killed_before_its_layer_is_said_and_heals(run, monkeypatch) -> None:
-    root = root_of(run)
+def test_a_command_that_is_killed_before_its_layer_is_said_and_heals(run, of_release, monkeypatch) -> None:
+    root, rename = root_of(run), Path.replace
+
+    def killed(path: Path, target: Path) -> Path:
+        if Path(target).name == SUMS:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    of_release("of another release")
     with monkeypatch.context() as patch:
-        patch.setattr(remake, "page_of", lambda files: "of another release")
-        with monkeypatch.context() as killed:
-            killed.setattr(Workspace, "_add_layer", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
-            assert barpc("report", run).code == 130
-        assert root_of(run) == root
-        said = barpc("verify", run)
-        assert said.code == 3
-        assert "output report.html: changed, by a command that did not come to its end: give it again" in said.out
-        assert barpc("report", run).code == 0
+        patch.setattr(Path, "replace", killed)
+        assert barpc("report", run).code == 130
+    assert root_of(run) == root
+    said = barpc("verify", run)
+    assert said.code == 3
+    assert "output report.html: changed, by a command that did not come to its end: give it again" in said.out
+    assert barpc("report", run).code == 0
     assert wrong(run, root) == set()
 
 

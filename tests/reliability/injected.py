@@ -219,11 +219,7 @@ class Scene:
         shutil.rmtree(self.out, ignore_errors=True)
         before = self.hashes()
         inject = f"inject={fault.call}:error={fault.error}:when={fault.when}"
-        ended = run(
-            self.command,
-            self.log,
-            *("-o", os.devnull, "-e", f"trace={fault.call}", "-e", inject),
-        )
+        ended = run(self.command, self.log, *("-o", os.devnull, "-e", f"trace={fault.call}", "-e", inject))
         if (odd := self._judged(ended)) is not None:
             return f"{odd}: {ended.said.strip()[-600:]}"
         if self.hashes() != before:

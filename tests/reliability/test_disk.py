@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc.rpcio import write_rpc
+from barpc.rpcio import read_rpc, write_rpc
+from tests.geotiffs import write_image
 
 from .conftest import assert_one_line, barpc, hashes
 from .trials import outputs
@@ -50,15 +51,10 @@ def size_of(folder: Path) -> int:
 def as_jp2(path: Path) -> Path:
     """The same image as JPEG 2000, with its RPC beside it: a copy of it is written by GDAL."""
     with rasterio.open(path) as image:
-        pixels, target = image.read(), path.with_suffix(".jp2")
-        shape = {"width": image.width, "height": image.height, "count": 1, "dtype": "uint16"}
-    with rasterio.open(target, "w", driver="JP2OpenJPEG", QUALITY="100", REVERSIBLE="YES", **shape) as out:
-        out.write(pixels)
-    from barpc.rpcio import read_rpc
-
+        pixels = image.read()
     write_rpc(read_rpc(path), path.with_name(f"{path.stem}_RPC.TXT"))
     path.unlink()
-    return target
+    return write_image(path.with_suffix(".jp2"), pixels, driver="JP2OpenJPEG", QUALITY="100", REVERSIBLE="YES")
 
 
 @pytest.mark.parametrize(

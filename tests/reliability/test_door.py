@@ -13,6 +13,7 @@ from rasterio import Affine
 from tests.geotiffs import write_image
 
 from .conftest import Said, barpc, hashes
+from .test_interruption import flipped
 from .trials import SAMPLES, crop
 
 VERBS: dict[str, tuple[str, ...]] = {
@@ -45,13 +46,6 @@ def replaced(path: Path, old: bytes, new: bytes) -> None:
     data = path.read_bytes()
     assert old in data
     path.write_bytes(data.replace(old, new, 1))
-
-
-def flipped(path: Path) -> None:
-    """A byte in the middle of a file is another, its size the same."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
 
 
 def cut(path: Path) -> None:

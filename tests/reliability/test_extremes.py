@@ -112,10 +112,7 @@ def test_an_archive_counts_what_its_numbers_become(tmp_path: Path) -> None:
     """510 kB of bytes that are all alike would be 3.9 GB of doubles."""
     data = io.BytesIO()
     np.lib.format.write_array_header_1_0(data, {"descr": "|u1", "fortran_order": False, "shape": (300_000_000,)})
-    with (
-        zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("xy.npy", "w") as file,
-    ):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive, archive.open("xy.npy", "w") as file:
         file.write(data.getvalue())
         for _ in range(300):
             file.write(bytes(1_000_000))
@@ -192,8 +189,7 @@ def test_a_name_whose_files_would_be_hidden_is_refused(name) -> None:
 
 
 @pytest.mark.parametrize(
-    "host",
-    ["a..b", f"{'a' * 64}.org", ".org", "[::1::2]", "[12345::]", "a.org:99999", "a.org:0", "[::1]:70000"],
+    "host", ["a..b", f"{'a' * 64}.org", ".org", "[::1::2]", "[12345::]", "a.org:99999", "a.org:0", "[::1]:70000"]
 )
 def test_a_host_that_is_none_is_refused_before_it_is_asked(host) -> None:
     with pytest.raises(ImageError, match="a URL is SCHEME://HOST/PATH"):
@@ -219,10 +215,9 @@ def test_no_reader_shows_lines_of_a_text_that_is_none_of_its_files(tmp_path, rea
     secret.write_text("the-key-of-the-house is under, the, stone, 42\nand the gate is open on mondays, 1, 2, 3\n")
     name = {"matches": "m.csv", "gcp": "g.csv", "points": "p.csv", "asp": "g.gcp"}[reader]
     (tmp_path / name).symlink_to(secret)
-    read = {
-        "matches": lambda path: read_links(path, ["a", "b"]),
-        "points": read_correspondences,
-    }.get(reader, lambda path: read_gcps(path, ["a", "b"]))
+    read = {"matches": lambda path: read_links(path, ["a", "b"]), "points": read_correspondences}.get(
+        reader, lambda path: read_gcps(path, ["a", "b"])
+    )
     with pytest.raises(BarpcError) as caught:
         read(tmp_path / name)
     assert not {"key", "house", "stone", "gate", "mondays"} & set(str(caught.value).replace("-", " ").split())

@@ -310,20 +310,7 @@ def test_a_hostile_dem_fetches_nothing(name, crops, tmp_path, trap):
         assert_silent(trap, barpc(*args), tmp_path / "out")
 
 
-BESIDE = (
-    ".ovr",
-    ".msk",
-    ".aux.xml",
-    ".msk.ovr",
-    ".aux",
-    ".prj",
-    ".tfw",
-    ".imd",
-    ".rpb",
-    "_RPC.TXT",
-    ".xml",
-    ".geom",
-)
+BESIDE = ".ovr", ".msk", ".aux.xml", ".msk.ovr", ".aux", ".prj", ".tfw", ".imd", ".rpb", "_RPC.TXT", ".xml", ".geom"
 
 
 def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESIDE) -> None:
@@ -335,17 +322,8 @@ def surrounded(trap: Trap, name: str, file: Path, suffixes: Sequence[str] = BESI
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        # every verb, a run of seconds: before a commit of a source of pixels and of a service
-        pytest.param(name, marks=pytest.mark.slow if name in KINDS else pytest.mark.nightly)
-        if name not in ("source, element", "a web service")
-        else name
-        for name in CONTENTS
-    ],
-)
-def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, trap, request):
+@pytest.mark.parametrize("name", EVERY)
+def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, trap):
     """Beside an image (of which the RPC is readable, else no pixel would be asked for), a DEM and an output."""
     surrounded(trap, name, crops[1], BESIDE[:8])
     bounds = read_rpc(crops[0]).ground_offset
@@ -361,10 +339,8 @@ def test_a_hostile_file_beside_another_fetches_nothing(name, crops, tmp_path, tr
 
 
 @pytest.mark.landing(2)
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=pytest.mark.slow if x in KINDS else pytest.mark.nightly) for x in CONTENTS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVERY)
 def test_a_hostile_file_beside_another_fetches_nothing_in_a_whole_run(name, crops, tmp_path, trap):
     for crop in crops:
         surrounded(trap, name, crop, BESIDE[:8])

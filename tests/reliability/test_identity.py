@@ -15,16 +15,10 @@ import rasterio
 from barpc import adjust
 from barpc.base.errors import InputError
 from barpc.base.options import RunOptions
-from barpc.rpcio import write_rpc_vrt
-from tests.reliability.trials import SAMPLES, crop, outputs
+from barpc.rpcio import read_rpc, write_rpc_vrt
+from tests.reliability.trials import outputs
 
 AGAIN = RunOptions(overwrite=True)
-
-
-@pytest.fixture
-def images(tmp_path: Path) -> list[Path]:
-    (tmp_path / "in").mkdir()
-    return [crop(source, tmp_path / "in" / source.name) for source in SAMPLES[:2]]
 
 
 def other(path: Path) -> bytes:
@@ -57,19 +51,13 @@ FAST, SLOW = (in_place, "detect"), ((moved_in, "cameras"), (in_place, "hash"), (
 
 
 @pytest.mark.slow
-def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> None:
-    views = []
-    for path in images:
-        vrt = tmp_path / f"{path.stem}.vrt"
-        with rasterio.open(path) as image:
-            assert image.rpcs is not None
-        from barpc.rpcio import read_rpc
-
+def test_a_vrt_whose_image_was_replaced_is_another_input(crops, tmp_path) -> None:
+    views = [tmp_path / f"{path.stem}.vrt" for path in crops]
+    for path, vrt in zip(crops, views, strict=True):
         write_rpc_vrt(read_rpc(path), path, vrt)
-        views.append(vrt)
     adjust(views, tmp_path / "out", AGAIN)
     before = outputs(tmp_path / "out")
-    images[0].write_bytes(other(images[0]))
+    crops[0].write_bytes(other(crops[0]))
     adjust(views, tmp_path / "out", AGAIN)
     after = outputs(tmp_path / "out")
     adjust(views, tmp_path / "fresh", AGAIN)
@@ -83,58 +71,50 @@ def test_a_vrt_whose_image_was_replaced_is_another_input(images, tmp_path) -> No
 @pytest.mark.parametrize(
     ("change", "stage"),
     [
-        pytest.param(
-            change,
-            stage,
-            marks=()
-            if (change, stage) == FAST
-            else pytest.mark.slow
-            if (change, stage) in SLOW
-            else pytest.mark.nightly,
-        )
+        pytest.param(change, stage, marks=() if (change, stage) in (FAST, *SLOW) else pytest.mark.nightly)
         for change in (in_place, moved_in)
         for stage in ("cameras", "hash", "read", "detect", "match", "fit")
     ],
 )
 def test_an_image_that_is_replaced_at_work_ends_the_run_and_leaves_nothing_wrong(
-    images, tmp_path, change, stage
+    crops, tmp_path, change, stage
 ) -> None:
-    truth, new = images[0].read_bytes(), other(images[0])
-    adjust(images, tmp_path / "truth", AGAIN)
+    truth, new = crops[0].read_bytes(), other(crops[0])
+    adjust(crops, tmp_path / "truth", AGAIN)
     done = []
 
     def progress(name: str, number: int, total: int) -> None:
         if name.startswith(stage) and not done:
             done.append(name)
-            change(images[0], new)
+            change(crops[0], new)
 
-    with pytest.raises(InputError, match=rf"{images[0].name}: was changed or replaced while the run was at work"):
-        adjust(images, tmp_path / "out", AGAIN, progress=progress)
+    with pytest.raises(InputError, match=rf"{crops[0].name}: was changed or replaced while the run was at work"):
+        adjust(crops, tmp_path / "out", AGAIN, progress=progress)
     assert done
     assert not [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".vrt", ".TXT", ".html")]
-    change(images[0], truth)
-    adjust(images, tmp_path / "out", AGAIN)
+    change(crops[0], truth)
+    adjust(crops, tmp_path / "out", AGAIN)
     assert outputs(tmp_path / "out") == outputs(tmp_path / "truth")
 
 
-def test_workers_see_it_too(images, tmp_path) -> None:
-    new, done = other(images[1]), []
+def test_workers_see_it_too(crops, tmp_path) -> None:
+    new, done = other(crops[1]), []
 
     def progress(name: str, number: int, total: int) -> None:
         if name.startswith("read") and not done:
             done.append(name)
-            moved_in(images[1], new)
+            moved_in(crops[1], new)
 
     with ThreadPoolExecutor(2) as pool, pytest.raises(InputError, match="was changed or replaced"):
-        adjust(images, tmp_path / "out", AGAIN, executor=pool, progress=progress)
+        adjust(crops, tmp_path / "out", AGAIN, executor=pool, progress=progress)
     assert done
 
 
 @pytest.mark.slow
-def test_what_does_not_change_a_file_does_not_end_a_run(images, tmp_path) -> None:
+def test_what_does_not_change_a_file_does_not_end_a_run(crops, tmp_path) -> None:
     def progress(name: str, number: int, total: int) -> None:
-        images[0].read_bytes()
-        (images[0].parent / "beside.txt").write_text(name)
+        crops[0].read_bytes()
+        (crops[0].parent / "beside.txt").write_text(name)
 
-    adjust(images, tmp_path / "out", AGAIN, progress=progress)
+    adjust(crops, tmp_path / "out", AGAIN, progress=progress)
     assert (tmp_path / "out" / "summary.json").is_file()

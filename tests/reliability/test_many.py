@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +30,9 @@ def shifted(source: Path, folder: Path, count: int) -> list[Path]:
         offset = rpc.ground_offset + np.array([step * n, 0.0, 0.0])
         path = folder / f"view_{n:04d}.vrt"
         shade = rewrite(Path(shutil.copy(source, path.with_suffix(".tif"))), pixels=lambda v, n=n: v + n)
-        write_rpc_vrt(type(rpc)(**{**fields_of(rpc), "ground_offset": offset}), shade, path)
+        write_rpc_vrt(replace(rpc, ground_offset=offset), shade, path)
         found.append(path)
     return found
-
-
-def fields_of(rpc) -> dict[str, object]:
-    from dataclasses import fields
-
-    return {f.name: getattr(rpc, f.name) for f in fields(rpc) if f.init}
 
 
 PROGRAM = """
@@ -92,6 +87,8 @@ def test_one_bad_image_of_many_is_named_and_left_out_when_asked(pristine, tmp_pa
     assert not (tmp_path / "out").exists()
     said = barpc("adjust", *pristine, bad, "-o", tmp_path / "out", "--keep-going", "--json")
     assert said.code == 3
+    assert "bad.tif" in said.err
+    assert (tmp_path / "out/view_00.vrt").exists()
     summary = json.loads(said.out)
     assert [Path(left["path"]).name for left in summary["left_out"]] == ["bad.tif"]
     assert len(summary["views"]) == 3

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import errno
-import mmap
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
-import click
 import pytest
 
 from barpc import __version__
 from barpc.base import errors
-from barpc.base.errors import BarpcError, ImageError, InputError, has_room, out_of_memory
+from barpc.base.errors import BarpcError, ImageError, InputError, out_of_memory
 from barpc.pipeline import verify_outputs
 from barpc.pipeline.executor import run_batch
+from tests.cli.conftest import verb  # noqa: F401
 from tests.cli.test_main import run
 from tests.reliability.trials import SAMPLES, crop
 
@@ -80,15 +78,11 @@ def room(request, monkeypatch) -> bool:
 
 
 @pytest.fixture
-def told(monkeypatch, capsys) -> Callable[[BaseException], str]:
+def told(verb, capsys) -> Callable[[BaseException], str]:  # noqa: F811
     """What the command says of a verb that ends in an error."""
 
     def ends_in(error: BaseException) -> str:
-        def fail() -> None:
-            raise error
-
-        verb = SimpleNamespace(info=click.Command("info", callback=fail))
-        monkeypatch.setitem(sys.modules, "barpc.cli.info", verb)
+        verb(error)
         assert run("info") == 1
         return capsys.readouterr().err.removeprefix("barpc: ")
 
@@ -116,17 +110,6 @@ def test_a_chain_that_bites_its_tail_ends() -> None:
     first, second = ValueError("a"), ValueError("b")
     first.__cause__, second.__cause__ = second, first
     assert not out_of_memory(first)
-
-
-def test_room_is_what_can_be_mapped(monkeypatch) -> None:
-    assert has_room()
-    assert not has_room(1 << 60)
-
-    def refused(*_: object) -> None:
-        raise OSError(errno.ENOMEM, "Cannot allocate memory")
-
-    monkeypatch.setattr(mmap, "mmap", refused)
-    assert not has_room()
 
 
 def test_no_file_is_blamed_for_want_of_memory(room) -> None:
@@ -157,28 +140,24 @@ def test_no_reader_of_a_file_that_was_written_is_blamed(tmp_path, monkeypatch) -
         verify_outputs._consumer_readings(tmp_path / "x_RPC.TXT", lambda _, read: (0.0, 0.0))
 
 
-def test_a_worker_says_what_its_own_memory_is(monkeypatch) -> None:
+def test_a_worker_says_what_its_own_memory_is(room) -> None:
     def fail() -> None:
         raise MAPPED
 
-    monkeypatch.setattr(errors, "has_room", lambda: False)
     (outcome,), _ = run_batch(fail, [()], __version__)
-    assert isinstance(outcome[2], MemoryError)
-    monkeypatch.setattr(errors, "has_room", lambda: True)
-    (outcome,), _ = run_batch(fail, [()], __version__)
-    assert outcome[2] is MAPPED
+    assert outcome[2] is MAPPED if room else isinstance(outcome[2], MemoryError)
 
 
 @pytest.mark.slow
 @pytest.mark.landing(2)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems bound no address space")
 @pytest.mark.parametrize("megabytes", [250, 550, 350, 450, 500, 600, 625, 650, 700, 800, 1000])
-@pytest.mark.parametrize("verb", ["adjust", "verify"])
-def test_a_bound_on_memory_is_one_line_that_says_so(tmp_path, verb, megabytes) -> None:
+@pytest.mark.parametrize("word", ["adjust", "verify"])
+def test_a_bound_on_memory_is_one_line_that_says_so(tmp_path, word, megabytes) -> None:
     """OpenBLAS waited for ever, deaf to signals; a loader's word was a bug, a file not reopened a full disk."""
     images = [crop(path, tmp_path / path.name) for path in SAMPLES[:2]]
     command = [sys.executable, "-m", "barpc", "-q", "adjust", *map(str, images), "-o", str(tmp_path / "out")]
-    if verb == "verify":
+    if word == "verify":
         assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode in (0, 3)
         command = [sys.executable, "-m", "barpc", "-q", "verify", str(tmp_path / "out")]
     limit = megabytes << 20

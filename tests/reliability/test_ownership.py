@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ from barpc.rpcio import read_rpc, read_rpc_source, write_rpc
 from tests.lanes import diagonal, rest_slow
 
 from .conftest import Said, assert_one_line, barpc, hashes
-from .test_interruption import ROOT, posix, relative
+from .test_interruption import posix, relative, sweep
 from .trials import outputs
 
 OTHERS = (
@@ -39,7 +37,7 @@ def assert_untouched(folder: Path, before: dict[Path, str], said: Said, *words: 
 # -- the folder of the images --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("more", [(), ("--overwrite",)])
+@pytest.mark.parametrize("more", [(), ("--overwrite",), ("--overwrite", "--images", "copy")])
 @pytest.mark.parametrize("formats", ["txt", "rpb", "geom"])
 def test_the_folder_of_the_images_is_refused_before_any_work(crops, tmp_path, formats, more):
     before = hashes([tmp_path])
@@ -100,19 +98,24 @@ def test_a_user_s_file_is_never_replaced_and_refused_by_name(crops, tmp_path, na
     assert_untouched(tmp_path, before, said, name, "give another -o")
 
 
-@pytest.mark.parametrize("verb", rest_slow(["adjust", "match"]))
+WORDS = {"adjust": ("{a}", "{b}"), "convert": ("{a}", "--rpc", "{b}"), "match": ("{a}", "{b}")}
+
+
+@pytest.mark.parametrize("verb", rest_slow(WORDS, 2))
 def test_a_file_that_was_edited_is_refused_and_all_others_are_as_they_were(crops, out, tmp_path, verb):
-    if verb == "match":
+    command = (verb, *(word.format(a=crops[0], b=crops[1]) for word in WORDS[verb]), "-o", out)
+    if verb != "adjust":
         kept = (tmp_path / "out").rename(tmp_path / "kept") / ".barpc/cache"
         shutil.copytree(kept, out / ".barpc/cache")
-        assert barpc(verb, *crops, "-o", out).code == 0
-    edited = out / {"adjust": "view_00_RPC.TXT", "match": "asp/view_00__view_01.txt"}[verb]
+        assert barpc(*command).code == 0
+    assert_one_line(barpc(*command), 1, "--overwrite")
+    edited = out / ("asp/view_00__view_01.txt" if verb == "match" else "view_00_RPC.TXT")
     edited.write_text(edited.read_text() + "\n")
     before = hashes([tmp_path])
-    assert_one_line(barpc(verb, *crops, "-o", out, "--overwrite"), 1, edited.name, "changed since")
+    assert_one_line(barpc(*command, "--overwrite"), 1, edited.name, "changed since", "not replaced")
     assert hashes([tmp_path]) == before
     edited.unlink()
-    assert barpc(verb, *crops, "-o", out, "--overwrite").code == 0
+    assert barpc(*command, "--overwrite").code == 0
     assert edited.is_file()
 
 
@@ -169,10 +172,7 @@ def test_stopped_between_two_outputs_the_same_command_finishes(crops, ran, out, 
 @pytest.mark.parametrize("step", [5, 1])
 def test_killed_between_any_two_outputs_the_same_command_finishes(step):
     """adjust in all formats, with copies, over a finished run; match, apply: the same bytes."""
-    command = [sys.executable, "-m", "tests.reliability.trials", "--every-output", str(step)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    for name, found in json.loads(done.stdout).items():
+    for name, found in sweep("--every-output", step).items():
         assert found["identical"] == found["killed"], name
         assert found["killed"] >= found["outputs"] // step, name
 
@@ -181,9 +181,7 @@ def test_killed_between_any_two_outputs_the_same_command_finishes(step):
 @pytest.mark.nightly
 def test_commands_on_finished_runs_that_are_killed_at_random_end_with_the_same_bytes():
     """Of `--add-to`, with `--update`, `ortho`, `dsm` beside and in its run, `calibrate`."""
-    command = [sys.executable, "-m", "tests.reliability.trials", "20", "--of-runs", "--seed", "3"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
-    found = json.loads(done.stdout)
+    found = sweep(20, "--of-runs", "--seed", 3)
     assert len(found) == 6
     for name, one in found.items():
         assert one["odd"] == [], name
@@ -225,19 +223,6 @@ def test_the_vendor_s_file_of_an_input_is_never_replaced(crops, verb, end):
         said = barpc(verb.split()[0], *words, "--overwrite")
         assert_one_line(said, 1, target.name, "never replaced")
         assert hashes([crops[0].parent]) == before
-
-
-def test_convert_replaces_its_own_files_only(crops, tmp_path):
-    out = tmp_path / "out"
-    command = ("convert", crops[0], "--rpc", crops[1], "-o", out)
-    assert barpc(*command).code == 0
-    assert_one_line(barpc(*command), 1, "--overwrite")
-    assert barpc(*command, "--overwrite").code == 0
-    mine = out / "view_00_RPC.TXT"
-    mine.write_text("mine")
-    before = hashes([out])
-    assert_one_line(barpc(*command, "--overwrite"), 1, mine.name, "not replaced")
-    assert hashes([out]) == before
 
 
 def test_convert_adds_to_a_folder_and_hides_no_input(crops, tmp_path):

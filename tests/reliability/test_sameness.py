@@ -61,11 +61,7 @@ def ways(scene: Path) -> dict[str, RunOptions]:
     }
 
 
-SELDOM = {
-    **dict.fromkeys(("two passes", "a list of pairs", "an area", "an earlier run", "a bad file"), pytest.mark.slow),
-    # in all orders below, or as with control points
-    **dict.fromkeys(("the defaults", "given matches", "matches to be verified"), pytest.mark.nightly),
-}
+AT_NIGHT = "the defaults", "given matches", "matches to be verified"  # in all orders below, or as with control points
 
 
 def images_of(scene: Path, way: str) -> list[Path]:
@@ -75,7 +71,7 @@ def images_of(scene: Path, way: str) -> list[Path]:
 @pytest.mark.landing(2)
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "way", [pytest.param(way, marks=SELDOM[way]) if way in SELDOM else way for way in ways(Path())]
+    "way", [pytest.param(way, marks=[pytest.mark.nightly] * (way in AT_NIGHT)) for way in ways(Path())]
 )
 def test_the_order_of_the_images_changes_no_byte(scene, tmp_path, way):
     orders = list(permutations(images_of(scene, way)))

@@ -9,23 +9,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from barpc import adjust
-from barpc.base.options import RunOptions
 from barpc.cameras import open_camera
 from barpc.export.targets import TARGETS
 from barpc.rasters.raster import open_raster
 from tests.lanes import rest_slow
 from tests.reliability.conftest import barpc
-from tests.reliability.trials import SAMPLES, crop
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("shadows")
-    (folder / "in").mkdir()
-    images = [crop(source, folder / "in" / source.name) for source in SAMPLES[:2]]
-    adjust(images, folder / "run", RunOptions())
-    return folder
 
 
 def seen(folder: Path) -> dict[str, object]:
@@ -60,15 +48,15 @@ FITTED = ("export colmap",)  # beside the images as the others; pinholes are fit
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("verb", rest_slow(sorted(VERBS, key=lambda verb: verb in FITTED), len(TARGETS) + 1))
-def test_an_image_stays_the_camera_that_it_was(finished, tmp_path, verb) -> None:
+def test_an_image_stays_the_camera_that_it_was(ran, tmp_path, verb) -> None:
     folder = tmp_path / "in"
-    shutil.copytree(finished / "in", folder)
-    places = {"run": finished / "run", "in": folder, "a": folder / "view_00.tif", "b": folder / "view_01.tif"}
+    shutil.copytree(ran / "in", folder)
+    places = {"run": ran / "out", "in": folder, "a": folder / "view_00.tif", "b": folder / "view_01.tif"}
     before = seen(folder)
     if verb.startswith("export"):  # of a run whose images these are
-        shutil.copytree(finished / "run", tmp_path / "run")
+        shutil.copytree(ran / "out", tmp_path / "run")
         summary = tmp_path / "run" / "summary.json"
-        summary.write_text(summary.read_text().replace(str(finished / "in"), str(folder)))
+        summary.write_text(summary.read_text().replace(str(ran / "in"), str(folder)))
         places["run"] = tmp_path / "run"
     said = barpc(*(word.format(**places) for word in VERBS[verb]))
     assert "unexpected" not in said.err

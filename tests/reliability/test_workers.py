@@ -67,17 +67,10 @@ def cluster(tmp_path):
     folder = tmp_path / "dask"
     folder.mkdir()
     where = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(folder), "OMP_NUM_THREADS": "1"}
-    quiet = {
-        "stdout": subprocess.DEVNULL,
-        "stderr": subprocess.PIPE,
-        "text": True,
-        "env": where,
-        "cwd": folder,
-    }
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "env": where, "cwd": folder}
     program = [sys.executable, "-m"]
     scheduler = subprocess.Popen(
-        [*program, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"],
-        **quiet,
+        [*program, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"], **quiet
     )
     address = None
     for line in scheduler.stderr:
@@ -86,15 +79,7 @@ def cluster(tmp_path):
             break
     workers = [
         subprocess.Popen(
-            [
-                *program,
-                "distributed.cli.dask_worker",
-                address,
-                "--nthreads",
-                "1",
-                "--no-nanny",
-                "--no-dashboard",
-            ],
+            [*program, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"],
             **(quiet | {"stderr": subprocess.DEVNULL}),
         )
         for _ in range(2)
