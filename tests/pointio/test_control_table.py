@@ -11,11 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rasterio.warp import transform
 
 from barpc.base.errors import InputError
 from barpc.pointio.gcps import ControlReference, read_gcps
+from tests.pointio.test_gcp_formats import ALT, COL, LAT, LON, NO_ALTITUDE, ROW, SAME
 
 VIEWS = ["left", "right.img", "IMG_2021-03 a"]
 FOOT, US_FOOT = 0.3048, 1200 / 3937
@@ -151,7 +153,7 @@ CASES: dict[str, Case] = {
     "csv, latitude first": Case(_HEAD + rows(_CSV)),
     "csv, dos": Case(_HEAD + rows(_CSV), encode=dos),
     "csv, old mac": Case(_HEAD + rows(_CSV), encode=old_mac),
-    "csv, byte order mark": Case(_HEAD + rows(_CSV), encode=marked),
+    "csv, byte order mark, comment at the end": Case(_HEAD + rows(_CSV) + "# the end\n", encode=marked),
     "csv, utf-16, tabs": Case((_HEAD + rows(_CSV)).replace(",", "\t"), encode=utf16),
     "csv, utf-16 of big ends": Case(_HEAD + rows(_CSV), encode=big),
     "csv, semicolons and decimal commas": Case(
@@ -265,12 +267,21 @@ CASES: dict[str, Case] = {
 }  # fmt: skip
 
 
+CASES |= {
+    f"one point, {name}": Case(
+        text, file, points={"p": (LON, LAT, ALT)}, seen=(("p", 0, COL, ROW),), tolerance=1e-10, flat=name in NO_ALTITUDE
+    )
+    for name, (file, text) in SAME.items()
+}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_the_points_of_a_file_are_where_they_are(name: str, tmp_path: Path) -> None:
     case = CASES[name]
     (tmp_path / case.file).write_bytes(case.encode(case.text))
     found = read_gcps(tmp_path / case.file, VIEWS, case.frame)
     places, seen = case.points or P, case.seen or SEEN
+    np.testing.assert_allclose(found.xy, np.round(found.xy, 6), rtol=0, atol=1e-9)
     got = {
         (int(v), round(float(c), 6), round(float(r), 6)): found.lonlatalt[g]
         for g, v, (c, r) in zip(found.point, found.view, found.xy, strict=True)
@@ -283,6 +294,7 @@ def test_the_points_of_a_file_are_where_they_are(name: str, tmp_path: Path) -> N
         assert abs(got[key][2] - alt) <= 1e-6, key
     assert len(found.names) == len({p for p, *_ in seen})  # seen in two images, a point is one
     assert found.strangers == ()
+    assert ("no altitudes" in "".join(found.said)) == case.flat
     assert all(line.startswith(str(tmp_path)) and "\n" not in line for line in found.said)
 
 
