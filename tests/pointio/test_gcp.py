@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pyproj
 import pytest
 from rasterio.control import GroundControlPoint
 
-from barpc.base.errors import InputError
 from barpc.pointio.gcps import read_gcps
 from tests.geotiffs import write_image
+from tests.pointio.conftest import refused
 
 NAMES = ["left", "right"]
 
@@ -61,13 +63,11 @@ def test_tags_in_a_map_projection_are_brought_to_wgs84(tmp_path):
 def test_what_is_wrong_with_a_file_is_said(tmp_path, text, says):
     path = tmp_path / "bad.gcp"
     path.write_text(text)
-    with pytest.raises(InputError, match=says):
-        read_gcps(path, NAMES)
+    refused(partial(read_gcps, names=NAMES), path, says)
 
 
 def test_a_missing_file_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_gcps(tmp_path / "none.gcp", NAMES)
+    refused(partial(read_gcps, names=NAMES), tmp_path / "none.gcp", "no such file")
 
 
 def test_the_quickbird_points_read_alike_from_geojson_and_from_tags(shared_data):
