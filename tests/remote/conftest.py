@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+import sys
 import threading
 import time
 from collections import Counter
@@ -157,6 +158,23 @@ class Fetched:
     ) -> Part:
         self._sent = itertools.chain(parts, more)
         return hosts.fetch(at, start, stop)
+
+
+def forget() -> None:
+    """What was known of stores, and of where they are."""
+    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
+        cached.cache_clear()
+    for module, name in (("s3fs", "S3FileSystem"), ("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
+        if module in sys.modules:
+            getattr(sys.modules[module], name).clear_instance_cache()
+
+
+@pytest.fixture
+def forgotten() -> Iterator[None]:
+    """No store is known before or after."""
+    forget()
+    yield
+    forget()
 
 
 @pytest.fixture
