@@ -86,7 +86,6 @@ class Web:
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
     monkeypatch.setattr(hosts, "WAITS", (0.0, 0.01, 0.01))
-    monkeypatch.setattr(hosts, "TIMEOUT", 2.0)
     folder = tmp_path / "served"
     folder.mkdir()
     found = Web(folder)
@@ -95,6 +94,13 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
     finally:
         found.server.shutdown()
         found.server.server_close()
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a second for an answer, and hardly more for its bytes."""
+    monkeypatch.setattr(hosts, "TIMEOUT", 0.5)
+    monkeypatch.setattr(hosts, "_SLOWEST", 1_000_000)
 
 
 def drip(handler: _Handler, part: bytes, *_span: int) -> bool:

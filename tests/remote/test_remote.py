@@ -25,7 +25,7 @@ from barpc.base.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.base.frozen import from_arrays, to_arrays
 from barpc.base.identity import fingerprint
 from barpc.base.options import RunOptions, TieOptions, read_options
-from barpc.base.remote import REQUEST_BYTES, Remote, RemoteFile, hosts, located, pinned
+from barpc.base.remote import REQUEST_BYTES, Remote, RemoteFile, located, pinned
 from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.cameras import open_camera, open_split, split_spec
 from barpc.pipeline import load_views
@@ -152,8 +152,6 @@ def test_a_vrt_a_kept_result_and_a_text_open_nothing_even_where_the_host_is_allo
     with pytest.raises(ImageError, match="from disk only"):
         load_views([samples.url("x.vrt")], min_views=1, hosts=(samples.host,))
     assert not any("view_00" in path for path in samples.seen)
-    with pytest.raises(ValueError, match="Remote"):
-        from_arrays(to_arrays((Remote(url, 5, "x"),)))
     assert type(from_arrays(to_arrays(str.__str__(url)))) is str
 
 
@@ -320,15 +318,21 @@ MOODS: dict[str, tuple[Mood, str, int]] = {  # what it does, what is said, how o
     "500": (status(500), "500; asked 4 times", 4),
     "other scheme": (status(302, Location="file:///etc/passwd"), "file:///etc/passwd", 1),
     "nowhere": (status(301), "on and on", 3),
-    "drip": (drip, "more than 0.566 s for 65536 bytes", 4),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mood", MOODS)
-def test_a_host_that_misbehaves_costs_one_line(samples: Web, monkeypatch: pytest.MonkeyPatch, mood: str) -> None:
-    monkeypatch.setattr(hosts, "TIMEOUT", 0.5 if mood == "drip" else 30.0)
-    monkeypatch.setattr(hosts, "_SLOWEST", 1_000_000)
-    samples.mood, said, times = MOODS[mood]
+def test_a_host_that_misbehaves_costs_one_line(samples: Web, mood: str) -> None:
+    costs_one_line(samples, *MOODS[mood])
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_host_that_sends_a_byte_now_and_then_costs_one_line(samples: Web) -> None:
+    costs_one_line(samples, drip, "more than 0.566 s for 65536 bytes", 4)
+
+
+def costs_one_line(samples: Web, mood: Mood, said: str, times: int) -> None:
+    samples.mood = mood
     at = located(samples.url(NAMES[0]), (samples.host,))
     with pytest.raises(ImageError) as caught, open_raster(at):
         pass
