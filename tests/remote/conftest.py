@@ -111,6 +111,7 @@ def drip(handler: _Handler, part: bytes, *_span: int) -> bool:
     handler.end_headers()
     for _ in range(100):
         handler.wfile.write(b"x")
+        handler.web.counts["dripped"] += 1
         time.sleep(0.2)
     return True
 
