@@ -96,14 +96,20 @@ def ecef(lon: np.ndarray, lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
 
 
 class Posed(NamedTuple):
-    """A camera of COLMAP's texts: focal lengths, principal point, world to camera."""
+    """An image of COLMAP's texts: its number and its camera's, focal lengths, principal point, world to camera.
 
+    `places` (n, 3): column, row and number of the points that it shows.
+    """
+
+    number: int
+    camera: int
     name: str
     size: tuple[int, int]
     focal: np.ndarray
     center: np.ndarray
     turn: np.ndarray
     shift: np.ndarray
+    places: np.ndarray
 
     def project(self, world: np.ndarray) -> np.ndarray:
         """Columns and rows (N, 2), (0, 0) at the corner of the first pixel."""
@@ -127,9 +133,12 @@ def posed(model: Path) -> Iterator[Posed]:
         number, kind, *rest = line.split()
         assert kind == "PINHOLE"
         cameras[number] = [float(word) for word in rest]
-    for line in (model / "sparse/0/images.txt").read_text().splitlines()[::2]:
-        _, *words, number, name = line.split()
-        pose, (width, height, *numbers) = np.array(words, float), cameras[number]
+    lines = iter((model / "sparse/0/images.txt").read_text().splitlines())
+    for line, seen in zip(lines, lines, strict=True):
+        number, *words, camera, name = line.split()
+        pose, (width, height, *numbers) = np.array(words, float), cameras[camera]
         assert pose[0] >= 0
-        fx_fy, cx_cy = np.array(numbers).reshape(2, 2)
-        yield Posed(name, (int(width), int(height)), fx_fy, cx_cy, turned(*pose[:4]), pose[4:])
+        focal, center = np.array(numbers).reshape(2, 2)
+        places = np.array(seen.split(), float).reshape(-1, 3)
+        size = int(width), int(height)
+        yield Posed(int(number), int(camera), name, size, focal, center, turned(*pose[:4]), pose[4:], places)

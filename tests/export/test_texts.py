@@ -24,7 +24,7 @@ from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
 from barpc.rpcio import CARRIERS, read_rpc
 from barpc.sensor.centers import camera_center
 from barpc.sensor.sampler import Sample, image_grid
-from tests.export.conftest import changed, table, turned
+from tests.export.conftest import changed, posed, table
 
 OUT = Path("/elsewhere/out")
 HOW = ExportOptions()
@@ -224,50 +224,35 @@ def test_a_camera_that_shows_the_ground_mirrored_is_no_pinhole(south, sign):
         pinholes.pinhole_of(of, of.shots[0])
 
 
-@pytest.fixture(scope="module")
-def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
-    """COLMAP's texts of the scene, its lines by file."""
+def test_colmap_s_texts_hold_the_scene(south, tmp_path):
     of = replace(south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots)))
-    files = colmap(of, OUT, ExportOptions(exact=True))
-    texts = {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
-    assert set(files) == texts | {"sparse/0/points3D.ply", "transforms.json", "world.json"}
-    del files["sparse/0/points3D.ply"]
-    files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
-    return (
-        of,
-        {name: data.decode().split("\n")[:-1] for name, data in files.items()},
-        json.loads(files["world.json"]),
-    )
-
-
-def test_colmap_s_texts_hold_the_scene(model):
-    of, texts, about = model
+    files, texts = colmap(of, OUT, ExportOptions(exact=True)), ("cameras", "images", "points3D")
+    assert set(files) == {f"sparse/0/{name}.txt" for name in texts} | {
+        "sparse/0/points3D.ply", "transforms.json", "world.json",
+    }  # fmt: skip
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    for name in texts:
+        (tmp_path / f"sparse/0/{name}.txt").write_bytes(files[f"sparse/0/{name}.txt"])
+    about, rows = json.loads(files["world.json"]), (tmp_path / "sparse/0/points3D.txt").read_text().splitlines()
     points = {}
     world = of.world(of.points)
-    for line in texts["points3D.txt"]:
+    for line in rows:
         number, *rest = line.split()
         points[int(number)] = np.array(rest[:3], float)
         assert rest[3:6] == ["128"] * 3
         assert points[int(number)] == pytest.approx(world[int(number) - 1])
     assert list(points) == sorted(points)
     errors: dict[int, list[float]] = {number: [] for number in points}
-    for k, shot in enumerate(of.shots):
-        number, kind, width, height, *numbers = texts["cameras.txt"][k].split()
-        assert (number, kind, width, height) == (str(k + 1), "PINHOLE", "900", "700")
-        fx, fy, cx, cy = map(float, numbers)
-        head = texts["images.txt"][2 * k].split()
-        assert (head[0], head[8], head[9]) == (str(k + 1), str(k + 1), f"{k}.tif")
-        assert float(head[1]) >= 0
-        rotation, move = turned(*map(float, head[1:5])), np.array(head[5:8], float)
-        places = np.array(texts["images.txt"][2 * k + 1].split(), float).reshape(-1, 3)
-        assert places[:, :2] == pytest.approx(shot.xy + 0.5)
-        assert places[:, 2].astype(int).tolist() == (shot.index + 1).tolist()
-        seen = np.array([points[int(n)] for n in places[:, 2]]) @ rotation.T + move
-        off = np.hypot(*(seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy] - places[:, :2]).T)
+    for k, (shot, image) in enumerate(zip(of.shots, posed(tmp_path), strict=True)):
+        assert (image.number, image.camera, image.name, image.size) == (k + 1, k + 1, f"{k}.tif", (900, 700))
+        numbers = image.places[:, 2].astype(int).tolist()
+        assert image.places[:, :2] == pytest.approx(shot.xy + 0.5)
+        assert numbers == (shot.index + 1).tolist()
+        off = np.hypot(*(image.project(np.array([points[n] for n in numbers])) - image.places[:, :2]).T)
         assert np.median(off) < 0.4
-        for n, error in zip(places[:, 2].astype(int), off, strict=True):
+        for n, error in zip(numbers, off, strict=True):
             errors[n].append(error)
-    for line in texts["points3D.txt"]:
+    for line in rows:
         words = line.split()
         assert float(words[7]) == pytest.approx(np.mean(errors[int(words[0])]), abs=1e-6)
         track = [(int(a) - 1, int(b)) for a, b in zip(words[8::2], words[9::2], strict=True)]
