@@ -26,22 +26,20 @@ def test_a_polygon_is_closed_counter_clockwise_and_in_range():
     assert shape(geometry).equals(shapely.box(5, 43, 6, 44))
 
 
-@pytest.mark.parametrize("turn", [-360.0, 0.0, 360.0])
-def test_the_antimeridian_cuts_a_footprint_in_two(turn):
-    geometry = shape(polygon(ring(179.5 + turn, 10, 181 + turn, 11)))
-    expected = shapely.union_all([shapely.box(179.5, 10, 180, 11), shapely.box(-180, 10, -179, 11)])
-    assert geometry.geom_type == "MultiPolygon"
-    assert geometry.equals(expected)
-    assert all(part.exterior.is_ccw for part in geometry.geoms)
-
-
-def test_a_footprint_that_only_touches_the_antimeridian_is_one_polygon():
-    assert shape(polygon(ring(179, 10, 180, 11))).equals(shapely.box(179, 10, 180, 11))
-    assert shape(polygon(ring(180, 10, 181, 11))).equals(shapely.box(-180, 10, -179, 11))
-
-
-def test_longitudes_of_0_to_360_come_out_in_range():
-    assert shape(polygon(ring(300, 10, 301, 11))).equals(shapely.box(-60, 10, -59, 11))
+@pytest.mark.parametrize(
+    ("ends", "parts"),
+    [
+        *(((179.5 + turn, 181 + turn), [(179.5, 180), (-180, -179)]) for turn in (-360.0, 0.0, 360.0)),
+        ((179, 180), [(179, 180)]),  # it only touches the antimeridian
+        ((180, 181), [(-180, -179)]),
+        ((300, 301), [(-60, -59)]),
+    ],
+)
+def test_a_footprint_lies_in_range_and_the_antimeridian_cuts_it_in_two(ends, parts):
+    geometry = shape(polygon(ring(ends[0], 10, ends[1], 11)))
+    assert geometry.geom_type == ("MultiPolygon" if len(parts) == 2 else "Polygon")
+    assert geometry.equals(shapely.union_all([shapely.box(west, 10, east, 11) for west, east in parts]))
+    assert all(part.exterior.is_ccw for part in getattr(geometry, "geoms", [geometry]))
 
 
 @pytest.mark.parametrize(("lat", "pole"), [(80.0, 90.0), (-80.0, -90.0)])

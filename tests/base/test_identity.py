@@ -14,22 +14,22 @@ from barpc.base.remote import Remote
 
 def test_a_file_whose_number_changes_and_whose_bytes_do_not_is_the_same(tmp_path) -> None:
     """Some file systems number files anew; times that changed mean that somebody was at it."""
-    path = tmp_path / "a"
-    path.write_bytes(b"x" * 1000)
-    found = identity.fingerprint(path)
-    found.ask()
-    assert found.stamp is not None
-    renumbered = identity.Input(
-        found.path, found.size, found.sha256, identity.Stamp(*found.stamp.times(), 1, 2, "here")
-    )
-    renumbered.ask()
-    wrong = identity.Input(found.path, found.size, "0" * 64, identity.Stamp(*found.stamp.times(), 3, 2, "here"))
-    identity._stamps.clear()
-    with pytest.raises(InputError, match="was changed or replaced"):
-        wrong.ask()
-    path.unlink()
-    with pytest.raises(InputError, match="was changed or replaced"):
+
+    def renumbered(name: str, sha256: str = "") -> identity.Input:
+        (tmp_path / name).write_bytes(b"x" * 1000)
+        found = identity.fingerprint(tmp_path / name)
         found.ask()
+        assert found.stamp is not None
+        stamp = identity.Stamp(*found.stamp.times(), 1, 2, "here")
+        return identity.Input(found.path, found.size, sha256 or found.sha256, stamp)
+
+    same, other = renumbered("a"), renumbered("b", "0" * 64)
+    same.ask()
+    with pytest.raises(InputError, match="was changed or replaced"):
+        other.ask()
+    (tmp_path / "a").unlink()
+    with pytest.raises(InputError, match="was changed or replaced"):
+        same.ask()
 
 
 def test_devices_are_compared_on_one_host_only() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from barpc.workspace import Workspace
 
 
 def sha(data: bytes) -> str:
-    return sha256(data).hexdigest()
+    return hashlib.sha256(data).hexdigest()
 
 
 @pytest.fixture
@@ -139,20 +139,24 @@ def test_no_name_is_more_than_a_file_that_is_not_there(made, name) -> None:
 
 
 def test_a_large_file_is_hashed_where_its_times_are_not_those_noted(made, tmp_path, monkeypatch) -> None:
-    hashed = list[str]()
-    hash_of = sealed.fingerprint
-    monkeypatch.setattr(sealed, "READ_WHOLE", 0)
-    monkeypatch.setattr(sealed, "fingerprint", lambda path: (hashed.append(str(path)), hash_of(path))[1])
+    size, hash_of = sealed.READ_WHOLE + 1, hashlib.file_digest
     path, image = "../../in/a.tif", tmp_path / "in/a.tif"
+    image.write_bytes(b"a" * size)
     with Workspace(made, adds=True) as run:
         run.note({path: Stamp.of(image.stat())})
-    assert Sealed.open(made).find(path, sha(b"a"), 1) == image
+    hashed = list[object]()
+    monkeypatch.setattr(hashlib, "file_digest", lambda *given: (hashed.append(given), hash_of(*given))[1])
+
+    def find(**how: bool) -> Path | None:
+        return Sealed.open(made).find(path, sha(b"a" * size), size, **how)
+
+    assert find() == image
     assert hashed == []
-    assert Sealed.open(made).find(path, sha(b"a"), 1, whole=True) == image
+    assert find(whole=True) == image
     assert len(hashed) == 1
     times = image.stat()
-    image.write_bytes(b"b")
+    image.write_bytes(b"b" * size)
     os.utime(image, ns=(times.st_atime_ns, times.st_mtime_ns))  # as a forger does
-    assert Sealed.open(made).find(path, sha(b"a"), 1) is None
-    image.write_bytes(b"a")  # put back: other times, the same content
-    assert Sealed.open(made).find(path, sha(b"a"), 1) == image
+    assert find() is None
+    image.write_bytes(b"a" * size)  # put back: other times, the same content
+    assert find() == image

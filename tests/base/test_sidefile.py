@@ -409,13 +409,6 @@ def test_what_a_json_holds_is_counted_before_it_is_parsed(text, values, tmp_path
     assert (parse_json("[]"), GEOJSON.values, SUMMARY.values) == ([], 8 * MB, 32 * MB)
 
 
-def test_large_files_of_few_numbers_are_read(tmp_path):
-    """Texts of a table, such as names, may be as long as the table may."""
-    path = tmp_path / "a.csv"
-    path.write_text("n" * 100 + ",1\n")
-    assert read_text(path, replace(TABLE, most=128)).startswith("nnn")
-
-
 def test_a_path_that_not_every_file_can_hold_is_refused(tmp_path):
     assert plain_path(tmp_path / "a é b.tif") == tmp_path / "a é b.tif"
     for char, what in (("\n", r"the character '\\n'"), ("\x7f", "the character"), ("\\", "the character"),

@@ -19,11 +19,11 @@ from rasterio.warp import Resampling, reproject
 from scipy.ndimage import map_coordinates
 
 import barpc
+from tests.export.conftest import ecef, posed, read, table
 
 rpcm = pytest.importorskip("rpcm")
 pyproj = pytest.importorskip("pyproj")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Dataset has no geotransform")]
-TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 MAXAR = "LINE", "SAMP", "LAT", "LONG", "HEIGHT"
 NAMES = "img_01", "img_02", "img_03"
 
@@ -42,10 +42,6 @@ def exported(run: Path, target: str, name: str = "", **options: object) -> Path:
     if not out.exists():
         barpc.export(run, out, target, **options)
     return out
-
-
-def read(path: Path) -> dict:
-    return json.loads(path.read_text(encoding="utf-8"))
 
 
 def truth(run: Path, name: str):
@@ -96,37 +92,24 @@ def splatted(model: Path) -> dict[str, tuple[np.ndarray, float, float, int, int]
 
     It takes the rotation, the translation and the two focal lengths for fields of view; principal points it ignores.
     """
-    cameras = {}
-    for line in (model / "sparse/0/cameras.txt").read_text().splitlines():
-        number, kind, *rest = line.split()
-        assert kind == "PINHOLE"
-        cameras[number] = [float(word) for word in rest]
     found = {}
-    for line in (model / "sparse/0/images.txt").read_text().splitlines()[::2]:
-        _, w, x, y, z, *shift, number, name = line.split()
-        w, x, y, z = map(float, (w, x, y, z))
-        turn = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+    for image in posed(model):
         view = np.eye(4)
-        view[:3, :3], view[:3, 3] = turn, [float(word) for word in shift]
-        width, height, fx, fy, *_ = cameras[number]
-        across, down = (2 * np.arctan(side / (2 * f)) for side, f in ((width, fx), (height, fy)))
+        view[:3, :3], view[:3, 3] = image.turn, image.shift
+        across, down = 2 * np.arctan(np.array(image.size) / (2 * image.focal))
         near, far = 0.01, 100.0
         clip = np.zeros((4, 4))
         clip[0, 0], clip[1, 1] = 1 / np.tan(across / 2), 1 / np.tan(down / 2)
         clip[2, 2:], clip[3, 2] = [far / (far - near), -far * near / (far - near)], 1.0
         both = clip.astype(np.float32) @ view.astype(np.float32)
-        found[name] = both, fx, fy, int(width), int(height)
+        found[image.name] = both, *image.focal, *image.size
     return found
 
 
 def to_world(model: Path, at: np.ndarray) -> np.ndarray:
     """Ground points (lon, lat, alt) in the frame of the model, by its matrix."""
     matrix = np.linalg.inv(np.array(read(model / "world.json")["world_to_ecef"]))
-    return np.column_stack(TO_ECEF.transform(*at.T)) @ matrix[:3, :3].T + matrix[:3, 3]
+    return ecef(*at.T) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def test_a_loader_of_splatting_sees_the_ground_where_the_rpc_does(model, run):
@@ -255,8 +238,7 @@ def test_the_arithmetic_of_sat_nerf_and_eogs_runs_on_every_record(run, shared_da
         low, high = float(record["min_alt"]), float(record["max_alt"])
         seen, at = np.array(record["keypoints"]["2d_coordinates"]), points[record["keypoints"]["pts3d_indices"]]
         ends = [
-            np.column_stack(TO_ECEF.transform(*model.localization(*seen.T, alt), alt))
-            for alt in (np.full(len(seen), high), np.full(len(seen), low))
+            ecef(*model.localization(*seen.T, alt), alt) for alt in (np.full(len(seen), high), np.full(len(seen), low))
         ]
         along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0], axis=1)[:, None]
         depth = ((at - ends[0]) * along).sum(axis=1)
@@ -368,7 +350,7 @@ def test_the_table_of_points_lies_on_the_rays(run):
     rows = list(csv.DictReader((out / "points.csv").read_text().splitlines()[1:]))
     at = np.array([[float(row[key]) for key in ("lon", "lat", "alt")] for row in rows])
     tracks = {row["track"]: k for k, row in enumerate(rows)}
-    seen = list(csv.DictReader((run / "tables/observations.csv").read_text().splitlines()))
+    seen = list(csv.DictReader(table(run, "observations")))
     for name in NAMES:
         own = [row for row in seen if row["view"] == name and row["used"] == "1" and row["track"] in tracks]
         xy = np.array([[float(row["col"]), float(row["row"])] for row in own])

@@ -14,20 +14,18 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.enums import ColorInterp
-from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError, OutputError
 from barpc.base.verb_options import ExportOptions
-from barpc.cli import main
-from barpc.export.colmap import _ShotPixels
+from barpc.export.colmap import _Pixels
 from barpc.export.light import sun_angles
-from barpc.export.shots import read_scene
-from barpc.export.targets import TARGETS, _link_image, export_run
+from barpc.export.targets import TARGETS, export_run
 from barpc.rpcio import read_rpc
 from barpc.rpcio.acquisition import read_acquisition
 from barpc.sensor.sampler import image_grid
+from tests.export.conftest import changed, ecef, ended, posed, read, table
+from tests.geotiffs import write_image
 from tests.lanes import rest_slow
-from tests.sealing import seal
 
 DATED = {"time": ("2013-04-17T22:00:00+02:00",)}  # for images whose files state no time
 
@@ -36,20 +34,6 @@ def exported(run: Path, target: str, tmp_path: Path, **options: object) -> Path:
     exact = {"exact": True} if target == "colmap" else {}  # (the images of these runs do not exist)
     export_run(run, target, tmp_path / target, ExportOptions(**DATED | exact | options))
     return tmp_path / target
-
-
-def read(path: Path) -> dict:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
-def ecef(lon: np.ndarray, lat: np.ndarray, alt: np.ndarray) -> np.ndarray:
-    pyproj = pytest.importorskip("pyproj")
-    to = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
-    return np.column_stack(to.transform(lon, lat, alt))
 
 
 def box(rpc, size: tuple[int, int], alts: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -124,39 +108,25 @@ def test_colmap_s_pinholes_are_as_near_as_they_say(run_dir, tmp_path):
     out = exported(run_dir, "colmap", tmp_path)
     about = read(out / "world.json")
     to_world = np.linalg.inv(np.array(about["world_to_ecef"]))
-    views = read(run_dir / "summary.json")["views"]
-    cameras, images = ((out / f"sparse/0/{name}.txt").read_text().splitlines() for name in ("cameras", "images"))
-    for view, camera, image in zip(views, cameras, images[::2], strict=True):
+    for view, image in zip(read(run_dir / "summary.json")["views"], posed(out), strict=True):
         rpc = read_rpc(run_dir / f"{view['name']}_RPC.TXT")
         at, seen = box(rpc, view["size"], about["alt_range"])
         world = at @ to_world[:3, :3].T + to_world[:3, 3]
         assert np.abs(world).max() < 5000
-        *numbers, name = image.split()
-        w, x, y, z, *shift = map(float, numbers[1:8])
-        turn = Rotation.from_quat([x, y, z, w]).as_matrix()
-        right, down, forward = (world @ turn.T + shift).T
-        fx, fy, cx, cy = map(float, camera.split()[4:])
-        found = np.column_stack([fx * right / forward + cx, fy * down / forward + cy]) - 0.5
-        off = np.hypot(*(found - seen).T).max()
+        off = np.hypot(*(image.project(world) - 0.5 - seen).T).max()
         assert off < 0.3
-        assert 0.8 * off < about["pinhole_error_px"][name] < 1.2 * off
-        assert Path(out, about["images"][name]).resolve() == Path(view["path"]).resolve()
-        assert (-turn.T @ shift)[2] > 300e3  # it looks down from its orbit
+        assert 0.8 * off < about["pinhole_error_px"][image.name] < 1.2 * off
+        assert Path(out, about["images"][image.name]).resolve() == Path(view["path"]).resolve()
+        assert (-image.turn.T @ image.shift)[2] > 300e3  # it looks down from its orbit
 
 
-def in_one_folder(run: Path, tmp_path: Path, folder: str = "/images") -> Path:
+def in_one_folder(run: Path, tmp_path: Path, form: str = "/images/{}.tif") -> Path:
     """A copy of a run whose images lie together."""
-    copy = shutil.copytree(run, tmp_path / "run")
-    summary = read(copy / "summary.json")
-    for view in summary["views"]:
-        view["path"] = f"{folder}/{view['name']}.tif"
-    (copy / "summary.json").write_text(json.dumps(summary))
-    seal(copy)
-    return copy
+    return changed(run, tmp_path, lambda of: [view.update(path=form.format(view["name"])) for view in of["views"]])
 
 
 def test_an_image_s_path_that_is_no_text_is_refused_by_the_summary_s_name(run_dir, tmp_path):
-    odd = in_one_folder(run_dir, tmp_path, "/images/\udce9")
+    odd = in_one_folder(run_dir, tmp_path, "/images/\udce9/{}.tif")
     with pytest.raises(InputError, match=r"summary\.json: .* its path holds bytes that are not UTF-8"):
         exported(odd, "satnerf", tmp_path)
     assert not (tmp_path / "satnerf").exists()
@@ -192,46 +162,37 @@ def test_pycolmap_opens_the_model_and_finds_the_errors_that_it_states(southern, 
 def test_colmap_finds_every_image_in_its_folder_and_none_is_copied(southern, tmp_path):
     for _ in range(2):  # again: in place of the first
         export_run(southern, "colmap", tmp_path / "model", ExportOptions(overwrite=True, exact=True))
-    lines = (tmp_path / "model/sparse/0/images.txt").read_text().splitlines()[::2]
     views = read(southern / "summary.json")["views"]
-    for line, view in zip(lines, views, strict=True):
-        path = tmp_path / "model/images" / line.split()[-1]
+    for image, view in zip(posed(tmp_path / "model"), views, strict=True):
+        path = tmp_path / "model/images" / image.name
         assert path.is_symlink()
         assert path.resolve() == Path(view["path"]).resolve()
     assert len(list((tmp_path / "model/images").iterdir())) == len(views)
-    (tmp_path / "other/images").mkdir(parents=True)
-    theirs = tmp_path / "other/images" / lines[0].split()[-1]
-    theirs.write_bytes(b"mine")
-    with pytest.raises(OutputError):
-        export_run(southern, "colmap", tmp_path / "other", ExportOptions(overwrite=True, exact=True))
-    assert theirs.read_bytes() == b"mine"
 
 
-def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path, monkeypatch, caplog):
-    link = tmp_path / "sparse/images/a.tif"
-    for image in ("../../a.tif", "../../b.tif"):
-        _link_image(link, image)
-        assert str(link.readlink()) == image
-    (tmp_path / "mine.tif").write_text("mine")
-    with pytest.raises(OutputError, match="is there already and no link of an earlier export"):
-        _link_image(tmp_path / "mine.tif", "a.tif")
-    assert (tmp_path / "mine.tif").read_text() == "mine"
+def test_a_link_takes_the_place_of_an_earlier_one_and_of_nothing_else(southern, tmp_path, monkeypatch, caplog):
+    run, how = in_one_folder(southern, tmp_path), ExportOptions(overwrite=True, exact=True)
+    link, mine = (tmp_path / f"model/images/view_000{k}.tif" for k in (0, 1))
+    link.parent.mkdir(parents=True)
+    link.symlink_to("../../b.tif")
+    mine.write_text("mine")
+    with pytest.raises(OutputError, match=r"view_0001\.tif: is there already and no link of an earlier export"):
+        export_run(run, "colmap", tmp_path / "model", how)
+    assert (link.is_symlink(), link.resolve()) == (True, Path("/images/view_0000.tif").resolve())
+    assert mine.read_text() == "mine"
 
     def refuse(*_: object) -> None:
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(Path, "symlink_to", refuse)
-    _link_image(tmp_path / "c.tif", "a.tif")
-    assert "c.tif: no link to a.tif (Operation not permitted): copy the image there" in caplog.text
+    export_run(run, "colmap", tmp_path / "linked", how)
+    said = r"view_0002\.tif: no link to (\.\./)+images/view_0002\.tif \(Operation not permitted\): copy the image there"
+    assert re.search(said, caplog.text)
 
 
 def test_colmap_refuses_a_name_that_its_text_cannot_hold(southern, tmp_path):
-    run = in_one_folder(southern, tmp_path)
-    summary = (run / "summary.json").read_text()
-    (run / "summary.json").write_text(summary.replace('.tif"', ' a.tif"'))
-    seal(run)
     with pytest.raises(InputError, match="space"):
-        exported(run, "colmap", tmp_path)
+        exported(in_one_folder(southern, tmp_path, "/images/{} a.tif"), "colmap", tmp_path)
 
 
 def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
@@ -240,9 +201,9 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     comment, *lines = (out / "points.csv").read_text().splitlines()
     assert comment.startswith("# covariance")
     rows = list(csv.DictReader(lines))
-    table = {int(row["track"]): row for row in rows_of(southern / "tables/residuals.csv")}
-    assert {int(row["track"]) for row in rows} == set(table)
-    assert all(row["alt"] == table[int(row["track"])]["height_above_datum"] for row in rows)
+    known = {int(row["track"]): row for row in csv.DictReader(table(southern, "residuals"))}
+    assert {int(row["track"]) for row in rows} == set(known)
+    assert all(row["alt"] == known[int(row["track"])]["height_above_datum"] for row in rows)
     ply = plyfile.PlyData.read(str(out / "points.ply"))["vertex"]
     assert len(ply) == len(rows)
     names = ("var_ee", "var_en", "var_eu", "var_nn", "var_nu", "var_uu")
@@ -253,7 +214,7 @@ def test_points_come_with_the_covariance_of_their_rays(southern, tmp_path):
     assert (values[:, 5] > 2 * values[:, 0]).mean() > 0.9  # heights are worse than places
     # by a Monte Carlo of one point: image noise in, scatter of the intersection out
     rng, track = np.random.default_rng(3), rows[7]["track"]
-    seen = [r for r in rows_of(southern / "tables/observations.csv") if r["track"] == track]
+    seen = [r for r in csv.DictReader(table(southern, "observations")) if r["track"] == track]
     noise = float(comment.split("noise ")[1].split(" px")[0])
     from barpc.base.geodesy import ecef_from_ground, enu_basis
     from barpc.sensor.triangulation import triangulate
@@ -326,11 +287,8 @@ def test_nothing_is_replaced_that_is_not_an_earlier_export(target, southern, tmp
 
 
 def test_an_image_of_the_run_is_never_written_over(southern, tmp_path):
-    run, out = in_one_folder(southern, tmp_path), tmp_path / "stereo"
-    summary = read(run / "summary.json")
-    summary["views"][0]["path"] = str(out / "config.json")
-    (run / "summary.json").write_text(json.dumps(summary))
-    seal(run)
+    out = tmp_path / "stereo"
+    run = changed(southern, tmp_path, lambda of: of["views"][0].update(path=str(out / "config.json")))
     with pytest.raises(OutputError, match=r"config\.json: is an input and is never written"):
         export_run(run, "s2p", out)
 
@@ -342,37 +300,33 @@ def test_the_run_s_own_folder_is_never_an_export(southern):
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", "x\0y"])
 def test_a_run_that_lies_about_names_writes_and_reads_nothing_outside(name, southern, tmp_path):
-    run = shutil.copytree(southern, tmp_path / "run")
-    summary = read(run / "summary.json")
-    old = summary["views"][0]["name"]
-    text = (run / "summary.json").read_text().replace(json.dumps(old), json.dumps(name))
-    (run / "summary.json").write_text(text)
-    table = (run / "tables/observations.csv").read_text().replace(f"\n{old},", f'\n"{name}",')
-    (run / "tables/observations.csv").write_text(table)
-    seal(run)
+    old = read(southern / "summary.json")["views"][0]["name"]
+
+    def rename(summary: dict) -> None:
+        text = json.dumps(summary).replace(json.dumps(old), json.dumps(name))
+        summary |= json.loads(text)
+
+    rows = [line.replace(f"{old},", f'"{name}",', 1) for line in table(southern, "observations")]
+    run = changed(southern, tmp_path, rename, observations=rows)
     with pytest.raises((InputError, OutputError)):
         export_run(run, "satnerf", tmp_path / "out")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
 
 
 def test_rpc_files_are_taken_from_the_run_s_own_folder_alone(southern, tmp_path):
-    run = shutil.copytree(southern, tmp_path / "run")
-    summary = read(run / "summary.json")
-    view = summary["views"][0]
-    shutil.move(run / f"{view['name']}_RPC.TXT", tmp_path / "elsewhere_RPC.TXT")
-    (run / "link_RPC.TXT").symlink_to(tmp_path / "elsewhere_RPC.TXT")
-    view["outputs"] = {"link_RPC.TXT": {}, "..": {}}
-    (run / "summary.json").write_text(json.dumps(summary))
-    seal(run)
+    def move(summary: dict) -> None:
+        view, run = summary["views"][0], tmp_path / "run"
+        shutil.move(run / f"{view['name']}_RPC.TXT", tmp_path / "elsewhere_RPC.TXT")
+        (run / "link_RPC.TXT").symlink_to(tmp_path / "elsewhere_RPC.TXT")
+        view["outputs"] = {"link_RPC.TXT": {}, "..": {}}
+
+    run = changed(southern, tmp_path, move)
     with pytest.raises(InputError, match="no RPC file"):
         export_run(run, "s2p", tmp_path / "out")
 
 
 def test_a_run_without_an_adjustment_says_so(southern, tmp_path):
-    run = shutil.copytree(southern, tmp_path / "run")
-    text = (run / "summary.json").read_text()
-    (run / "summary.json").write_text(text.replace('"kind": "adjust"', '"kind": "match"'))
-    seal(run)
+    run = changed(southern, tmp_path, lambda of: of.update(kind="match"))
     with pytest.raises(InputError, match="without corrected cameras"):
         export_run(run, "s2p", tmp_path / "out")
     with pytest.raises(InputError, match=r"no summary\.json"):
@@ -380,12 +334,9 @@ def test_a_run_without_an_adjustment_says_so(southern, tmp_path):
 
 
 def test_the_verb_prints_what_it_wrote(southern, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["export", str(southern), str(tmp_path / "a b"), "--to", "s2p", "--json"])
-    assert stop.value.code in (0, None)
+    assert ended(southern, tmp_path / "a b", "--to", "s2p", "--json") == 0
     assert json.loads(capsys.readouterr().out) == [str(tmp_path / "a b" / "config.json")]
-    with pytest.raises(SystemExit):
-        main(["export", "--help"])
+    assert ended("--help") == 0
     words = capsys.readouterr().out.translate(str.maketrans("[]|,", "    ")).split()
     assert set(TARGETS) <= set(words)  # the verb offers every target
 
@@ -435,32 +386,27 @@ def test_an_export_of_another_name_and_altitudes_upside_down_are_refused(souther
     ],
 )
 def test_flags_that_do_not_go_together_are_wrong_usage(target, flags, said, southern, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["export", str(southern), str(tmp_path / "out"), "--to", target, *flags])
-    assert stop.value.code == 2
+    assert ended(southern, tmp_path / "out", "--to", target, *flags) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 def test_pictures_of_images_that_are_gone_are_not_made(southern, tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["export", str(southern), str(tmp_path / "out"), "--to", "colmap"])
-    assert stop.value.code == 1
+    assert ended(southern, tmp_path / "out", "--to", "colmap") == 1
     assert re.fullmatch(r"barpc: .*north\.tif: .*\n", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
-def test_a_picture_has_the_colours_of_its_image(southern, tmp_path):
+def test_a_picture_has_the_colours_of_its_image(south, tmp_path):
     rng = np.random.default_rng(0)
     bands = rng.integers(1, 200, (4, 40, 50)).astype(np.uint8)
     bands[0, :8] = 0  # a border
-    path = tmp_path / "rgb.tif"
-    with rasterio.open(path, "w", driver="GTiff", width=50, height=40, count=4, dtype="uint8", nodata=0) as file:
-        file.write(bands)
+    path = write_image(tmp_path / "rgb.tif", bands, nodata=0)
+    with rasterio.open(path, "r+") as file:
         file.colorinterp = [getattr(ColorInterp, name) for name in ("blue", "green", "red", "undefined")]
-    (shot, *_) = read_scene(southern).shots
-    pixels = _ShotPixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
+    shot = south.shots[0]
+    pixels = _Pixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
     shown, valid = pixels.read((5, 4, 30, 20))
     assert shown.shape == (20, 30, 3)
     for k, band in enumerate((2, 1, 0)):

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from barpc.base.errors import InputError, UsageError
-from barpc.cli import main
 from barpc.export.light import dated, lit, moment, sun_angles
-from barpc.export.shots import read_scene
 from barpc.rpcio.acquisition import read_acquisition
+from tests.export.conftest import ended
 
 PUBLISHED = [
     # Reda and Andreas 2004 (NREL/TP-560-34302), table A5.1: elevation without refraction, azimuth
@@ -62,11 +61,6 @@ def test_the_sun_stands_where_the_algorithm_of_nrel_has_it():
         assert apart(found, (float(truth.elevation.iloc[0]), float(truth.azimuth.iloc[0]))) < 0.01
 
 
-@pytest.fixture(scope="module")
-def south(southern):
-    return read_scene(southern)
-
-
 def test_the_user_s_time_is_of_images_that_state_none_and_of_those_he_names(south):
     def times(*given, dates=()):
         return [shot.light.time for shot in dated(south, given, dates).shots]
@@ -100,10 +94,8 @@ def test_a_time_that_is_none_is_refused(south, times, dates, said):
 
 def test_where_nothing_tells_the_time_nothing_is_written_and_the_exit_code_is_3(southern, tmp_path, capsys):
     for target, flag in (("satnerf", "--time"), ("stac", "--date")):
-        with pytest.raises(SystemExit) as stop:
-            main(["export", str(southern), str(tmp_path / "out"), "--to", target])
+        assert ended(southern, tmp_path / "out", "--to", target) == 3
         said = capsys.readouterr()
-        assert stop.value.code == 3
         assert said.out == ""
         assert re.fullmatch(
             rf"barpc: needs review \(exit code 3\): nothing is written: view_0001, view_0002: .*give {flag} .*\n",

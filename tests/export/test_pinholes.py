@@ -10,9 +10,10 @@ import pytest
 from barpc.base.errors import InputError
 from barpc.export import pinholes
 from barpc.export.pinholes import Pinhole, fit_camera, pinhole_camera
-from barpc.export.shots import Scene, read_scene
+from barpc.export.shots import Scene
 from barpc.sensor.curve import rotation_matrix
 from barpc.sensor.sampler import Sample
+from tests.export.conftest import ecef
 
 TURN = rotation_matrix(np.array([np.pi - 0.2, 0.1, 0.05]))  # looks down
 TRUE = Pinhole(np.array([9000.0, 8500.0]), np.array([480.0, 300.0]), TURN, np.array([20.0, -10.0, 6000.0]))
@@ -117,11 +118,6 @@ def test_a_pinhole_of_noisy_points_is_where_their_squares_are_least():
 # --- pictures -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def scenes(southern, on_date_line) -> list[Scene]:
-    return [read_scene(southern), read_scene(on_date_line)]
-
-
 def test_a_skewed_camera_is_found_where_there_is_one():
     camera = np.array([[9000.0, 40.0, 480.0], [0.0, 8500.0, 300.0], [0.0, 0.0, 1.0]]) @ np.column_stack(
         [TRUE.rotation, TRUE.translation]
@@ -134,14 +130,11 @@ def test_a_skewed_camera_is_found_where_there_is_one():
 
 def missed(scene: Scene, shot, picture, margin: float = 0.0) -> np.ndarray:
     """How far [px] the plain arithmetic of a reader is from the ground that the RPC sees in a picture, by PROJ."""
-    pyproj = pytest.importorskip("pyproj")
-    to_ecef = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
     rng, (col, row, width, height) = np.random.default_rng(5), picture.window
     image = rng.uniform([col, row], [col + width - 1, row + height - 1], (4000, 2))
     alt = rng.uniform(*scene.alt_range, 4000)
-    ecef = np.column_stack(to_ecef.transform(*shot.rpc.localize(image, alt).T[:2], alt))
-    matrix = np.linalg.inv(scene.world_to_ecef)
-    x, y, z = ((ecef @ matrix[:3, :3].T + matrix[:3, 3]) @ picture.pinhole.rotation.T + picture.pinhole.translation).T
+    matrix, at = np.linalg.inv(scene.world_to_ecef), ecef(*shot.rpc.localize(image, alt).T[:2], alt)
+    x, y, z = ((at @ matrix[:3, :3].T + matrix[:3, 3]) @ picture.pinhole.rotation.T + picture.pinhole.translation).T
     (fx, fy), (w, h) = picture.pinhole.focal, picture.size
     assert fx == fy  # square
     shown = np.column_stack([fx * x / z + w / 2, fx * y / z + h / 2])
@@ -153,8 +146,8 @@ def missed(scene: Scene, shot, picture, margin: float = 0.0) -> np.ndarray:
     return np.linalg.norm(back[:, :2] / back[:, 2:] - 0.5 - image, axis=1)
 
 
-def test_a_central_camera_misses_what_it_says_and_parts_as_much_less_as_they_are_smaller(scenes):
-    for scene in scenes:
+def test_a_central_camera_misses_what_it_says_and_parts_as_much_less_as_they_are_smaller(south, dateline):
+    for scene in (south, dateline):
         for shot in scene.shots:
             errors = []
             for window in ((0, 0, 900, 700), (450, 0, 450, 350)):
@@ -165,16 +158,16 @@ def test_a_central_camera_misses_what_it_says_and_parts_as_much_less_as_they_are
             assert errors[1] < 0.6 * errors[0]
 
 
-def test_the_centre_is_above_the_ground_and_the_picture_keeps_the_axes_of_the_image(scenes):
-    for shot in scenes[0].shots:
-        picture = pinholes.central_picture(scenes[0], shot, (100, 50, 300, 200))
+def test_the_centre_is_above_the_ground_and_the_picture_keeps_the_axes_of_the_image(south):
+    for shot in south.shots:
+        picture = pinholes.central_picture(south, shot, (100, 50, 300, 200))
         assert -picture.pinhole.rotation.T[2] @ picture.pinhole.translation > 300e3
         assert picture.homography[:2, :2] == pytest.approx(np.eye(2), abs=0.1)
         assert np.array(picture.size) == pytest.approx([300, 200], rel=0.1)
 
 
-def test_an_image_that_shows_the_ground_mirrored_gets_a_picture_that_does_not(scenes):
-    scene, shot = scenes[0], scenes[0].shots[0]
+def test_an_image_that_shows_the_ground_mirrored_gets_a_picture_that_does_not(south):
+    scene, shot = south, south.shots[0]
     mirrored = replace(shot, rpc=replace(shot.rpc, image_scale=shot.rpc.image_scale * [1, -1]))
     picture = pinholes.central_picture(scene, mirrored, (0, 0, 900, 700))
     assert np.linalg.det(picture.pinhole.rotation) == pytest.approx(1.0)
@@ -182,8 +175,8 @@ def test_an_image_that_shows_the_ground_mirrored_gets_a_picture_that_does_not(sc
     assert missed(scene, mirrored, picture).max() < 1.05 * picture.error < 0.2
 
 
-def test_parts_are_the_fewest_that_stay_within_the_tolerance(scenes):
-    scene, shot = scenes[0], scenes[0].shots[0]
+def test_parts_are_the_fewest_that_stay_within_the_tolerance(south):
+    scene, shot = south, south.shots[0]
     for tolerance, most in ((0.2, 1), (0.1, 4)):
         pictures = pinholes.pictures_of(scene, shot, tolerance)
         assert len(pictures) <= most

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,31 +15,19 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef, metres_per_unit
-from barpc.base.manifest import Layer
-from barpc.base.sealed import Sealed
 from barpc.base.verb_options import ExportOptions
 from barpc.export import files as made_of
 from barpc.export import pinholes
-from barpc.export import shots as scene
 from barpc.export.colmap import colmap
 from barpc.export.light import UnknownTimeError, dated
 from barpc.export.shots import Scene, pairs_of, read_scene, relative_link
-from barpc.rpcio import read_rpc
+from barpc.rpcio import CARRIERS, read_rpc
 from barpc.sensor.centers import camera_center
 from barpc.sensor.sampler import Sample, image_grid
+from tests.export.conftest import changed, posed, table
 
 OUT = Path("/elsewhere/out")
 HOW = ExportOptions()
-
-
-@pytest.fixture(scope="module")
-def south(southern) -> Scene:
-    return read_scene(southern)
-
-
-@pytest.fixture(scope="module")
-def dateline(on_date_line) -> Scene:
-    return read_scene(on_date_line)
 
 
 def with_shot(of: Scene, **fields: Any) -> Scene:
@@ -59,29 +46,34 @@ def with_summary(south: Scene, **values: Any) -> Scene:
 
 
 def test_a_scene_holds_what_counts_of_its_run(south, southern):
-    lines = [line.split(",") for line in (southern / "tables/observations.csv").read_text().splitlines()[1:]]
-    table = np.loadtxt(southern / "tables/residuals.csv", delimiter=",", skiprows=1)
+    lines = [line.split(",") for line in table(southern, "observations")[1:]]
+    places = np.loadtxt(table(southern, "residuals"), delimiter=",", skiprows=1)[:, :3]
     for shot in south.shots:
         rows = [line for line in lines if line[0] == shot.name and line[8] == "1"]
         assert south.tracks[shot.index].tolist() == [int(row[1]) for row in rows]
         assert shot.xy == pytest.approx(np.array([[float(row[2]), float(row[3])] for row in rows]))
         assert shot.size == (900, 700)
-    assert south.points == pytest.approx(table[:, :3])
+    assert south.points == pytest.approx(places)
     used = [line for line in lines if line[8] == "1"]
     left = np.array([[float(row[6]), float(row[7])] for row in used])
     free = left.size - 3 * len({row[1] for row in used})
     assert south.noise == pytest.approx(np.sqrt((left**2).sum() / free))
 
 
-def test_altitudes_reach_a_margin_beyond_all_but_half_a_per_cent(south):
+def test_altitudes_reach_a_margin_beyond_all_but_half_a_per_cent(southern, south, tmp_path):
     low, high = np.percentile(south.points[:, 2], [0.5, 99.5])
     margin = 20.0 + 0.1 * (high - low)
     assert south.alt_range == (np.floor(low - margin), np.ceil(high + margin))
-    assert scene._scene_altitudes(np.array([100.0, 100.0]), south.summary) == (80.0, 120.0)
-    wide = tuple(
-        replace(view, alt_range_m=(10.0 * k - 50, 10.0 * k + 500)) for k, view in enumerate(south.summary.views)
-    )
-    assert scene._scene_altitudes(np.zeros(0), replace(south.summary, views=wide)) == (-50.0, 520.0)
+    head, first, *_ = table(southern, "residuals")
+    cells = first.split(",")
+    level = [",".join([*cells[:2], "100.0", *cells[3:-1], track]) for track in "01"]
+
+    def apart(summary: dict[str, Any]) -> None:
+        for k, view in enumerate(summary["views"]):
+            view["alt_range_m"] = [10.0 * k - 50, 10.0 * k + 500]
+
+    assert read_scene(changed(southern, tmp_path / "two", residuals=[head, *level])).alt_range == (80.0, 120.0)
+    assert read_scene(changed(southern, tmp_path / "none", apart, residuals=[head])).alt_range == (-50.0, 520.0)
 
 
 def test_the_origin_is_in_the_middle_of_the_tie_points(south, dateline):
@@ -167,20 +159,24 @@ def test_pairs_for_stereo_have_an_angle_between_two_and_fifty_degrees(south):
     assert pairs(1.0, None) == [("A", "B"), ("A", "C")]  # better than none
 
 
-def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, south, tmp_path):
-    image = south.summary.views[0].name
-    names = [f"{image}{end}" for row in scene.CARRIERS.values() for end in row.suffixes]
-    for name in names:
-        (tmp_path / name).write_text("x")
-    listed = dict.fromkeys(names, hashlib.sha256(b"x").hexdigest())
-    run = replace(south.run, sealed=Sealed(tmp_path, "", [Layer("", listed)], {}, tmp_path, {}))
-    assert scene._carrier(run, image, {"x"}) is None  # the run says nothing of it
-    for name in names:
-        assert scene._carrier(run, image, {name}) == tmp_path / name
-        (tmp_path / name).unlink()
-    (tmp_path.parent / "outside.vrt").write_text("x")
-    (tmp_path / names[0]).symlink_to(tmp_path.parent / "outside.vrt")
-    assert scene._carrier(run, image, {names[0]}) is None
+def test_the_run_s_raster_with_the_rpc_in_it_goes_before_the_image(southern, tmp_path):
+    names = [f"view_0000{end}" for row in CARRIERS.values() for end in row.suffixes]
+
+    def carrier(folder: str, *said: str, there: Sequence[str] = names) -> Path | None:
+        def write(summary: dict[str, Any]) -> None:
+            summary["views"][0]["outputs"] |= {name: {} for name in said}
+            for name in there:
+                (tmp_path / folder / "run" / name).write_text("x")
+            if not there:
+                (tmp_path / folder / "outside.vrt").write_text("x")
+                (tmp_path / folder / "run" / names[0]).symlink_to("../outside.vrt")
+
+        return read_scene(changed(southern, tmp_path / folder, write)).shots[0].carrier
+
+    assert carrier("unsaid") is None  # the run says nothing of it
+    for k, name in enumerate(names):
+        assert carrier(f"run {k}", *names[k:]) == tmp_path / f"run {k}/run" / name
+    assert carrier("linked", names[0], there=()) is None
 
 
 # --- for renderers ----------------------------------------------------------------------------------------
@@ -228,59 +224,35 @@ def test_a_camera_that_shows_the_ground_mirrored_is_no_pinhole(south, sign):
         pinholes.pinhole_of(of, of.shots[0])
 
 
-@pytest.fixture(scope="module")
-def model(south) -> tuple[Scene, dict[str, list[str]], dict[str, Any]]:
-    """COLMAP's texts of the scene, its lines by file."""
+def test_colmap_s_texts_hold_the_scene(south, tmp_path):
     of = replace(south, shots=tuple(replace(shot, file=f"/images/{k}.tif") for k, shot in enumerate(south.shots)))
-    files = colmap(of, OUT, ExportOptions(exact=True))
-    texts = {f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")}
-    assert set(files) == texts | {"sparse/0/points3D.ply", "transforms.json", "world.json"}
-    del files["sparse/0/points3D.ply"]
-    files = {name.removeprefix("sparse/0/"): data for name, data in files.items()}
-    return (
-        of,
-        {name: data.decode().split("\n")[:-1] for name, data in files.items()},
-        json.loads(files["world.json"]),
-    )
-
-
-def turned(quaternion: list[float]) -> np.ndarray:
-    w, x, y, z = quaternion
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-
-
-def test_colmap_s_texts_hold_the_scene(model):
-    of, texts, about = model
+    files, texts = colmap(of, OUT, ExportOptions(exact=True)), ("cameras", "images", "points3D")
+    assert set(files) == {f"sparse/0/{name}.txt" for name in texts} | {
+        "sparse/0/points3D.ply", "transforms.json", "world.json",
+    }  # fmt: skip
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    for name in texts:
+        (tmp_path / f"sparse/0/{name}.txt").write_bytes(files[f"sparse/0/{name}.txt"])
+    about, rows = json.loads(files["world.json"]), (tmp_path / "sparse/0/points3D.txt").read_text().splitlines()
     points = {}
     world = of.world(of.points)
-    for line in texts["points3D.txt"]:
+    for line in rows:
         number, *rest = line.split()
         points[int(number)] = np.array(rest[:3], float)
         assert rest[3:6] == ["128"] * 3
         assert points[int(number)] == pytest.approx(world[int(number) - 1])
     assert list(points) == sorted(points)
     errors: dict[int, list[float]] = {number: [] for number in points}
-    for k, shot in enumerate(of.shots):
-        number, kind, width, height, *numbers = texts["cameras.txt"][k].split()
-        assert (number, kind, width, height) == (str(k + 1), "PINHOLE", "900", "700")
-        fx, fy, cx, cy = map(float, numbers)
-        head = texts["images.txt"][2 * k].split()
-        assert (head[0], head[8], head[9]) == (str(k + 1), str(k + 1), f"{k}.tif")
-        assert float(head[1]) >= 0
-        rotation, move = turned([float(word) for word in head[1:5]]), np.array(head[5:8], float)
-        places = np.array(texts["images.txt"][2 * k + 1].split(), float).reshape(-1, 3)
-        assert places[:, :2] == pytest.approx(shot.xy + 0.5)
-        assert places[:, 2].astype(int).tolist() == (shot.index + 1).tolist()
-        seen = np.array([points[int(n)] for n in places[:, 2]]) @ rotation.T + move
-        off = np.hypot(*(seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy] - places[:, :2]).T)
+    for k, (shot, image) in enumerate(zip(of.shots, posed(tmp_path), strict=True)):
+        assert (image.number, image.camera, image.name, image.size) == (k + 1, k + 1, f"{k}.tif", (900, 700))
+        numbers = image.places[:, 2].astype(int).tolist()
+        assert image.places[:, :2] == pytest.approx(shot.xy + 0.5)
+        assert numbers == (shot.index + 1).tolist()
+        off = np.hypot(*(image.project(np.array([points[n] for n in numbers])) - image.places[:, :2]).T)
         assert np.median(off) < 0.4
-        for n, error in zip(places[:, 2].astype(int), off, strict=True):
+        for n, error in zip(numbers, off, strict=True):
             errors[n].append(error)
-    for line in texts["points3D.txt"]:
+    for line in rows:
         words = line.split()
         assert float(words[7]) == pytest.approx(np.mean(errors[int(words[0])]), abs=1e-6)
         track = [(int(a) - 1, int(b)) for a, b in zip(words[8::2], words[9::2], strict=True)]
@@ -448,20 +420,19 @@ def test_points_are_written_with_their_covariance(south):
 
 @pytest.mark.parametrize(
     ("tracks", "noise"),
-    [([0, 0, 1, 1], 1.0), ([0, 0, 0, 0], np.sqrt(8 * 0.25 / 5)), ([0, 0, 1, 2], np.nan)],
+    [
+        ([0, 0, 1, 1, 1], 1.0),
+        ([0, 0, 0, 0, 0], np.sqrt(8 * 0.25 / 5)),
+        ([0, 0, 1, 2, 2], np.nan),
+        ([0, 0, 1], np.nan),  # none to spare
+        ([], np.nan),
+    ],
 )
-def test_noise_is_what_is_left_over_the_observations_that_points_did_not_take(tracks, noise):
-    after = np.full((5, 2), 0.5)
-    after[4] = np.nan
-    observed = SimpleNamespace(after=after, track=np.array([*tracks, tracks[-1]]))
-    found = scene._noise(SimpleNamespace(observations=observed), np.arange(5))
-    np.testing.assert_allclose(found, noise)
-
-
-def test_nothing_is_known_of_noise_without_observations_to_spare():
-    observed = SimpleNamespace(after=np.full((3, 2), 0.5), track=np.array([0, 0, 1]))
-    assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.arange(3)))
-    assert np.isnan(scene._noise(SimpleNamespace(observations=observed), np.zeros(0, int)))
+def test_noise_is_what_is_left_over_the_observations_that_points_did_not_take(southern, tmp_path, tracks, noise):
+    """Where an observation has no residual, as the fifth, it is none."""
+    left = [f"view_000{k % 3},{track},1,2,0,0,{',' if k == 4 else '0.5,-0.5'},1" for k, track in enumerate(tracks)]
+    run = changed(southern, tmp_path, observations=[table(southern, "observations")[0], *left])
+    np.testing.assert_allclose(read_scene(run).noise, noise)
 
 
 def test_stereo_is_made_of_images_without_reservation_that_share_thirty_matches(south):

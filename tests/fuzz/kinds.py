@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from .mutate import Mutate
@@ -35,3 +37,13 @@ class Sample:
     mutations: tuple[Mutate, ...] = ()
     beside: Callable[[Path], object] = lambda folder: None
     share: float = 1.0
+
+
+def bytes_of(write: Callable[[Path], Path]) -> Callable[[], bytes]:
+    """The bytes of a file that is written into a folder and named, once a process."""
+
+    def made() -> bytes:
+        with tempfile.TemporaryDirectory() as folder:
+            return write(Path(folder)).read_bytes()
+
+    return cache(made)

@@ -25,25 +25,7 @@ WORDS = (
     "\x1b[31m", "x" * 3000,
     "=1+1", "#", '"', "'", "\\", "%s", "{}", "a__b", "2021-02-30T00:00:00", "NaT", "\x00", "1 2 3", "a.b", "-",
 )  # fmt: skip
-MARKS = (
-    b"\x00",
-    b"<",
-    b">",
-    b"&",
-    b'"',
-    b"(",
-    b")",
-    b"[",
-    b"]",
-    b"{",
-    b"}",
-    b",",
-    b"\n",
-    b": ",
-    b"=",
-    b"\xff",
-    b"\xef\xbb\xbf",
-)
+MARKS = (b"\x00", *(mark.encode() for mark in '<>&"()[]{},\n'), b": ", b"=", b"\xff", b"\xef\xbb\xbf")
 VALUES = (
     None, True, False, 0, -1, 1, 2, 1.0, 1.5, -0.0, 1e-300, 1e15, 1e99, -1e99, 10**17, 10**18, 10**400, -(2**63) - 1,
     float("nan"), float("inf"), "", "a", "x" * 3000, "\x00\n\x1b", "\ud800", "../../x", "nan", "1e5", [], {}, [[]],
@@ -113,14 +95,20 @@ def mutate_text(data: bytes, rng: Rng) -> bytes:
     return text.encode("utf-8", "surrogateescape")
 
 
+def _somewhere(tree: list, rng: Rng, deeper: float) -> tuple:
+    """A list or dictionary of a tree, and a place in it; each level is gone into with a probability."""
+    holder, key = tree, 0
+    while rng.random() < deeper and isinstance(holder[key], (dict, list)) and holder[key]:
+        holder = holder[key]
+        key = pick(rng, list(holder)) if isinstance(holder, dict) else int(rng.integers(len(holder)))
+    return holder, key
+
+
 def mutate_json(data: bytes, rng: Rng) -> bytes:
     """Values of other types and sizes, keys missing, doubled and unknown, lists of other lengths, deep nesting."""
     tree = [json.loads(data)]
     for _ in range(rng.integers(1, 4)):
-        holder, key = tree, 0
-        while rng.random() < 0.93 and isinstance(holder[key], (dict, list)) and holder[key]:
-            holder = holder[key]
-            key = pick(rng, list(holder)) if isinstance(holder, dict) else int(rng.integers(len(holder)))
+        holder, key = _somewhere(tree, rng, 0.93)
         match rng.integers(0, 8):
             case 0 if holder is not tree:
                 del holder[key]
@@ -147,10 +135,7 @@ def mutate_values(data: bytes, rng: Rng) -> bytes:
     """JSON whose values have the types they should and other sizes; nothing where nothing may be; lists shorter."""
     tree = [json.loads(data)]
     for _ in range(rng.integers(1, 4)):
-        holder, key = tree, 0
-        while rng.random() < 0.97 and isinstance(holder[key], (dict, list)) and holder[key]:
-            holder = holder[key]
-            key = pick(rng, list(holder)) if isinstance(holder, dict) else int(rng.integers(len(holder)))
+        holder, key = _somewhere(tree, rng, 0.97)
         value = holder[key]
         if isinstance(value, list) and value and len(value) not in (2, 3, 7):
             holder[key] = value[:: int(rng.integers(1, 4)) * (-1) ** int(rng.integers(2))][

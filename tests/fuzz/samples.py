@@ -43,6 +43,7 @@ from barpc.rpcio.grids import read_correction
 from barpc.rpcio.images import put_tag
 from barpc.rpcio.text import ReadOptions, decode_text
 from barpc.scene import View
+from barpc.sensor import SensorModel
 from barpc.sensor.direct_grid import DirectGrid
 from barpc.sensor.linescan import read_linescan
 from barpc.sensor.sentinel1 import open_product
@@ -65,19 +66,12 @@ from tests.sensor.s1_product import Product
 from tests.sensor.spot_files import Scene
 
 from .ends import mutate_npz_ends
-from .kinds import Sample
-from .mutate import (
-    Mutate,
-    mutate_header,
-    mutate_json,
-    mutate_npz,
-    mutate_text,
-    mutate_values,
-    mutate_xml,
-)  # fmt: skip
+from .kinds import Sample, bytes_of
+from .mutate import Mutate, mutate_header, mutate_json, mutate_npz, mutate_text, mutate_values, mutate_xml
 from .used import USED
 
 NAMES = ("left", "right")
+TEXT, ARRAYS = (mutate_text,), (mutate_npz, mutate_npz_ends)
 
 
 # --- RPC files --------------------------------------------------------------------------------------------
@@ -118,19 +112,13 @@ _XML = ("xml", "dimap", "enmap", "gdal")
 
 def _rpc_sample(kind: str) -> Sample:
     row = kind.split(" ", maxsplit=1)[0]
-    mutations = (
-        (mutate_xml, mutate_text) if row in _XML else (mutate_json, mutate_text) if row == "json" else (mutate_text,)
-    )
-    name = f"scene.{row}"
-    return Sample(name, partial(_read_format, kind=row), lambda: TEXTS[kind]().encode(), mutations)
+    mutations = ((mutate_xml,) if row in _XML else (mutate_json,) if row == "json" else ()) + TEXT
+    return Sample(f"scene.{row}", partial(_read_format, kind=row), lambda: TEXTS[kind]().encode(), mutations)
 
 
-@cache
-def _tiff() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        image = write_image(Path(folder) / "a.tif", shape=(1, 2, 2))
-        write_rpc_copy(make_rpc(), image, Path(folder) / "b.tif")
-        return (Path(folder) / "b.tif").read_bytes()
+def _tiff(folder: Path) -> Path:
+    write_rpc_copy(make_rpc(), write_image(folder / "a.tif", shape=(1, 2, 2)), folder / "b.tif")
+    return folder / "b.tif"
 
 
 def _nitf() -> bytes:
@@ -191,9 +179,7 @@ def _localisation(transform: rasterio.Affine | None = None, rng: np.random.Gener
 
 
 def _use_dem(path: Path) -> object:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return Dem.open(path)([5.05, 5.051, -170.0, np.nan], [43.95, 43.951, 80.0, 44.0])
+    return Dem.open(path)([5.05, 5.051, -170.0, np.nan], [43.95, 43.951, 80.0, 44.0])
 
 
 def _use_grid(path: Path) -> object:
@@ -241,12 +227,6 @@ def _npz(**arrays: object) -> bytes:
     file = io.BytesIO()
     np.savez(file, **arrays)
     return file.getvalue()
-
-
-@cache
-def _database() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        return colmap(Path(folder)).read_bytes()
 
 
 def _prior() -> bytes:
@@ -351,11 +331,12 @@ def _safe() -> bytes:
     return file.getvalue()
 
 
+def _shown(camera: SensorModel) -> object:
+    return camera.project(camera.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+
+
 def _use_product(path: Path, **options: object) -> object:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        radar = open_product(path, **options)
-        return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+    return _shown(open_product(path, **options))
 
 
 def _use_orbit(path: Path) -> object:
@@ -367,8 +348,7 @@ def _beside_orbit(folder: Path) -> None:
 
 
 def _use_sicd(path: Path) -> object:
-    radar = open_sicd(path)
-    return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+    return _shown(open_sicd(path))
 
 
 def _sicd() -> bytes:
@@ -379,17 +359,12 @@ def _sicd() -> bytes:
     return text.replace(' xmlns="urn:SICD:1.2.1"', "").encode()
 
 
-@cache
-def _sicd_nitf() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        return nitf(document("PFA"), Path(folder) / "image.ntf").read_bytes()
+def _sicd_nitf(folder: Path) -> Path:
+    return nitf(document("PFA"), folder / "image.ntf")
 
 
 def _use_terrasar(path: Path) -> object:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        radar = open_terrasar(path)
-        return radar.project(radar.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+    return _shown(open_terrasar(path))
 
 
 def _use_georef(path: Path) -> object:
@@ -418,8 +393,7 @@ _FLIGHT = Flight(size=(200, 1500))
 
 
 def _use_linescan(path: Path) -> object:
-    camera = read_linescan(path).model
-    return camera.project(camera.localize(np.array([[100.0, 20.0]]), np.array([100.0])))
+    return _shown(read_linescan(path).model)
 
 
 # --- lists and tables -------------------------------------------------------------------------------------
@@ -456,17 +430,35 @@ CSV_GCPS = (
 )
 
 
+def _gcps(path: Path) -> object:
+    return read_gcps(path, NAMES)
+
+
+def _matches(path: Path) -> object:
+    return read_matches(path, NAMES)
+
+
+def _of(name: str, read: Callable[[Path], object], data: bytes, mutations: tuple[Mutate, ...] = TEXT) -> Sample:
+    return Sample(name, read, lambda: data, mutations)
+
+
 def _gcp_sample(name: str, text: str) -> Sample:
-    data = text.encode()
-    damage = {"<": (mutate_xml, mutate_text), "{": (mutate_json,)}.get(text[0], (mutate_text,))
-    return Sample(name, lambda path: read_gcps(path, NAMES), lambda: data, damage)
+    return _of(name, _gcps, text.encode(), {"<": (mutate_xml, mutate_text), "{": (mutate_json,)}.get(text[0], TEXT))
 
 
 MATCHES = b"image,col,row,track,sigma\nleft,1.5,2.5,0,0.5\nright,3,4,0,0.5\nleft,7,8,b,1\nright.tif,9,1e1,b,1\n"
+TABLE_OF_MATCHES = {
+    "names": np.array(NAMES),
+    "view": np.array([0, 1]),
+    "track": np.zeros(2, int),
+    "xy": np.ones((2, 2)),
+}
+PAIR = {"keypoints0": np.eye(2), "keypoints1": 9 * np.eye(2), "matches": np.array([[0, 1], [1, 0]])}
 POINTS = (
     b'{"type": "FeatureCollection", "features": [{"geometry": {"coordinates": [5.4, 43.2, 1]},'
     b' "properties": {"ji": [1, 2]}}]}'
 )
+LIGHT = b"<X><IMAGING_DATE>2013-04-17</IMAGING_DATE><SUN_ELEVATION>5e1</SUN_ELEVATION></X>"
 
 
 def _read_layer(path: Path) -> object:
@@ -474,119 +466,60 @@ def _read_layer(path: Path) -> object:
     return read_gcps(path if path.suffix == ".gpkg" else path.with_suffix(".shp"), ["left"])
 
 
-def _beside_shapefile(folder: Path) -> None:
-    shapefile_of(folder, rows=3)
-
-
-@cache
-def _of_shapefile(name: str) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        _beside_shapefile(Path(folder))
-        return (Path(folder) / name).read_bytes()
-
-
-@cache
-def _calibration() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        return calibration_of(Path(folder) / "a.cal").read_bytes()
+def _of_shapefile(end: str, *mutations: Mutate) -> Sample:
+    data = bytes_of(lambda folder: shapefile_of(folder, rows=3).with_suffix(end))
+    return Sample(f"left{end}", _read_layer, data, mutations, partial(shapefile_of, rows=3))
 
 
 SAMPLES: dict[str, Sample] = {
     **{f"rpc {kind}": _rpc_sample(kind) for kind in TEXTS},
-    "rpc tag": Sample("b.tif", read_rpc, _tiff, (mutate_header,)),
-    "rpc nitf": Sample("b.ntf", read_rpc, cache(_nitf), (mutate_text,)),
-    "options": Sample("run.toml", read_options, lambda: OPTIONS, (mutate_text,)),
-    "gcps": Sample("a.gcp", lambda path: read_gcps(path, NAMES), lambda: ASP_GCPS, (mutate_text,)),
-    "gcps csv": Sample("a.csv", lambda path: read_gcps(path, NAMES), lambda: CSV_GCPS, (mutate_text,)),
-    "gcps json": Sample("a.geojson", lambda path: read_gcps(path, NAMES), lambda: GCPS, (mutate_json,)),
+    "rpc tag": Sample("b.tif", read_rpc, bytes_of(_tiff), (mutate_header,)),
+    "rpc nitf": Sample("b.ntf", read_rpc, cache(_nitf), TEXT),
+    "options": _of("run.toml", read_options, OPTIONS),
+    "gcps": _of("a.gcp", _gcps, ASP_GCPS),
+    "gcps csv": _of("a.csv", _gcps, CSV_GCPS),
+    "gcps json": _of("a.geojson", _gcps, GCPS, (mutate_json,)),
     **{f"gcps {kind}": _gcp_sample(*row) for kind, row in GCP_FILES.items()},
     "gcps geopackage": Sample("a.gpkg", _read_layer, geopackage_of, share=0.3),
-    "gcps shp": Sample("left.shp", _read_layer, lambda: _of_shapefile("left.shp"), (), _beside_shapefile),
-    "gcps dbf": Sample("left.dbf", _read_layer, lambda: _of_shapefile("left.dbf"), (), _beside_shapefile),
-    "gcps prj": Sample("left.prj", _read_layer, lambda: _of_shapefile("left.prj"), (mutate_text,), _beside_shapefile),
-    "calibration": Sample("a.cal", read_calibration, _calibration, (mutate_json,), share=0.3),
-    "matches csv": Sample("t.csv", lambda path: read_matches(path, NAMES), lambda: MATCHES, (mutate_text,)),
-    "matches npz": Sample(
-        "t.npz",
-        lambda path: read_matches(path, NAMES),
-        lambda: _npz(names=np.array(NAMES), view=np.array([0, 1]), track=np.array([0, 0]), xy=np.ones((2, 2))),
-        (mutate_npz, mutate_npz_ends),
+    "gcps shp": _of_shapefile(".shp"),
+    "gcps dbf": _of_shapefile(".dbf"),
+    "gcps prj": _of_shapefile(".prj", mutate_text),
+    "calibration": Sample(
+        "a.cal", read_calibration, bytes_of(lambda folder: calibration_of(folder / "a.cal")), (mutate_json,), share=0.3
     ),
-    "matches asp": Sample(
-        "run-left__right.txt",
-        lambda path: read_matches(path, NAMES),
-        lambda: b"2 2\n1 2 0 0\n3 4 0 0\n5 6 0 0\n7 8 0 0\n",
-        (mutate_text,),
-    ),
-    "matches asp binary": Sample(
-        "run-left__right.match",
-        lambda path: read_matches(path, NAMES),
-        lambda: binary(np.eye(2), 9 * np.eye(2), 2),
-        (mutate_header,),
-    ),
-    "matches colmap": Sample("t.db", lambda path: read_matches(path, ["a", "b"]), _database, (mutate_header,)),
-    "matches dictionary": Sample(
-        "left__right.npz",
-        lambda path: read_matches(path, NAMES),
-        lambda: _npz(keypoints0=np.eye(2), keypoints1=9 * np.eye(2), matches=np.array([[0, 1], [1, 0]])),
-        (mutate_npz, mutate_npz_ends),
-    ),
-    "points csv": Sample(
-        "p.csv",
-        read_correspondences,
-        lambda: b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5,43.3,101,3,4\n",
-        (mutate_text,),
-    ),
-    "points json": Sample("p.json", read_correspondences, lambda: POINTS, (mutate_json,)),
+    "matches csv": _of("t.csv", _matches, MATCHES),
+    "matches npz": Sample("t.npz", _matches, partial(_npz, **TABLE_OF_MATCHES), ARRAYS),
+    "matches asp": _of("run-left__right.txt", _matches, b"2 2\n1 2 0 0\n3 4 0 0\n5 6 0 0\n7 8 0 0\n"),
+    "matches asp binary": _of("run-left__right.match", _matches, binary(np.eye(2), 9 * np.eye(2), 2), (mutate_header,)),
+    "matches colmap": Sample("t.db", lambda path: read_matches(path, ["a", "b"]), bytes_of(colmap), (mutate_header,)),
+    "matches dictionary": Sample("left__right.npz", _matches, partial(_npz, **PAIR), ARRAYS),
+    "points csv": _of("p.csv", read_correspondences, b"lon,lat,alt,col,row\n5.4,43.2,100,1,2\n5.5,43.3,101,3,4\n"),
+    "points json": _of("p.json", read_correspondences, POINTS, (mutate_json,)),
     "points npz": Sample(
-        "p.npz",
-        read_correspondences,
-        lambda: _npz(ground=np.ones((3, 3)), image=np.ones((3, 2))),
-        (mutate_npz, mutate_npz_ends),
+        "p.npz", read_correspondences, partial(_npz, ground=np.ones((3, 3)), image=np.ones((3, 2))), ARRAYS
     ),
-    "points of a verb": Sample(
+    "points of a verb": _of(
         "p.txt",
         lambda path: given_points((), str(path), ("lon", "lat", "alt"), 0.0),
-        lambda: b"lon,lat,alt\n5.4,43.2,100\n5.5,43.3\n",
-        (mutate_text,),
+        b"lon,lat,alt\n5.4,43.2,100\n5.5,43.3\n",
     ),
-    "pairs": Sample(
-        "pairs.txt",
-        lambda path: read_pairs(path, _views()),
-        lambda: b"# two\nleft right\n'left.tif' \"right.tif\"\n",
-        (mutate_text,),
+    "pairs": _of(
+        "pairs.txt", lambda path: read_pairs(path, _views()), b"# two\nleft right\n'left.tif' \"right.tif\"\n"
     ),
-    "images": Sample(
-        "list.txt",
-        lambda path: image_paths((), str(path), keep_going=True),
-        lambda: b"left.tif\n# x\nright.tif\n",
-        (mutate_text,),
-    ),
-    "metadata": Sample(
-        "product.xml",
-        lambda path: read_acquisition("image.tif", str(path)),
-        lambda: b"<X><IMAGING_DATE>2013-04-17</IMAGING_DATE><SUN_ELEVATION>5e1</SUN_ELEVATION></X>",
-        (mutate_text,),
-    ),
-    "area": Sample("aoi.geojson", read_area, lambda: AREA, (mutate_json,)),
+    "images": _of("list.txt", lambda path: image_paths((), str(path), keep_going=True), b"left.tif\n# x\nright.tif\n"),
+    "metadata": _of("product.xml", lambda path: read_acquisition("image.tif", str(path)), LIGHT),
+    "area": _of("aoi.geojson", read_area, AREA, (mutate_json,)),
     "dem": Sample("dem.tif", _use_dem, _dem, (_mutate_transform(_dem), mutate_header), share=0.2),
     "dem hgt": Sample("N43E005.hgt", _use_dem, cache(lambda: bytes(2 * 1201**2)), (), share=0.02),
     "geoid gtx": Sample("geoid.gtx", _use_dem, _gtx, (mutate_header,)),
     "geoid pgm": Sample("geoid.pgm", _use_dem, _pgm, (mutate_header,)),
     "grid": Sample("nodes.tif", _use_grid, _localisation, (_mutate_transform(_localisation), mutate_header), share=0.2),
     "correction": Sample(
-        "a_correction.tif",
-        _use_correction,
-        _correction,
-        (_mutate_transform(_correction), mutate_header),
-        share=0.2,
+        "a_correction.tif", _use_correction, _correction, (_mutate_transform(_correction), mutate_header), share=0.2
     ),
-    "prior": Sample("block.npz", _use_prior, _prior, (mutate_npz, mutate_npz_ends)),
+    "prior": Sample("block.npz", _use_prior, _prior, ARRAYS),
     "record": Sample(
-        "kept.npz",
-        _use_record,
-        lambda: _npz(**to_arrays((make_rpc(), {"a": [1.5, None]}, np.arange(3)))),
-        (mutate_npz, mutate_npz_ends),
+        "kept.npz", _use_record, lambda: _npz(**to_arrays((make_rpc(), {"a": [1.5, None]}, np.arange(3)))), ARRAYS
     ),
     "summary": _run_sample("summary.json", _report, mutate_json, mutate_values, mutate_values, share=0.6),
     "comparison": _run_sample("summary.json", _compare, mutate_json, mutate_values, mutate_values, share=0.6),
@@ -607,17 +540,12 @@ SAMPLES: dict[str, Sample] = {
     "annotation": Sample(_BURSTS.name, _use_product, lambda: _annotation(_BURSTS), (mutate_xml,), share=0.2),
     "annotation grd": Sample(_GROUND.name, _use_product, lambda: _annotation(_GROUND), (mutate_xml,), share=0.2),
     "sicd": Sample("image.xml", _use_sicd, _sicd, (mutate_xml,), share=0.2),
-    "sicd nitf": Sample("image.ntf", _use_sicd, _sicd_nitf, (), share=0.2),
+    "sicd nitf": Sample("image.ntf", _use_sicd, bytes_of(_sicd_nitf), (), share=0.2),
     "terrasar": Sample(
         terrasar_files.NAME, _use_terrasar, lambda: _terrasar()[0], (mutate_xml,), _beside_main, share=0.2
     ),
     "georef": Sample(
-        "ANNOTATION/GEOREF.xml",
-        _use_georef,
-        lambda: _terrasar()[1],
-        (mutate_xml,),
-        _beside_georef,
-        share=0.2,
+        "ANNOTATION/GEOREF.xml", _use_georef, lambda: _terrasar()[1], (mutate_xml,), _beside_georef, share=0.2
     ),
     "isd": Sample("image.XML", _use_linescan, lambda: isd(_FLIGHT)[0].encode(), (mutate_xml,)),
     "dimap model": Sample("DIM_image.XML", _use_linescan, lambda: dimap(_FLIGHT)[0].encode(), (mutate_xml,)),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import socket
-import tempfile
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
@@ -32,7 +31,7 @@ from tests.pointio.test_foreign import hloc
 from tests.rpcio.conftest import make_rpc, write_image
 
 from .ends import ENDS, bent, mutate_npz_ends
-from .kinds import Sample
+from .kinds import Sample, bytes_of
 from .mutate import Rng, mutate_npz, mutate_text, pick
 
 # --- a small block ----------------------------------------------------------------------------------------
@@ -99,21 +98,21 @@ def _spelt(kind: Any, rule: Rule, rng: Rng) -> str:
     return str(pick(rng, ends_of(rule, kind is int)))
 
 
+def _spelt_table(table: str, record: type, most: int, again: float, rng: Rng) -> bytes:
+    known = declared(record)
+    names = rng.choice(list(known), int(rng.integers(1, most + 1)), replace=again > 0 and rng.random() < again)
+    lines = [f"{name} = {_spelt(known[name].kind, known[name].rule, rng)}" for name in names]
+    return "\n".join([f"[{table}]", *lines, ""]).encode()
+
+
 def mutate_options(_: bytes, rng: Rng) -> bytes:
     """One to four options, each at an end of its range; a key may be there twice."""
-    known = declared(AdjustOptions)
-    names = rng.choice(list(known), int(rng.integers(1, 5)), replace=rng.random() < 0.1)
-    lines = [f"{name} = {_spelt(known[name].kind, known[name].rule, rng)}" for name in names]
-    return "\n".join(["[adjust]", *lines, ""]).encode()
+    return _spelt_table("adjust", AdjustOptions, 4, 0.1, rng)
 
 
 def mutate_fit_options(_: bytes, rng: Rng) -> bytes:
-    """The same of the fit's options."""
-    known = declared(FitOptions)
-    names = rng.choice(list(known), int(rng.integers(1, 4)), replace=False)
-    return "\n".join(
-        ["[fit]", *(f"{name} = {_spelt(known[name].kind, known[name].rule, rng)}" for name in names), ""]
-    ).encode()
+    """One to three of the fit's options."""
+    return _spelt_table("fit", FitOptions, 3, 0.0, rng)
 
 
 def _use_options(path: Path) -> object:
@@ -136,15 +135,9 @@ def _use_fit_options(path: Path) -> object:
 # --- an earlier block -------------------------------------------------------------------------------------
 
 
-@cache
-def _block_file(sparse: bool) -> bytes:
-    block = small_block()
-    found = adjust_tracks(
-        block.views,
-        block.tracks,
-        AdjustOptions(drift=0, model="rotation", solver="sparse" if sparse else "auto"),
-    )
-    prior = block_prior(found)
+def _block_file(folder: Path, sparse: bool) -> Path:
+    block, options = small_block(), AdjustOptions(drift=0, model="rotation", solver="sparse" if sparse else "auto")
+    prior = block_prior(adjust_tracks(block.views, block.tracks, options))
     if sparse:
         from barpc.ba.solving.linear import Blocks
 
@@ -153,9 +146,8 @@ def _block_file(sparse: bool) -> bytes:
             prior.names, prior.model, prior.drift, prior.params, Blocks.of(whole, prior.params.shape[1]), prior.center,
             1e-3 * np.ones((1, prior.params.size)),
         )  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        prior.save(Path(folder) / "block.npz")
-        return (Path(folder) / "block.npz").read_bytes()
+    prior.save(folder / "block.npz")
+    return folder / "block.npz"
 
 
 def _use_block(path: Path) -> object:
@@ -170,17 +162,16 @@ def _use_block(path: Path) -> object:
 # --- HDF5 -------------------------------------------------------------------------------------------------
 
 
-def _hdf5(kind: str) -> bytes:
+def _hdf5(folder: Path, kind: str) -> Path:
     """The matches, and of hloc's the keypoints in the same file."""
     import h5py
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = hloc(Path(folder), kind)
-        if kind == "hloc":
-            with h5py.File(path, "a") as file, h5py.File(path.with_name("feats.h5"), "r") as points:
-                for name in points:
-                    points.copy(name, file)
-        return path.read_bytes()
+    path = hloc(folder, kind)
+    if kind == "hloc":
+        with h5py.File(path, "a") as file, h5py.File(path.with_name("feats.h5"), "r") as points:
+            for name in points:
+                points.copy(name, file)
+    return path
 
 
 def _beside_plain(folder: Path) -> None:
@@ -271,16 +262,13 @@ def _server(_process: int) -> _Server:
     return _Server()
 
 
-@cache
-def _image() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        return write_image(Path(folder) / "a.tif", shape=(1, 2, 2)).read_bytes()
+_image = bytes_of(lambda folder: write_image(folder / "a.tif", shape=(1, 2, 2)))
 
 
-def _answer(status: str = "206 Partial Content") -> bytes:
+def _answer() -> bytes:
     body = _image()
     head = (
-        f'HTTP/1.1 {status}\r\nServer: s\r\nContent-Length: {len(body)}\r\nETag: "one"\r\n'
+        f'HTTP/1.1 206 Partial Content\r\nServer: s\r\nContent-Length: {len(body)}\r\nETag: "one"\r\n'
         f"Content-Range: bytes 0-{len(body) - 1}/{len(body)}\r\nLocation: /answer.http\r\n\r\n"
     )
     return head.encode() + body
@@ -293,29 +281,7 @@ _HEADERS = (
     b"Location: \xff", b"ETag: \x1b[31m", b"ETag: " + b"x" * 70000, b"X: y\r\n" * 200, b" folded", b":", b"\x00",
     b"Content-Length: 5\r\nContent-Length: 6",
 )  # fmt: skip
-_STATUS = (
-    100,
-    101,
-    199,
-    200,
-    204,
-    206,
-    301,
-    302,
-    304,
-    307,
-    308,
-    404,
-    410,
-    416,
-    425,
-    429,
-    500,
-    503,
-    999,
-    0,
-    -1,
-)
+_STATUS = (100, 101, 199, 200, 204, 206, 301, 302, 304, 307, 308, 404, 410, 416, 425, 429, 500, 503, 999, 0, -1)
 
 
 def mutate_answer(data: bytes, rng: Rng) -> bytes:
@@ -394,20 +360,16 @@ USED: dict[str, Sample] = {
         (mutate_fit_options,),
         share=0.1,
     ),
-    "block used": Sample(
-        "block.npz",
-        _use_block,
-        lambda: _block_file(False),
-        (mutate_npz, mutate_npz_ends, mutate_npz_ends),
-        share=0.3,
-    ),
-    "sparse block used": Sample(
-        "block.npz",
-        _use_block,
-        lambda: _block_file(True),
-        (mutate_npz, mutate_npz_ends, mutate_npz_ends),
-        share=0.3,
-    ),
+    **{
+        kind: Sample(
+            "block.npz",
+            _use_block,
+            bytes_of(partial(_block_file, sparse=sparse)),
+            (mutate_npz, mutate_npz_ends, mutate_npz_ends),
+            share=0.3,
+        )
+        for kind, sparse in {"block used": False, "sparse block used": True}.items()
+    },
     "answer": Sample("answer.http", _use_answer, _answer, (mutate_answer,), share=0.3),
 }
 """Kind -> sample."""
@@ -416,7 +378,7 @@ if find_spec("h5py"):
         f"matches {kind}": Sample(
             "t.h5",
             lambda path: read_matches(path, ["a", "b"]),
-            partial(_hdf5, kind),
+            bytes_of(partial(_hdf5, kind=kind)),
             (mutate_hdf5,),
             beside,
             share=0.3,

@@ -9,6 +9,7 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.pointio.correspondences import GROUND_SIGMA, HEIGHT_SIGMA, read_altimetry
+from tests.pointio.conftest import refused
 
 WANTED = [[5.44, 43.25, 120.5], [5.45, 43.26, 130.0]]
 
@@ -67,11 +68,7 @@ def test_accuracies_are_taken_where_they_are_stated(tmp_path: Path):
 def test_what_is_wrong_is_one_line_with_the_file(tmp_path: Path, text: str, told: str):
     file = tmp_path / "a.csv"
     file.write_text(text)
-    with pytest.raises(InputError) as error:
-        read_altimetry(file)
-    assert told in str(error.value)
-    assert str(error.value).startswith(str(file))
-    assert "\n" not in str(error.value)
+    refused(read_altimetry, file, told)
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path):

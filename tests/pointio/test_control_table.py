@@ -5,20 +5,22 @@ Truth is made by GDAL's transformations and by hand; no row is read back from wh
 
 from __future__ import annotations
 
-import codecs
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rasterio.warp import transform
 
-from barpc.base.errors import InputError
 from barpc.pointio.gcps import ControlReference, read_gcps
+from tests.pointio.conftest import refused
+from tests.pointio.test_gcp_formats import ALT, COL, LAT, LON, NO_ALTITUDE, ROW, SAME
 
 VIEWS = ["left", "right.img", "IMG_2021-03 a"]
 FOOT, US_FOOT = 0.3048, 1200 / 3937
+DOS = "\r\n"
 P = {"a": (5.4, 43.3, 240.5), "b": (5.4125, 43.2875, 101.25), "c": (5.3875, 43.3125, 330.0)}
 """Points: lon, lat, alt."""
 SEEN = [("a", 0, 263.25, 889.75), ("a", 1, 12.5, 7.0), ("b", 0, 100.0, 200.5), ("c", 2, 55.5, 66.25)]
@@ -32,32 +34,13 @@ class Case:
 
     text: str
     file: str = "control.csv"
-    encode: Callable[[str], bytes] = str.encode
+    encoding: str = "utf-8"  # "utf-16": as Excel writes it, with its mark
+    newline: str = "\n"
     frame: ControlReference | None = None
     points: dict[str, tuple[float, float, float]] | None = None  # other places than P
     seen: tuple[tuple[str, int, float, float], ...] | None = None  # others than SEEN
     tolerance: float = 1e-9  # deg: a tenth of a millimetre
     flat: bool = False  # no altitudes
-
-
-def utf16(text: str) -> bytes:
-    return text.encode("utf-16")  # as Excel writes it, with its mark
-
-
-def big(text: str) -> bytes:
-    return codecs.BOM_UTF16_BE + text.encode("utf-16-be")
-
-
-def marked(text: str) -> bytes:
-    return codecs.BOM_UTF8 + text.encode()
-
-
-def dos(text: str) -> bytes:
-    return text.replace("\n", "\r\n").encode()
-
-
-def old_mac(text: str) -> bytes:
-    return text.replace("\n", "\r").encode()
 
 
 def rows(template: str, places: dict[str, tuple[float, ...]] = P, names: tuple[str, ...] = NAMED, more: float = 0.0):
@@ -149,15 +132,15 @@ _CSV = "{p},{y},{x},{z},{i},{c},{r}"
 CASES: dict[str, Case] = {
     # --- texts and cells
     "csv, latitude first": Case(_HEAD + rows(_CSV)),
-    "csv, dos": Case(_HEAD + rows(_CSV), encode=dos),
-    "csv, old mac": Case(_HEAD + rows(_CSV), encode=old_mac),
-    "csv, byte order mark": Case(_HEAD + rows(_CSV), encode=marked),
-    "csv, utf-16, tabs": Case((_HEAD + rows(_CSV)).replace(",", "\t"), encode=utf16),
-    "csv, utf-16 of big ends": Case(_HEAD + rows(_CSV), encode=big),
+    "csv, dos": Case(_HEAD + rows(_CSV), newline=DOS),
+    "csv, old mac": Case(_HEAD + rows(_CSV), newline="\r"),
+    "csv, byte order mark, comment at the end": Case(_HEAD + rows(_CSV) + "# the end\n", encoding="utf-8-sig"),
+    "csv, utf-16, tabs": Case((_HEAD + rows(_CSV)).replace(",", "\t"), encoding="utf-16"),
+    "csv, utf-16 of big ends": Case("\ufeff" + _HEAD + rows(_CSV), encoding="utf-16-be"),
     "csv, semicolons and decimal commas": Case(
-        _HEAD.replace(",", ";") + comma(rows("{p};{y};{x};{z};{i};{c};{r}")), encode=dos),
+        _HEAD.replace(",", ";") + comma(rows("{p};{y};{x};{z};{i};{c};{r}")), newline=DOS),
     "csv, tabs and decimal commas, utf-16": Case(
-        _HEAD.replace(",", "\t") + comma(rows("{p}\t{y}\t{x}\t{z}\t{i}\t{c}\t{r}")), encode=utf16),
+        _HEAD.replace(",", "\t") + comma(rows("{p}\t{y}\t{x}\t{z}\t{i}\t{c}\t{r}")), encoding="utf-16"),
     "csv, all quoted": Case(
         '"name","lat","lon","h","image","col","row"\n' + rows('"{p}","{y}","{x}","{z}","{i}","{c}","{r}"')),
     "csv, blanks in columns": Case(
@@ -183,7 +166,8 @@ CASES: dict[str, Case] = {
         "id;lat;lon;alt;img;px;py\n" + dms_rows("{h} {d} {m} {s}", WEST), points=WEST),
     "dms, decimal minutes, south": Case(
         "id;lat;lon;alt;img;px;py\n" + dms_rows("{d}° {mm}' {h}", SOUTH), points=SOUTH),
-    "dms, colons and commas": Case("id;lat;lon;alt;img;px;py\n" + comma(dms_rows("{d}:{m}:{s}{h}", P)), encode=utf16),
+    "dms, colons and commas": Case(
+        "id;lat;lon;alt;img;px;py\n" + comma(dms_rows("{d}:{m}:{s}{h}", P)), encoding="utf-16"),
     # --- reference systems, axes, units
     "utm, a column of codes": Case("p,epsg,X_utm,Y_utm,Z,image,col,row\n".replace("p,", "point,", 1)
                                    + rows("{p},32631,{x!r},{y!r},{z},{i},{c},{r}", UTM)),
@@ -215,8 +199,8 @@ CASES: dict[str, Case] = {
     "2-D csv": Case("name,lon,lat,image,col,row\n" + rows("{p},{x},{y},{i},{c},{r}"), flat=True),
     # --- formats
     "geojson": Case(geojson(), "g.geojson"),
-    "geojson, marked, dos": Case(geojson(), "g.json", encode=lambda text: codecs.BOM_UTF8 + dos(text)),
-    "geojson, utf-16": Case(geojson(), "g.json", encode=utf16),
+    "geojson, marked, dos": Case(geojson(), "g.json", encoding="utf-8-sig", newline=DOS),
+    "geojson, utf-16": Case(geojson(), "g.json", encoding="utf-16"),
     "geojson, 2-D": Case(geojson(size=2), "g.json", flat=True),
     "geojson, map coordinates": Case(geojson(UTM, crs=of_urn("urn:ogc:def:crs:EPSG::32631")), "g.json"),
     "geojson, degrees by a code": Case(geojson(crs=of_urn("EPSG:4326")), "g.json"),
@@ -225,7 +209,7 @@ CASES: dict[str, Case] = {
         json.dumps({"features": [feature(p, v, str(c), str(r), list(P[p])) for p, v, c, r in SEEN]}), "g.json"),  # type: ignore[arg-type]
     "qgis, marked, dos": Case(
         "#CRS: EPSG:4326\nmapX,mapY,sourceX,sourceY,enable,dX,dY,residual\n" + _QGIS + "9,9,9,-9,0,0,0,0\n",
-        "left.points", encode=lambda text: codecs.BOM_UTF8 + dos(text), seen=LEFT, flat=True),
+        "left.points", encoding="utf-8-sig", newline=DOS, seen=LEFT, flat=True),
     "qgis, map coordinates by flag": Case(
         "mapX,mapY,pixelX,pixelY,enable\n"
         + "".join(f"{UTM[p][0]!r},{UTM[p][1]!r},{c + 0.5},{-r - 0.5},1\n" for p, _, c, r in LEFT), "left.tif.points",
@@ -234,43 +218,52 @@ CASES: dict[str, Case] = {
         "EPSG:32631\n# x y z\n" + "".join(
             f"{UTM[p][0]!r}\t{UTM[p][1]!r}\t{UTM[p][2]}\t{c + 0.5}\t{r + 0.5}\t{NAMED[v]}.JPG\t{p}\n"
             for p, v, c, r in SEEN if v < 2), "gcp_list.txt",
-        encode=dos, seen=tuple(row for row in SEEN if row[1] < 2)),
+        newline=DOS, seen=tuple(row for row in SEEN if row[1] < 2)),
     "odm, zone of the south, utf-16": Case(
         "WGS84 UTM 60S\n" + "".join(
             f"{x!r} {y!r} {z} {c + 0.5} {r + 0.5} {NAMED[v]} {p}\n"
             for p, v, c, r in LEFT for x, y, z in (moved("EPSG:32760", SOUTH)[p],)), "gcp_list.txt",
-        encode=utf16, points=SOUTH, seen=LEFT),
+        encoding="utf-16", points=SOUTH, seen=LEFT),
     "odm, names of images with blanks": Case(
         "EPSG:4326\n" + rows("{x} {y} {z} {c} {r} {i} {p}", more=0.5).replace("IMG_2021-03 a", '"IMG_2021-03 a"'),
         "gcp_list.txt"),
     "micmac": Case(micmac(), "g.xml"),
-    "micmac, utf-16": Case(micmac().replace("'1.0'", "'1.0' encoding='utf-16'"), "g.xml", encode=utf16),
+    "micmac, utf-16": Case(micmac().replace("'1.0'", "'1.0' encoding='utf-16'"), "g.xml", encoding="utf-16"),
     "micmac, map coordinates": Case(micmac(UTM), "g.xml", frame=ControlReference("EPSG:32631")),
     "envi, dos": Case(
         "; ENVI Image to Map GCP File\n; projection info = {UTM, 31, North, WGS-84, units=Meters}\n"
         "; Map (x,y), Image (x,y)\n;\n" + "".join(
             f"   {UTM[p][0]!r}  {UTM[p][1]!r}   {c + 1.5}  {r + 1.5}\n" for p, _, c, r in LEFT), "left.pts",
-        encode=dos, seen=LEFT, flat=True),
+        newline=DOS, seen=LEFT, flat=True),
     "envi, utf-16, image first, south": Case(
         "; projection info = {UTM, 60, South, WGS-84, units=Meters}\n; Image (x,y), Map (x,y)\n" + "".join(
             f"{c + 1.5} {r + 1.5} {x!r} {y!r}\n" for p, _, c, r in LEFT
             for x, y, _ in (moved("EPSG:32760", SOUTH)[p],)), "left.pts",
-        encode=utf16, points=SOUTH, seen=LEFT, flat=True),
+        encoding="utf-16", points=SOUTH, seen=LEFT, flat=True),
     "asp": Case("# WKT: any\n" + _ASP, "g.gcp", seen=tuple(row for row in SEEN if row[1] < 2)),
     "asp, dos, marked": Case(
-        _ASP, "g.gcp", encode=lambda text: codecs.BOM_UTF8 + dos(text), seen=tuple(row for row in SEEN if row[1] < 2)),
+        _ASP, "g.gcp", encoding="utf-8-sig", newline=DOS, seen=tuple(row for row in SEEN if row[1] < 2)),
     "metashape": Case(
         "# CoordinateSystem: EPSG:32631\n#Label,Camera,X/Easting,Y/Northing,Z/Altitude,px,py,Error_(m)\n"
         + rows("{p},{i},{x!r},{y!r},{z},{c},{r},0.2", UTM, more=0.5), "markers.csv"),
 }  # fmt: skip
 
 
+CASES |= {
+    f"one point, {name}": Case(
+        text, file, points={"p": (LON, LAT, ALT)}, seen=(("p", 0, COL, ROW),), tolerance=1e-10, flat=name in NO_ALTITUDE
+    )
+    for name, (file, text) in SAME.items()
+}
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_the_points_of_a_file_are_where_they_are(name: str, tmp_path: Path) -> None:
     case = CASES[name]
-    (tmp_path / case.file).write_bytes(case.encode(case.text))
+    (tmp_path / case.file).write_text(case.text, encoding=case.encoding, newline=case.newline)
     found = read_gcps(tmp_path / case.file, VIEWS, case.frame)
     places, seen = case.points or P, case.seen or SEEN
+    np.testing.assert_allclose(found.xy, np.round(found.xy, 6), rtol=0, atol=1e-9)
     got = {
         (int(v), round(float(c), 6), round(float(r), 6)): found.lonlatalt[g]
         for g, v, (c, r) in zip(found.point, found.view, found.xy, strict=True)
@@ -283,6 +276,7 @@ def test_the_points_of_a_file_are_where_they_are(name: str, tmp_path: Path) -> N
         assert abs(got[key][2] - alt) <= 1e-6, key
     assert len(found.names) == len({p for p, *_ in seen})  # seen in two images, a point is one
     assert found.strangers == ()
+    assert ("no altitudes" in "".join(found.said)) == case.flat
     assert all(line.startswith(str(tmp_path)) and "\n" not in line for line in found.said)
 
 
@@ -303,6 +297,4 @@ def test_what_may_mean_two_things_is_refused_in_one_line(text: str, says: str | 
     if says is None:
         assert read_gcps(path, VIEWS).lonlatalt[0, 1] == P["a"][0] + 90
         return
-    with pytest.raises(InputError, match=says) as told:
-        read_gcps(path, VIEWS)
-    assert "\n" not in str(told.value)
+    refused(partial(read_gcps, names=VIEWS), path, says)

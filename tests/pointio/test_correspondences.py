@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from barpc.base.errors import InputError
 from barpc.pointio.correspondences import read_correspondences
+from tests.pointio.conftest import refused
 
 ROWS = np.array([[5.4, 43.2, 100.0, 10.5, 20.25], [5.5, 43.3, 120.5, 11.0, 21.0]])
 
@@ -44,12 +44,7 @@ def test_npz_holds_two_arrays_or_one_a_column(tmp_path: Path) -> None:
 
 def test_geojson_points_carry_their_image_position(tmp_path: Path) -> None:
     features = [
-        {
-            "type": "Feature",
-            "properties": {"ji": row[3:].tolist()},
-            "geometry": {"type": "Point", "coordinates": row[:3].tolist()},
-        }
-        for row in ROWS
+        {"properties": {"ji": row[3:]}, "geometry": {"type": "Point", "coordinates": row[:3]}} for row in ROWS.tolist()
     ]
     path = tmp_path / "points.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
@@ -69,9 +64,7 @@ def test_geojson_points_that_are_no_places_on_wgs84_are_refused(tmp_path: Path, 
     document = {"type": "FeatureCollection", "features": [feature]}
     document |= {"crs": {"properties": {"name": crs}}} if crs else {}
     (tmp_path / "a.geojson").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=says) as told:
-        read_correspondences(tmp_path / "a.geojson")
-    assert "\n" not in str(told.value)
+    refused(read_correspondences, tmp_path / "a.geojson", says)
 
 
 @pytest.mark.parametrize(
@@ -91,12 +84,9 @@ def test_geojson_points_that_are_no_places_on_wgs84_are_refused(tmp_path: Path, 
     ],
 )
 def test_what_is_no_table_is_refused_with_the_reason(tmp_path: Path, name: str, content: bytes, message: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_correspondences(path)
+    (tmp_path / name).write_bytes(content)
+    refused(read_correspondences, tmp_path / name, message)
 
 
 def test_a_file_that_does_not_exist_is_said_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_correspondences(tmp_path / "none.csv")
+    refused(read_correspondences, tmp_path / "none.csv", "no such file")

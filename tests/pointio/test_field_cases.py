@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,35 +9,29 @@ import pytest
 
 from barpc.base.errors import InputError
 from barpc.pointio.gcps import ControlReference, read_gcps
+from tests.pointio.conftest import refused
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
-TRUE = {f["properties"]["id"]: f for f in json.loads((SAMPLES / "gcps.geojson").read_text())["features"]}
-NAMES = ["view_00", "view_01", "view_02"]
+UTM = ControlReference("EPSG:32631", heights="ellipsoidal")
+CASES = {
+    "view_00_utm.points": (None, 0), "qgis.points": (None, 0), "gcp_e_n_xy.csv": (UTM, 6e-3), "gcp_utm.csv": (UTM, 0),
+    "odm_gcp_list.txt": (None, 0), "envi.pts": (None, 0), "gcp_2d.csv": (None, 0),
+}  # fmt: skip
+"""File, what is said of it, and how its altitudes are rounded."""
+FLAT = "view_00_utm.points", "qgis.points", "envi.pts", "gcp_2d.csv"
 
 
-def is_the_samples(path: Path, names: list[str], crs: str | None = None) -> None:
+@pytest.mark.parametrize("name", CASES)
+def test_files_of_other_tools_hold_the_points_of_the_samples(shared_data, name) -> None:
     pytest.importorskip("pyproj")
-    found = read_gcps(path, names, ControlReference(crs=crs, heights="ellipsoidal"))
-    assert len(found.names) == len(TRUE) == 5
-    places = np.array([f["geometry"]["coordinates"][:2] for f in TRUE.values()])
-    for lon, lat in found.lonlatalt[:, :2]:
-        assert np.abs(places - [lon, lat]).max(axis=1).min() < 1e-7
-
-
-@pytest.mark.parametrize(
-    ("name", "names", "crs"),
-    [
-        ("view_00_utm.points", ["view_00"], None),
-        ("qgis.points", ["view_00"], None),
-        ("gcp_e_n_xy.csv", NAMES, "EPSG:32631"),
-        ("gcp_utm.csv", NAMES, "EPSG:32631"),
-    ],
-)
-def test_a_case_from_the_field_is_the_points_of_the_samples(shared_data, name, names, crs):
-    folder = shared_data / "field_cases"
-    if not folder.is_dir():
-        pytest.skip("no field cases in the shared data")
-    is_the_samples(folder / name, names, crs)
+    frame, rounded = CASES[name]
+    views = ["view_00", "view_01", "view_02"] if frame else ["view_00"]
+    known = read_gcps(SAMPLES / "gcps.geojson", views)
+    found = read_gcps(shared_data / "field_cases" / name, views, frame)
+    np.testing.assert_array_equal(found.view, known.view)
+    np.testing.assert_allclose(found.xy, known.xy, rtol=0, atol=rounded or 6e-4)  # ENVI's three decimals
+    np.testing.assert_allclose(found.lonlatalt[:, :2], known.lonlatalt[:, :2], rtol=0, atol=2e-8)
+    np.testing.assert_allclose(found.lonlatalt[:, 2], known.lonlatalt[:, 2] * (name not in FLAT), atol=rounded)
 
 
 QGIS = "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual\n5.4,43.3,100.5,-200.5,1,0,0,0\n"
@@ -83,10 +76,7 @@ def test_x_and_y_are_the_pair_that_no_other_column_is_named_for(tmp_path, names)
 )
 def test_files_without_names_are_refused_by_their_program_and_the_cure(tmp_path, text, program):
     (tmp_path / "a.txt").write_text(text)
-    with pytest.raises(InputError, match=program) as caught:
-        read_gcps(tmp_path / "a.txt", ["view_00"])
-    assert "give" in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert "give" in refused(lambda path: read_gcps(path, ["view_00"]), tmp_path / "a.txt", program)
 
 
 def test_low_heights_of_two_bytes_are_no_text(tmp_path):

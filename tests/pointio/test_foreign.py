@@ -27,6 +27,13 @@ MATCHES = {("a", "b"): [[0, 1], [1, 3], [2, 2]], ("b", "c"): [[1, 0]]}
 """One of three views, a(0) - b(1) - c(0), and two of two."""
 
 
+def partners(first: str, rows: list[list[int]]) -> np.ndarray:
+    """The partner of each keypoint of the first image; -1: none."""
+    found = np.full(len(KEYPOINTS[first]), -1)
+    found[np.array(rows)[:, 0]] = np.array(rows)[:, 1]
+    return found
+
+
 def colmap(folder: Path, geometries: bool = True, shift: float = 0.5, names: str = "sub/{}.tif") -> Path:
     """A database of COLMAP's: it counts from the corner of the first pixel; more columns than two, raw matches too."""
     path = folder / "database.db"
@@ -63,9 +70,7 @@ def dictionaries(folder: Path, kind: str = "matches") -> Path:
         if kind == "rows":
             arrays |= {"keypoints0": one[found[:, 0]], "keypoints1": two[found[:, 1]]}
         elif kind == "matches0":
-            partner = np.full(len(one), -1)
-            partner[found[:, 0]] = found[:, 1]
-            arrays |= {"matches0": partner, "matches": found}
+            arrays |= {"matches0": partners(first, rows), "matches": found}
         else:
             arrays |= {"matches": found}
         name = f"{first}_{second}_matches" if kind == "rows" else f"{first}__{second}"
@@ -90,22 +95,28 @@ def asp(folder: Path, length: int = 0) -> Path:
     return folder
 
 
+def hdf5_arrays(kind: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Keypoints and matches by their places in files of HDF5, beside other arrays, as two programs call them."""
+    if kind == "plain":
+        keypoints = {f"{name}.tif": xy.astype(np.float32) for name, xy in KEYPOINTS.items()}
+        others = {"more/descriptors": np.ones((4, 3), np.float16), "scores": np.ones(4)}
+        return keypoints | others, {f"{a}.tif/{b}.tif": np.array(rows) for (a, b), rows in MATCHES.items()}
+    keypoints = {f"sub/{name}.tif/keypoints": xy.astype(np.float32) for name, xy in KEYPOINTS.items()}
+    matches = {}
+    for (a, b), rows in MATCHES.items():
+        matches[f"sub-{a}.tif/sub-{b}.tif/matches0"] = found = partners(a, rows)
+        matches[f"sub-{a}.tif/sub-{b}.tif/matching_scores0"] = np.ones(len(found))
+    return keypoints | {"sub/a.tif/descriptors": np.ones((4, 3), np.float16)}, matches
+
+
 def hloc(folder: Path, kind: str = "hloc") -> Path:
     h5py = pytest.importorskip("h5py")
     path = folder / "feats_matches-lightglue.h5"
-    with h5py.File(folder / ("feats.h5" if kind == "hloc" else "keypoints.h5"), "w") as features:
-        for name, xy in KEYPOINTS.items():
-            features[f"sub/{name}.tif/keypoints" if kind == "hloc" else f"{name}.tif"] = xy.astype(np.float32)
-        features["sub/a.tif/descriptors" if kind == "hloc" else "more/descriptors"] = np.ones((4, 3), np.float16)
-    with h5py.File(path, "w") as file:
-        for (first, second), rows in MATCHES.items():
-            if kind == "hloc":
-                partner = np.full(len(KEYPOINTS[first]), -1)
-                partner[np.array(rows)[:, 0]] = np.array(rows)[:, 1]
-                file[f"sub-{first}.tif/sub-{second}.tif/matches0"] = partner
-                file[f"sub-{first}.tif/sub-{second}.tif/matching_scores0"] = np.ones(len(partner))
-            else:
-                file[f"{first}.tif/{second}.tif"] = np.array(rows)
+    beside = folder / ("feats.h5" if kind == "hloc" else "keypoints.h5")
+    for name, arrays in zip((beside, path), hdf5_arrays(kind), strict=True):
+        with h5py.File(name, "w") as file:
+            for place, array in arrays.items():
+                file[place] = array
     return path
 
 
@@ -311,19 +322,24 @@ def test_two_images_of_a_database_are_enough(tmp_path: Path) -> None:
 
 
 class Stored:
-    """An array as h5py shows it, at a place of a file."""
+    """An array as h5py shows it, at a place of a file, or, by more fields, as it is not."""
 
-    def __init__(self, array: np.ndarray, name: str) -> None:
+    def __init__(self, array: np.ndarray, name: str, **lie: object) -> None:
         self.array, self.name = array, name
         self.shape, self.ndim, self.size, self.dtype = array.shape, array.ndim, array.size, array.dtype
         self.is_virtual, self.external, self.nbytes = False, None, array.nbytes
         self.id = types.SimpleNamespace(get_storage_size=lambda: array.nbytes)
+        vars(self).update(lie)
 
     def __getitem__(self, _: object) -> np.ndarray:
         return self.array
 
 
-def shelf(monkeypatch: pytest.MonkeyPatch, contents: dict[str, dict[str, np.ndarray]]) -> None:
+def shelf(
+    monkeypatch: pytest.MonkeyPatch,
+    contents: dict[str, dict[str, np.ndarray]],
+    lies: dict[str, dict[str, object]] | None = None,
+) -> None:
     """In place of h5py, which may be missing, one that finds these arrays by what stands behind the first bytes."""
 
     class Link: ...
@@ -337,7 +353,8 @@ def shelf(monkeypatch: pytest.MonkeyPatch, contents: dict[str, dict[str, np.ndar
 
         def __getitem__(self, name: str):
             if name in self.arrays:
-                return Stored(self.arrays[name], f"{self.place}/{name}")
+                place = f"{self.place}/{name}"
+                return Stored(self.arrays[name], place, **(lies or {}).get(place[1:], {}))
             below = {p.partition("/")[2]: a for p, a in self.arrays.items() if p.startswith(f"{name}/")}
             return Group(below, f"{self.place}/{name}")
 
@@ -357,33 +374,16 @@ def shelf(monkeypatch: pytest.MonkeyPatch, contents: dict[str, dict[str, np.ndar
     monkeypatch.setitem(sys.modules, "h5py", fake)
 
 
-FEATURES = {
-    "hloc": {f"sub/{name}.tif/keypoints": xy.astype(np.float32) for name, xy in KEYPOINTS.items()},
-    "within": {f"{name}.tif/keypoints": xy for name, xy in KEYPOINTS.items()},
-    "plain": {f"{name}.tif": xy for name, xy in KEYPOINTS.items()},
-}
-FEATURES["hloc"]["sub/a.tif/descriptors"] = FEATURES["plain"]["more/descriptors"] = np.ones((4, 3), np.float16)
-FEATURES["plain"]["scores"] = np.ones(4)
-
-
 @pytest.mark.parametrize(
     ("kind", "beside"), [("hloc", "feats.h5"), ("plain", "keypoints.h5"), ("plain", "features.h5")]
 )
 def test_keypoints_and_matches_of_two_files_are_found_by_their_places(tmp_path, monkeypatch, kind, beside) -> None:
-    matches: dict[str, np.ndarray] = {}
-    for (first, second), rows in MATCHES.items():
-        partner = np.full(len(KEYPOINTS[first]), -1)
-        partner[np.array(rows)[:, 0]] = np.array(rows)[:, 1]
-        if kind == "hloc":
-            matches[f"sub-{first}.tif/sub-{second}.tif/matches0"] = partner
-            matches[f"sub-{first}.tif/sub-{second}.tif/matching_scores0"] = np.ones(len(partner))
-        else:
-            matches[f"{first}.tif/{second}.tif"] = np.array(rows)
+    keypoints, matches = hdf5_arrays(kind)
     matches["a.tif/stranger.tif/matches0"] = np.array([0, 0, 0])
     path = tmp_path / "feats_matches-lightglue.h5"
     for name in (path.name, beside):
         (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" + name.encode())
-    shelf(monkeypatch, {path.name: matches, beside: FEATURES[kind]})
+    shelf(monkeypatch, {path.name: matches, beside: keypoints})
     found = read_matches(path, NAMES)
     expected = read_matches(colmap(tmp_path), NAMES)
     for name in ("view", "point", "xy", "sigma"):
@@ -395,39 +395,23 @@ def test_keypoints_and_matches_of_two_files_are_found_by_their_places(tmp_path, 
 
 
 def test_keypoints_may_lie_beside_their_matches_in_one_file(tmp_path, monkeypatch) -> None:
-    path = tmp_path / "all.h5"
+    path, matches = tmp_path / "all.h5", hdf5_arrays("plain")[1]
     path.write_bytes(b"\x89HDF\r\n\x1a\nall.h5")
-    rows = {f"{a}.tif/{b}.tif": np.array(found) for (a, b), found in MATCHES.items()}
-    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], **rows}})
+    within = {f"{name}.tif/keypoints": xy for name, xy in KEYPOINTS.items()}
+    shelf(monkeypatch, {"all.h5": within | matches})
     assert len(read_links(path, NAMES).ends) == 4
-    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/b.tif": np.array([[0, 9]])}})
-    with pytest.raises(InputError, match=r"not an HDF5 file of matches .*beyond the 3 and 4"):
-        read_links(path, NAMES)
-    shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/a.tif": np.array([[0, 1]])}})
-    with pytest.raises(InputError, match="no track is seen in two"):
-        read_links(path, NAMES)
-    elsewhere = Stored(np.array([[0, 1]]), "/a.tif/b.tif")
-    for field, value, words in (
-        ("is_virtual", True, "lies in another file"),
-        ("external", [("other", 0, 8)], "lies in another file"),
-        ("size", 1 << 28, "too large for the keypoints and matches of a COLMAP or HDF5 file"),  # of 8 bytes each
+    pair = "a.tif/b.tif"
+    for arrays, lie, words in (
+        ({pair: np.array([[0, 9]])}, {}, r"not an HDF5 file of matches .*beyond the 3 and 4"),
+        ({"a.tif/a.tif": np.array([[0, 1]])}, {}, "no track is seen in two"),
+        (matches, {"is_virtual": True}, "lies in another file"),
+        (matches, {"external": [("other", 0, 8)]}, "lies in another file"),
+        # of 8 bytes each
+        (matches, {"size": 1 << 28}, "too large for the keypoints and matches of a COLMAP or HDF5 file"),
     ):
-        shelf(monkeypatch, {"all.h5": {**FEATURES["within"], "a.tif/b.tif": elsewhere.array}})
-        monkeypatch.setattr(Stored, "__init__", _lying(field, value))
+        shelf(monkeypatch, {"all.h5": within | arrays}, {pair: lie})
         with pytest.raises(InputError, match=words):
             read_links(path, NAMES)
-        monkeypatch.undo()
-
-
-def _lying(field: str, value: object):
-    whole = Stored.__init__
-
-    def made(self, array: np.ndarray, name: str) -> None:
-        whole(self, array, name)
-        if name.endswith("a.tif/b.tif"):
-            setattr(self, field, value)
-
-    return made
 
 
 def test_a_trigger_is_not_run_and_nothing_is_left_beside_the_file(tmp_path: Path) -> None:

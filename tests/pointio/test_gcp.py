@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
+from functools import partial
 
 import numpy as np
 import pyproj
 import pytest
-import rasterio
 from rasterio.control import GroundControlPoint
 
-from barpc.base.errors import InputError
 from barpc.pointio.gcps import read_gcps
-from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA
+from tests.geotiffs import write_image
+from tests.pointio.conftest import refused
 
 NAMES = ["left", "right"]
 
@@ -41,34 +40,9 @@ def test_a_text_whose_first_letters_are_those_of_a_tiff_is_a_text(tmp_path):
     assert read_gcps(path, NAMES).names == ("II-7",)
 
 
-def _feature(**properties):
-    base = {"ji": [10.5, 20.5], "filename": "left.tif", "id": "a", "info": "x"}
-    return {
-        "type": "Feature",
-        "properties": {**base, **properties},
-        "geometry": {"type": "Point", "coordinates": [5.4, 43.2, 100.0]},
-    }
-
-
-def test_a_point_of_geojson_seen_in_two_images_is_one_point(tmp_path):
-    path = tmp_path / "g.geojson"
-    features = [_feature(), _feature(filename="right.tif", ji=[1, 2]), _feature(filename="far.tif")]
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    found = read_gcps(path, NAMES)
-    assert found.names == ("a",)
-    np.testing.assert_array_equal(found.view, [0, 1])
-    np.testing.assert_array_equal(found.xy, [[10.5, 20.5], [1, 2]])
-    assert (found.sigma == GROUND_SIGMA).all()
-    assert (found.xy_sigma == IMAGE_SIGMA).all()
-
-
 def test_tags_in_a_map_projection_are_brought_to_wgs84(tmp_path):
-    path = tmp_path / "left.tif"
     gcps = [GroundControlPoint(row=2, col=1, x=5e5, y=4.7e6, z=100.0, id="p")]
-    with rasterio.open(
-        path, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8", gcps=gcps, crs="EPSG:32631"
-    ):
-        pass
+    path = write_image(tmp_path / "left.tif", np.zeros((4, 4), np.uint8), gcps=gcps, crs="EPSG:32631")
     x, y = pyproj.Proj(proj="utm", zone=31, ellps="WGS84")(5e5, 4.7e6, inverse=True)
     np.testing.assert_allclose(read_gcps(path, NAMES).lonlatalt, [[x, y, 100.0]], atol=1e-10)
 
@@ -89,13 +63,11 @@ def test_tags_in_a_map_projection_are_brought_to_wgs84(tmp_path):
 def test_what_is_wrong_with_a_file_is_said(tmp_path, text, says):
     path = tmp_path / "bad.gcp"
     path.write_text(text)
-    with pytest.raises(InputError, match=says):
-        read_gcps(path, NAMES)
+    refused(partial(read_gcps, names=NAMES), path, says)
 
 
 def test_a_missing_file_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_gcps(tmp_path / "none.gcp", NAMES)
+    refused(partial(read_gcps, names=NAMES), tmp_path / "none.gcp", "no such file")
 
 
 def test_the_quickbird_points_read_alike_from_geojson_and_from_tags(shared_data):

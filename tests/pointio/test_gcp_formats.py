@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from barpc.pointio.tables import degrees
 from barpc.report.geopackage import MapLayer, geopackage, point_shapes
 from barpc.scene import GroundPoints
 from tests.geotiffs import write_image
+from tests.pointio.conftest import refused
 
 NAMES = ["left", "right"]
 LON, LAT, ALT, COL, ROW = 5.4, 43.3, 240.0, 263.25, 889.75
@@ -80,29 +82,8 @@ SAME = {
     "csv dms": ("g.csv", "Lat;Lon;Alt [ft];photo;pixel x;pixel y\n43°18'00.0\"N;005° 24' 00\"E;"
                 f"{ALT / 0.3048:.9f};C:\\flight\\LEFT.JPG;263,25;889,75\n"),
 }  # fmt: skip
-"""The same point in the syntax of each tool, its pixels counted as that tool does."""
-NO_ALTITUDE = (
-    "qgis new",
-    "qgis old",
-    "odm proj",
-    "envi degrees",
-    "envi image first",
-    "old geojson",
-    "geojson in words",
-)
-
-
-@pytest.mark.parametrize("name", SAME)
-def test_one_point_in_every_syntax_is_the_same_point(tmp_path: Path, name: str) -> None:
-    file, text = SAME[name]
-    (tmp_path / file).write_text(text, encoding="utf-8")
-    found = read_gcps(tmp_path / file, NAMES)
-    assert found.view.tolist() == [0]
-    flat = found.lonlatalt[0, 2] == 0.0
-    assert flat == (name in NO_ALTITUDE)
-    assert ("no altitudes" in "".join(found.said)) == flat
-    np.testing.assert_allclose(found.xy, [[COL, ROW]], rtol=0, atol=1e-9)
-    near(found, (LON, LAT, 0.0 if flat else ALT))
+"""The same point in the syntax of each tool, its pixels counted as that tool does; `test_control_table` reads them."""
+NO_ALTITUDE = "qgis new", "qgis old", "odm proj", "envi degrees", "envi image first", "old geojson", "geojson in words"
 
 
 def test_every_format_has_a_sample() -> None:
@@ -287,6 +268,10 @@ def test_what_is_no_angle_is_refused(text, axis) -> None:
         ("lat,lon,z_error,img_height,h,row_px,col_px", "lat lon - - alt row col"),
         ("h_ortho,h_ellipsoid,lon,lat,px,py", "- alt lon lat col row"),
         ("imageX,imageY,mapX,mapY", "col row east north"),
+        ("Row,Col,Image,Name,Height,Latitude,Longitude", "row col image id alt lat lon"),
+        ("label,file,x,y,h,col,row", "id image lon lat alt col row"),
+        ("point,view,lon,lat,z,x,y", "id image lon lat alt col row"),
+        ("id,image,lon,lat,alt,px,py", "id image lon lat alt col row"),
         ("gcp_name,E [m],N [m],H (m),file,x [px],y (Pixels)", "id east north alt image col row"),
         ("x_img,y_img,lon,lat,ele", "col row lon lat alt"),
     ],
@@ -529,9 +514,7 @@ def test_a_pipe_beside_a_shapefile_is_not_waited_for(tmp_path, end) -> None:
 )
 def test_a_message_names_the_place_and_no_python(tmp_path, file, text, says) -> None:
     (tmp_path / file).write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=says) as error:
-        read_gcps(tmp_path / file, NAMES)
-    assert str(error.value).startswith(str(tmp_path / file))
+    refused(partial(read_gcps, names=NAMES), tmp_path / file, says)
 
 
 @pytest.mark.parametrize(
@@ -548,23 +531,3 @@ def test_errors_of_python_are_said_in_other_words(make, says) -> None:
     with pytest.raises(Exception) as error:
         make()
     assert plain(error.value) == says
-
-
-# --- the shared cases -------------------------------------------------------------------------------------
-
-CASES = {
-    "gcp_utm.csv": ControlReference("EPSG:32631"), "odm_gcp_list.txt": ControlReference(),
-    "qgis.points": ControlReference(), "envi.pts": ControlReference(),
-    "gcp_2d.csv": ControlReference(),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_files_of_other_tools_hold_the_points_of_the_samples(shared_data, name) -> None:
-    known = read_gcps(Path(__file__).parents[2] / "data_samples" / "gcps.geojson", ["view_00"])
-    found = read_gcps(shared_data / "field_cases" / name, ["view_00"], CASES[name])
-    np.testing.assert_allclose(found.xy, known.xy, rtol=0, atol=6e-4)  # ENVI's three decimals
-    np.testing.assert_allclose(found.lonlatalt[:, :2], known.lonlatalt[:, :2], rtol=0, atol=2e-8)
-    np.testing.assert_allclose(
-        found.lonlatalt[:, 2], known.lonlatalt[:, 2] * (name in ("gcp_utm.csv", "odm_gcp_list.txt"))
-    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+import sys
 import threading
 import time
 from collections import Counter
@@ -85,7 +86,6 @@ class Web:
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
     monkeypatch.setattr(hosts, "WAITS", (0.0, 0.01, 0.01))
-    monkeypatch.setattr(hosts, "TIMEOUT", 2.0)
     folder = tmp_path / "served"
     folder.mkdir()
     found = Web(folder)
@@ -96,6 +96,13 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
         found.server.server_close()
 
 
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a second for an answer, and hardly more for its bytes."""
+    monkeypatch.setattr(hosts, "TIMEOUT", 0.5)
+    monkeypatch.setattr(hosts, "_SLOWEST", 1_000_000)
+
+
 def drip(handler: _Handler, part: bytes, *_span: int) -> bool:
     """One byte now and then, for ever."""
     handler.send_response(206)
@@ -104,6 +111,7 @@ def drip(handler: _Handler, part: bytes, *_span: int) -> bool:
     handler.end_headers()
     for _ in range(100):
         handler.wfile.write(b"x")
+        handler.web.counts["dripped"] += 1
         time.sleep(0.2)
     return True
 
@@ -157,6 +165,23 @@ class Fetched:
     ) -> Part:
         self._sent = itertools.chain(parts, more)
         return hosts.fetch(at, start, stop)
+
+
+def forget() -> None:
+    """What was known of stores, and of where they are."""
+    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
+        cached.cache_clear()
+    for module, name in (("s3fs", "S3FileSystem"), ("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
+        if module in sys.modules:
+            getattr(sys.modules[module], name).clear_instance_cache()
+
+
+@pytest.fixture
+def forgotten() -> Iterator[None]:
+    """No store is known before or after."""
+    forget()
+    yield
+    forget()
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,30 +12,16 @@ from pathlib import Path
 import pytest
 
 from barpc.base.errors import ImageError
-from barpc.base.remote import REQUEST_BYTES, RemoteFile, hosts, located
+from barpc.base.remote import REQUEST_BYTES, RemoteFile, located
 from barpc.base.safe_io import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
 from barpc.pipeline import load_views
 
+pytestmark = pytest.mark.usefixtures("forgotten")
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 DATA = (SAMPLES / "view_00.tif").read_bytes()
 ACCOUNT = "DefaultEndpointsProtocol=http;AccountName=devstoreaccount1;AccountKey="
 KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="  # everyone's
-
-
-def forget() -> None:
-    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
-        cached.cache_clear()
-    for module, name in (("gcsfs", "GCSFileSystem"), ("adlfs", "AzureBlobFileSystem")):
-        if module in sys.modules:
-            getattr(sys.modules[module], name).clear_instance_cache()
-
-
-@pytest.fixture(autouse=True)
-def _forgotten() -> Iterator[None]:
-    forget()
-    yield
-    forget()
 
 
 def free_port() -> int:

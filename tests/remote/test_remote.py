@@ -25,14 +25,16 @@ from barpc.base.errors import BarpcError, ImageError, InputError, RpcError
 from barpc.base.frozen import from_arrays, to_arrays
 from barpc.base.identity import fingerprint
 from barpc.base.options import RunOptions, TieOptions, read_options
-from barpc.base.remote import REQUEST_BYTES, Remote, RemoteFile, hosts, located, pinned
+from barpc.base.remote import REQUEST_BYTES, Remote, RemoteFile, located, pinned
 from barpc.base.safe_io import IMAGE, RPC_FILE, read_bytes, read_head, versioned
 from barpc.cameras import open_camera, open_split, split_spec
 from barpc.pipeline import load_views
 from barpc.pipeline.inputs import input_files, with_located
 from barpc.rasters.dem import Dem
 from barpc.rasters.raster import open_raster
+from barpc.rpcio import write_rpc_copy
 from barpc.tie.patches.channels import Sheet
+from tests.geotiffs import write_image
 from tests.remote.conftest import Web, drip
 
 SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
@@ -150,8 +152,6 @@ def test_a_vrt_a_kept_result_and_a_text_open_nothing_even_where_the_host_is_allo
     with pytest.raises(ImageError, match="from disk only"):
         load_views([samples.url("x.vrt")], min_views=1, hosts=(samples.host,))
     assert not any("view_00" in path for path in samples.seen)
-    with pytest.raises(ValueError, match="Remote"):
-        from_arrays(to_arrays((Remote(url, 5, "x"),)))
     assert type(from_arrays(to_arrays(str.__str__(url)))) is str
 
 
@@ -189,15 +189,9 @@ def test_workers_read_by_themselves_and_the_same_version(samples: Web) -> None:
 
 def test_a_window_of_a_large_image_costs_its_blocks_alone(server: Web) -> None:
     pixels = np.random.default_rng(0).integers(0, 4000, (2048, 3072), np.uint16)
-    with rasterio.open(
-        server.folder / "large.tif", "w", driver="GTiff", width=3072, height=2048, count=1, dtype="uint16",
-        tiled=True, blockxsize=256, blockysize=256, compress="deflate",
-    ) as file:  # fmt: skip
-        file.write(pixels, 1)
-    at, window = (
-        versioned(located(server.url("large.tif"), (server.host,)), IMAGE),
-        Window(600, 700, 300, 200),
-    )
+    tiled = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
+    write_image(server.folder / "large.tif", pixels, **tiled)
+    at, window = versioned(located(server.url("large.tif"), (server.host,)), IMAGE), Window(600, 700, 300, 200)
     with open_raster(at) as dataset:
         assert (dataset.read(1, window=window) == pixels[700:900, 600:900]).all()
     tiles, tile = 2 * 2, 256 * 256 * 2
@@ -267,18 +261,9 @@ def test_results_belong_to_the_version_that_a_host_names(samples: Web) -> None:
 def test_heights_and_a_reference_are_read_where_they_are_wanted(server: Web) -> None:
     heights = np.random.default_rng(4).normal(500, 100, (1500, 1600)).astype(np.float32)
     forward = rasterio.Affine(1e-3, 0, 5.0, 0, -1e-3, 45.0)
-    profile = {
-        "driver": "GTiff",
-        "width": 1600,
-        "height": 1500,
-        "count": 1,
-        "dtype": "float32",
-        "crs": "EPSG:4326",
-    }
     tiled = {"tiled": True, "blockxsize": 128, "blockysize": 128}
     for name in ("dem.tif", "ortho.tif"):
-        with rasterio.open(server.folder / name, "w", transform=forward, **profile, **tiled) as file:
-            file.write(heights, 1)
+        write_image(server.folder / name, heights, transform=forward, crs="EPSG:4326", **tiled)
     urls = {"dem": server.url("dem.tif"), "reference": (server.url("ortho.tif"),)}
     for allowed in ((), ("http://127.0.0.1:1",)):
         with pytest.raises(BarpcError):
@@ -312,10 +297,6 @@ def test_copies_are_written_and_a_vrt_is_refused_before_any_work(samples: Web, t
         barpc.adjust(urls, tmp_path / "a", RunOptions(allow_remote=allowed))
     one_line(caught.value, urls[0])
     assert not (tmp_path / "a").exists()
-    ties = SAMPLES.parent / "none"
-    assert not ties.exists()
-    from barpc.rpcio import write_rpc_copy
-
     at = located(urls[0], allowed)
     write_rpc_copy(open_camera(SAMPLES / NAMES[1]).rpc, at, tmp_path / "copy.tif")  # type: ignore[arg-type]
     with rasterio.open(tmp_path / "copy.tif") as copy, rasterio.open(SAMPLES / NAMES[0]) as image:
@@ -332,38 +313,27 @@ def status(code: int, **headers: str) -> Mood:
     return lambda handler, *_: handler.answer(code, b"x" * 100, **headers) or True
 
 
-def ranged(data: Callable[[bytes], bytes], span: str = "{0}-{1}/{2}", **headers: str) -> Mood:
-    def mood(handler: Any, part: bytes, start: int, stop: int, size: int) -> bool:
-        text = "bytes " + span.format(start, stop - 1, size)
-        handler.answer(206, data(part), Content_Range=text, ETag="x", **headers)
-        handler.close_connection = True
-        return True
-
-    return mood
-
-
-MOODS: dict[str, tuple[Mood, str, int]] = {  # what it does, what is said, how often it is asked
+MOODS: dict[str, tuple[Mood, str, int]] = {  # what it does, what is said, how often it is asked; more: test_parts
     "403": (status(403), "403", 1),
-    "404": (status(404), "no such file", 1),
     "500": (status(500), "500; asked 4 times", 4),
-    "other host": (status(302, Location="http://localhost:1/x"), "localhost:1", 1),
     "other scheme": (status(302, Location="file:///etc/passwd"), "file:///etc/passwd", 1),
-    "itself": (status(301, Location="/view_00.tif"), "on and on", 3),
     "nowhere": (status(301), "on and on", 3),
-    "no ranges": (status(200, Content_Length=str(10**9)), "no parts of files", 1),
-    "half-way": (ranged(lambda part: part[: len(part) // 2], Content_Length=""), "32768 of 65536 bytes", 4),
-    "longer length": (ranged(lambda part: part + b"x" * 10), "other bytes", 1),
-    "huge number": (ranged(lambda part: part, "{0}-{1}/" + "9" * 5000), "other bytes", 1),
-    "gzip": (ranged(lambda part: part, Content_Encoding="gzip"), "compressed", 1),
-    "drip": (drip, "more than 0.566 s for 65536 bytes", 4),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("mood", MOODS)
-def test_a_host_that_misbehaves_costs_one_line(samples: Web, monkeypatch: pytest.MonkeyPatch, mood: str) -> None:
-    monkeypatch.setattr(hosts, "TIMEOUT", 0.5 if mood == "drip" else 30.0)
-    monkeypatch.setattr(hosts, "_SLOWEST", 1_000_000)
-    samples.mood, said, times = MOODS[mood]
+def test_a_host_that_misbehaves_costs_one_line(samples: Web, mood: str) -> None:
+    costs_one_line(samples, *MOODS[mood])
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_host_that_sends_a_byte_now_and_then_costs_one_line(samples: Web) -> None:
+    costs_one_line(samples, drip, "more than 0.566 s for 65536 bytes", 4)
+    assert samples.counts["dripped"] < 200  # of 400: it is cut off
+
+
+def costs_one_line(samples: Web, mood: Mood, said: str, times: int) -> None:
+    samples.mood = mood
     at = located(samples.url(NAMES[0]), (samples.host,))
     with pytest.raises(ImageError) as caught, open_raster(at):
         pass
@@ -394,10 +364,7 @@ def test_no_pixels_are_made_of_a_file_whose_host_dies(server: Web, kind: str) ->
     """Some drivers fill what is missing, and none hears of an exception."""
     pixels = np.random.default_rng(3).integers(0, 255, (1, 800, 800), np.uint8)
     options = {"REVERSIBLE": "YES", "QUALITY": "100"} if kind.startswith("JP2") else {}
-    with rasterio.open(
-        server.folder / "x", "w", driver=kind, width=800, height=800, count=1, dtype="uint8", **options
-    ) as file:
-        file.write(pixels)
+    write_image(server.folder / "x", pixels, driver=kind, **options)
     at = located(server.url("x"), (server.host,))
     with open_raster(at) as dataset:
         assert abs(dataset.read(1).astype(float) - pixels[0]).mean() < 20
@@ -436,8 +403,8 @@ def test_a_host_that_does_not_say_what_lies_beside_an_image_is_not_guessed_about
     one_line(caught.value, samples.url(NAMES[0]), "403")
 
 
-def test_nobody_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hosts, "WAITS", (0.0, 0.0, 0.0))
+@pytest.mark.usefixtures("server")  # which shortens the waits
+def test_nobody_there() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         host = f"http://127.0.0.1:{taken.getsockname()[1]}"

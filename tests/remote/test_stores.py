@@ -20,6 +20,7 @@ from barpc.base.safe_io import IMAGE, read_bytes, versioned
 from barpc.cameras import open_camera
 from barpc.pipeline import load_views
 from barpc.rasters.raster import open_raster
+from tests.remote.conftest import forget
 
 pytest.importorskip("moto.server")
 pytest.importorskip("s3fs")
@@ -49,15 +50,6 @@ def server() -> Iterator[str]:
         yield "http://{}:{}".format(*found.get_host_and_port())
     finally:
         found.stop()
-
-
-def forget() -> None:
-    """What was known of stores, and of where they are."""
-    import s3fs
-
-    for cached in (hosts._store, hosts._open_version, hosts._store_listing):
-        cached.cache_clear()
-    s3fs.S3FileSystem.clear_instance_cache()
 
 
 @pytest.fixture

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import itertools
 import random
-import shutil
 import tracemalloc
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from barpc.base.remote import REQUEST_BYTES, Part
-from barpc.pipeline import load_views
-from tests.remote.conftest import Web
 
-SAMPLES = Path(__file__).resolve().parents[2] / "data_samples"
 HEAD = b'HTTP/1.1 206 OK\r\nETag: "a"\r\nContent-Range: bytes 0-65535/1000000\r\n'
 CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
 DATA = bytes(range(256)) * 256
@@ -98,26 +92,3 @@ def test_damaged_answers_give_the_bytes_that_were_asked_or_an_oserror(fetched):
             outcomes.add(str(error)[:12])
     assert {0, REQUEST_BYTES} == {one for one in outcomes if isinstance(one, int)}
     assert len(outcomes) > 3
-
-
-@pytest.mark.parametrize("size", [b"-5", b"-1", b"zz"])
-def test_keep_going_leaves_out_the_file_of_a_host_that_sends_foul_chunks(server: Web, size: bytes) -> None:
-    good = ("view_00.tif", "view_01.tif")
-    for name in good:
-        shutil.copy(SAMPLES / name, server.folder)
-
-    def foul(handler: Any, *_: object) -> bool:
-        if handler.path == "/bad.tif":
-            span = {"Content_Length": "", "Content_Range": "bytes 0-65535/1000000", "Transfer_Encoding": "chunked"}
-            handler.answer(206, size + b"\r\nhello\r\n" + END, **span)
-            handler.close_connection = True
-        elif handler.path.lstrip("/") not in good:
-            handler.answer(404)
-        return handler.path.lstrip("/") not in good
-
-    server.mood = foul
-    urls = [server.url(name) for name in (good[0], "bad.tif", good[1])]
-    loaded = load_views(urls, keep_going=True, hosts=(server.host,))
-    assert [view.name for view in loaded.views] == ["view_00", "view_01"]
-    assert [file for file, _ in loaded.left_out] == [urls[1]]
-    assert "its host broke off" in loaded.left_out[0][1]

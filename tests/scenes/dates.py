@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from barpc.base.geodesy import Array
@@ -17,8 +16,8 @@ from tests.everywhere import rows_of
 from tests.scenes.files import _write_image
 from tests.scenes.images import ImageOptions, Scene
 from tests.scenes.render import expose, render
-from tests.scenes.season import CLASSES, _lit
-from tests.scenes.terrain import Float32, Grid, fractal
+from tests.scenes.season import CLASSES, unlit
+from tests.scenes.terrain import Float32, fractal
 from tests.scenes.texture import Surface, _albedo
 
 _ANCHORS = 4  # times of the year with tones of their own, which other days lie between
@@ -107,16 +106,8 @@ class _Seasons:
         self._years, scene = years, years.scene
         self._base = scene.surfaces[0]
         rng = np.random.default_rng([years.seed, 82])
-        ground, step = self._base.ground.values, self._base.ground.step
-        shape = (ground.shape[0], ground.shape[1])
-        self._light = _lit(scene, self._base.date, shape, step)
-        self._albedo = ground / self._light
-        wide = 2 * int(1.0 / step) + 1
-        self._local = (
-            cv2.medianBlur(np.clip(self._albedo * 400, 0, 255).astype(np.uint8), wide).astype(np.float32) / 400
-        )
-        edges = np.quantile(self._local[::7, ::7], np.linspace(0, 1, CLASSES + 1)[1:-1])
-        self._kind = np.digitize(self._local, edges)
+        shape, step = self._base.ground.values.shape, self._base.ground.step
+        self._light, self._albedo, self._local, self._kind = unlit(scene)
         tones = np.linspace(0.08, 0.5, CLASSES)
         self._tone = np.array([rng.permutation(tones) for _ in range(_ANCHORS)])
         self._sign = np.array([rng.permutation(np.where(np.arange(CLASSES) % 2, -1.0, 1.0)) for _ in range(_ANCHORS)])
@@ -142,8 +133,4 @@ class _Seasons:
             white = self._drifts > np.quantile(self._drifts[::7, ::7], 1.0 - cover)
             today = np.where(white, 0.85 + self._white, today)
         ground: Float32 = (np.clip(today, 0.03, 0.95) * self._light).astype(np.float32)
-        return replace(
-            self._base,
-            ground=Grid(self._base.ground.origin, self._base.ground.step, ground),
-            roof=of(self._roof),
-        )
+        return replace(self._base, ground=replace(self._base.ground, values=ground), roof=of(self._roof))

@@ -118,16 +118,8 @@ class ImageOptions:
             raise InputError("simulate: a sun azimuth for every date, and a sun at 10 to 90 deg of elevation")
         if not 256 <= self.saturation <= 65535:
             raise InputError(f"simulate: saturation {self.saturation} is not in 256 .. 65535")
-        spread = (
-            self.attitude,
-            self.position,
-            self.drift,
-            self.snr,
-            self.relief,
-            self.buildings,
-            self.change,
-        )
-        if min(*spread, self.checks, self.gcps, self.gcp_noise) < 0:
+        spread = self.attitude, self.position, self.drift, self.gcp_noise
+        if min(*spread, self.snr, self.relief, self.buildings, self.change, self.checks, self.gcps) < 0:
             raise InputError("simulate: standard deviations, counts and sizes must not be negative")
 
 
@@ -262,12 +254,7 @@ class Scene:
         terrain, rng = self.terrain, self._rng(-2)
         x, y = terrain.relief.axes()
         xy = rng.uniform([x[0], y[0]], [x[-1], y[-1]], (count, 2))
-        alt = terrain.relief(*xy.T).astype(np.float64)
-        for i in range(len(terrain.buildings)):
-            u, v = terrain.buildings.sides(i, *xy.T)
-            on = (np.abs(u) < terrain.buildings.half[i, 0]) & (np.abs(v) < terrain.buildings.half[i, 1])
-            alt[on] = terrain.buildings.top[i]
-        return terrain.plane.ground(np.concatenate([xy, alt[:, None]], axis=1))
+        return terrain.plane.ground(np.column_stack([xy, terrain.highest(*xy.T)]))
 
     def shows(self, index: int, ground: Array, altitude: Float32) -> tuple[Array, BoolArray]:
         """Exact image points (N, 2) of ground points (N, 3) in a view, and which of them are in sight."""

@@ -11,6 +11,7 @@ from rasterio.crs import CRS
 from rasterio.warp import transform as warp_points
 from scipy import ndimage
 
+from tests.geotiffs import write_image
 from tests.scenes.images import Scene
 from tests.scenes.terrain import Float32, Grid, fractal
 from tests.scenes.texture import AMBIENT, Date, _albedo, _cast, _light, _resampled
@@ -26,6 +27,17 @@ def _lit(scene: Scene, date: Date, shape: tuple[int, int], step: float) -> Float
     return ndimage.gaussian_filter(lit.values, 0.7)
 
 
+def unlit(scene: Scene) -> tuple[Float32, Float32, Float32, np.ndarray]:
+    """Of the first date's ground its light, its reflectance, the mean of that around, and the class of that mean."""
+    surface = scene.surfaces[0]
+    ground, step = surface.ground.values, surface.ground.step
+    light = _lit(scene, surface.date, (ground.shape[0], ground.shape[1]), step)
+    albedo, wide = ground / light, 2 * int(1.0 / step) + 1
+    local = cv2.medianBlur(np.clip(albedo * 400, 0, 255).astype(np.uint8), wide).astype(np.float32) / 400
+    edges = np.quantile(local[::7, ::7], np.linspace(0, 1, CLASSES + 1)[1:-1])
+    return light, albedo, local, np.digitize(local, edges)
+
+
 def other_season(scene: Scene, seed: int, *, inverted: float = 0.5, snow: float = 0.15, changed: float = 0.1) -> Grid:
     """Brightness of the scene from straight above on another date.
 
@@ -34,13 +46,8 @@ def other_season(scene: Scene, seed: int, *, inverted: float = 0.5, snow: float 
     """
     rng = np.random.default_rng([seed, 77])
     surface = scene.surfaces[0]
-    ground, step = surface.ground.values, surface.ground.step
-    shape = (ground.shape[0], ground.shape[1])
-    albedo = ground / _lit(scene, surface.date, shape, step)
-    wide = 2 * int(1.0 / step) + 1
-    local = cv2.medianBlur(np.clip(albedo * 400, 0, 255).astype(np.uint8), wide).astype(np.float32) / 400
-    edges = np.quantile(local[::7, ::7], np.linspace(0, 1, CLASSES + 1)[1:-1])
-    kind = np.digitize(local, edges)
+    shape, step = surface.ground.values.shape, surface.ground.step
+    _, albedo, local, kind = unlit(scene)
     tone = rng.permutation(np.linspace(0.08, 0.5, CLASSES)).astype(np.float32)
     sign = np.where(np.arange(CLASSES) < inverted * CLASSES, -1.0, 1.0).astype(np.float32)
     sign = rng.permutation(sign)
@@ -64,9 +71,9 @@ def other_season(scene: Scene, seed: int, *, inverted: float = 0.5, snow: float 
             slice(*np.searchsorted(y, (low[1], high[1]))),
             slice(*np.searchsorted(x, (low[0], high[0]))),
         )
-        u, v = buildings.sides(i, *np.meshgrid(x[cols], y[rows]))
-        on = (np.abs(u) < buildings.half[i, 0]) & (np.abs(v) < buildings.half[i, 1])
-        today[rows, cols][on] = rng.uniform(0.1, 0.8) * (AMBIENT + (1 - AMBIENT) * 0.5)
+        today[rows, cols][buildings.under(i, *np.meshgrid(x[cols], y[rows]))] = rng.uniform(0.1, 0.8) * (
+            AMBIENT + (1 - AMBIENT) * 0.5
+        )
     return Grid(surface.ground.origin, step, today.astype(np.float32))
 
 
@@ -101,11 +108,7 @@ def write_reference(
         out[row : row + 256] = np.where(inside, 1 + 900 * blurred(xy[..., 0], xy[..., 1]), 0)
     layout = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "deflate"}
     place = rasterio.Affine(gsd, 0.0, left + shift[0], 0.0, -gsd, top + shift[1])
-    with rasterio.open(
-        path, "w", "GTiff", width, height, 1, dtype="uint16", crs=UTM, transform=place, nodata=0, **layout
-    ) as file:
-        file.write(out, 1)
-    return path
+    return write_image(path, out, crs=UTM, transform=place, nodata=0, **layout)
 
 
 def write_dem(
@@ -123,11 +126,7 @@ def write_dem(
     last = scene.terrain.plane.ground(np.array([px[-1], py[-1], 0.0]))
     step = (last - first)[:2] / (len(px) - 1, len(py) - 1)
     place = rasterio.Affine(step[0], 0.0, first[0] - 0.5 * step[0], 0.0, step[1], first[1] - 0.5 * step[1])
-    with rasterio.open(
-        path, "w", "GTiff", len(px), len(py), 1, dtype="float32", crs="EPSG:4979", transform=place
-    ) as file:
-        file.write(heights.astype(np.float32), 1)
-    return path
+    return write_image(path, heights.astype(np.float32), crs="EPSG:4979", transform=place)
 
 
 SEASONS = {"mild": (0.0, 0.1), "winter": (0.25, 0.4), "extreme": (0.5, 0.6)}

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 
 from barpc.base.errors import InputError
-from barpc.base.geodesy import Array, metres_per_unit, wrap_longitude
+from barpc.base.geodesy import Array, BoolArray, metres_per_unit, wrap_longitude
 
 Float32 = npt.NDArray[np.float32]
 
@@ -135,6 +135,11 @@ class Buildings:
         dx, dy = x - self.center[index, 0], y - self.center[index, 1]
         return cosine * dx + sine * dy, cosine * dy - sine * dx
 
+    def under(self, index: int, x: Array, y: Array) -> BoolArray:
+        """Whether places (...) lie beneath the roof of one building."""
+        u, v = self.sides(index, x, y)
+        return np.asarray((np.abs(u) < self.half[index, 0]) & (np.abs(v) < self.half[index, 1]))
+
     def corners(self) -> Array:
         """x, y, alt (B, 8, 3) [m] of the corners, four at the foot and four at the top."""
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
@@ -234,6 +239,14 @@ class Terrain:
         """Lowest ground and highest roof [m]."""
         top = self.buildings.top.max(initial=float(self.relief.values.max()))
         return float(self.relief.values.min()), float(top)
+
+    def highest(self, x: Array, y: Array) -> Array:
+        """Altitudes (N,) of the highest there is at places (N,): the ground, or a roof."""
+        alt = self.relief(x, y).astype(np.float64)
+        for i in range(len(self.buildings)):
+            on = self.buildings.under(i, x, y)
+            alt[on] = np.maximum(alt[on], self.buildings.top[i])
+        return alt
 
     def trace(self, ray: Ray, steps: int = 8) -> Array:
         """Altitudes (...) where lines meet the bare ground: the secant method, from the middle altitude."""

@@ -38,16 +38,6 @@ def sensor(request):
     return fly(TARGET, looks(3, 0.0)[request.param], SIZE, 0.5)
 
 
-def solid(terrain, x, y):
-    """Altitude of the highest solid thing at places x, y (N,)."""
-    alt = terrain.relief(x, y).astype(np.float64)
-    for i in range(len(terrain.buildings)):
-        u, v = terrain.buildings.sides(i, x, y)
-        on = (np.abs(u) < terrain.buildings.half[i, 0]) & (np.abs(v) < terrain.buildings.half[i, 1])
-        alt[on] = np.maximum(alt[on], terrain.buildings.top[i])
-    return alt
-
-
 def cast(sensor, terrain, image, step=0.02):
     """First altitudes (N,) at which lines of sight are in something solid: brute force, in steps of 2 cm."""
     low, high = terrain.alt_range()
@@ -55,7 +45,7 @@ def cast(sensor, terrain, image, step=0.02):
     for alt in np.arange(high, low - step, -step):
         todo = np.flatnonzero(np.isnan(found))
         x, y = PLANE.xy(sensor.localize(image[todo], np.array(alt))).T
-        found[todo[solid(terrain, x, y) >= alt]] = alt
+        found[todo[terrain.highest(x, y) >= alt]] = alt
     return found
 
 
@@ -147,7 +137,7 @@ def test_walls_show_on_the_side_of_the_camera_and_hide_the_ground_behind(surface
     )
     u = np.linspace(-1.2, 1.2, 481) * np.hypot(*terrain.buildings.half[tall])
     x, y = terrain.buildings.center[tall, 0] + u, np.full(481, terrain.buildings.center[tall, 1])
-    off_roof = solid(terrain, x, y) < terrain.buildings.top[tall]
+    off_roof = terrain.highest(x, y) < terrain.buildings.top[tall]
     ground = PLANE.ground(np.stack([x, y, terrain.relief(x, y).astype(float)], axis=1))
     col, row = np.rint(east.project(ground)).astype(int).T
     hidden = altitude[row, col] > ground[:, 2] + 1.0
