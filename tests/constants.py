@@ -89,7 +89,7 @@ SIZES = {
     "sides_crossed": ("barpc.tie.pairing.area._MOST_CROSSED",),
     "sides_together": ("barpc.tie.pairing.area._TOGETHER",),
     "patches_together": ("barpc.tie.patches.register.CHUNK",),
-    "rows_refined": ("barpc.tie.patches.dense._STRIP",),
+    "rows_refined": ("barpc.tie.patches.dense._STRIP_ROWS",),
     "newton_steps": ("barpc.tie.patches.register.NEWTON_STEPS",),
     "kept_after": ("barpc.workspace.KEEP_AFTER",),
     "rows_together": ("barpc.report.tables.CHUNK",),

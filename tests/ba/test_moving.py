@@ -169,7 +169,7 @@ def test_regions_are_proposed_by_what_their_motion_gains(cut: bool) -> None:
     right = np.where(moves[block.order] & cut, 0.1, np.maximum(seen.base.right, 0.6))
     base = replace(seen.base, right=right)
     shares = list(moving_ground._start_shares(seen.linear, group_in(seen), base, seen.extra, seen.sigma))
-    assert len(shares) == moving_ground._STARTS + cut
+    assert len(shares) == moving_ground._BEST_REGIONS + cut
     assert all(set(np.unique(share)) == {LEVEL, 1.0 - LEVEL} for share in shares)
     inside = [np.mean((share > 0.5) == moves[block.order]) for share in shares]
     assert max(inside[cut:]) > 0.8 or min(inside[cut:]) < 0.2  # a part, or all the rest, moves
@@ -195,20 +195,20 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
     by_move, cell = group.by_move, group.cell
     gains = moving_ground._region_gains(linear, group, base, none, np.zeros(0))
     curvature, _, across = Mixture(linear, none, np.zeros(0), base).scores(by_move, cell, GROUND_CELLS**2)
-    regions = {one.tobytes() for one in moving_ground._REGIONS}
+    regions = {one.tobytes() for one in moving_ground._GROUND_REGIONS}
     row, col = np.divmod(np.arange(GROUND_CELLS**2), GROUND_CELLS)
     spans = [(low, high) for high in range(GROUND_CELLS) for low in range(high + 1)]
     rectangles = [(row >= a) & (row <= b) & (col >= c) & (col <= d) for a, b in spans for c, d in spans]
     assert {one.tobytes() for one in rectangles if not one.all()} < regions
-    assert len(regions) == len(moving_ground._REGIONS)
+    assert len(regions) == len(moving_ground._GROUND_REGIONS)
     best = np.argsort(-gains)[[0, 10, 100]]
     assert gains[best[0]] > 20.0
-    first, *others = starts = moving_ground._distinct(moving_ground._REGIONS, gains)
-    assert (first == moving_ground._REGIONS[best[0]]).all()
-    assert len(others) == moving_ground._STARTS - 1
+    first, *others = starts = moving_ground._distinct_regions(moving_ground._GROUND_REGIONS, gains)
+    assert (first == moving_ground._GROUND_REGIONS[best[0]]).all()
+    assert len(others) == moving_ground._BEST_REGIONS - 1
     assert all(2 * (a & b).sum() <= (a | b).sum() for n, a in enumerate(starts) for b in starts[:n])
     for n in best:
-        region = moving_ground._REGIONS[n]
+        region = moving_ground._GROUND_REGIONS[n]
         part = across[region].sum(axis=0)
         room = np.eye(4) + 30.0**2 * (curvature[region].sum(axis=0) - part.T @ part)
         found = fit_mixture(linear, by_move * region[cell], group.sigma, base)

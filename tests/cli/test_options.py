@@ -14,7 +14,7 @@ from barpc.base.errors import InputError
 from barpc.base.options import AdjustOptions, FitOptions, RunOptions, TieOptions
 from barpc.cli import cli
 from barpc.cli.adjust import adjust
-from barpc.cli.flags import field_of, flag, flag_name, given_flags, image_paths, jobs_option, run_options
+from barpc.cli.flags import field_of, flag, flag_name, given_flags, image_paths, jobs_option, options_of_flags
 
 
 def given(target: str, *words: str) -> Any:
@@ -164,8 +164,8 @@ def test_paths_of_a_list_count_from_its_folder_and_a_missing_one_is_named_with_i
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "o.toml"
     path.write_text('overwrite = true\n[tie]\nband = 7\n[adjust]\nmodel = "shift"\n')
-    assert run_options({}, None) == RunOptions()
-    read = run_options({}, str(path))
+    assert options_of_flags({}, None) == RunOptions()
+    read = options_of_flags({}, str(path))
     assert (read.overwrite, read.tie.band, read.adjust.model) == (True, 7, "shift")
     flags = {
         "flag_tie_band": 9,
@@ -176,32 +176,32 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
         "flag_dem": "d.tif",
         "other": 3,
     }
-    found = run_options(flags, str(path))
+    found = options_of_flags(flags, str(path))
     assert (found.tie.band, found.adjust.model, found.adjust.jitter) == (9, "shift", "off")
     assert (found.overwrite, found.fit.tolerance, found.dem) == (True, 0.5, ("d.tif",))
-    alone = run_options(flags, None)
+    alone = options_of_flags(flags, None)
     assert (alone.tie, alone.adjust) == (TieOptions(band=9), AdjustOptions(jitter="off"))
-    assert run_options({"flag_adjust_drift": 0}, None).adjust.drift == 0  # 0 is a value
+    assert options_of_flags({"flag_adjust_drift": 0}, None).adjust.drift == 0  # 0 is a value
     assert given_flags({"alt": 0.0, "dem": None, "overwrite": False}) == {"alt": 0.0, "overwrite": False}
     with pytest.raises(InputError, match="command line"):
-        run_options({"flag_fit_tolerance": -1.0}, None)
+        options_of_flags({"flag_fit_tolerance": -1.0}, None)
 
 
 def test_one_word_gives_the_paper_s_method_and_the_file_and_flags_win_over_it(tmp_path: Path) -> None:
-    whole = run_options({"paper": True}, None)
+    whole = options_of_flags({"paper": True}, None)
     told = whole.adjust
     assert (told.model, told.center, told.drift, told.jitter) == ("rotation+translation", "projective", 0, "off")
     assert (whole.fit.method, whole.fit.space) == ("lcurve-joint", "ground")
     assert (whole.tie, replace(whole, adjust=AdjustOptions(), fit=FitOptions())) == (TieOptions(), RunOptions())
     file = tmp_path / "a.toml"
     file.write_text("[adjust]\nnoise_floor = 0.03\n")
-    mixed = run_options({"paper": True, "flag_adjust_drift": 1}, str(file))
+    mixed = options_of_flags({"paper": True, "flag_adjust_drift": 1}, str(file))
     assert (mixed.adjust.noise_floor, mixed.adjust.drift, mixed.adjust.jitter) == (0.03, 1, "off")
     file.write_text('[adjust]\ncenter = "projective"\n')
     with pytest.raises(InputError, match=r"center stands in a file, where it is not accepted; give the flag --paper"):
-        run_options({}, str(file))
-    assert run_options({"paper": False}, None) == RunOptions()
-    assert run_options({}, None) == RunOptions()
+        options_of_flags({}, str(file))
+    assert options_of_flags({"paper": False}, None) == RunOptions()
+    assert options_of_flags({}, None) == RunOptions()
 
 
 def listed_in_help(verb: str, flag: str) -> dict[str, list[str]]:

@@ -17,7 +17,7 @@ from rasterio.enums import ColorInterp
 
 from barpc.base.errors import InputError, OutputError
 from barpc.base.verb_options import ExportOptions
-from barpc.export.colmap import _Pixels
+from barpc.export.colmap import _ShotPixels
 from barpc.export.light import sun_angles
 from barpc.export.targets import TARGETS, export_run
 from barpc.rpcio import read_rpc
@@ -406,7 +406,7 @@ def test_a_picture_has_the_colours_of_its_image(south, tmp_path):
     with rasterio.open(path, "r+") as file:
         file.colorinterp = [getattr(ColorInterp, name) for name in ("blue", "green", "red", "undefined")]
     shot = south.shots[0]
-    pixels = _Pixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
+    pixels = _ShotPixels(replace(shot, file=str(path), entry=replace(shot.entry, size=(50, 40))))
     shown, valid = pixels.read((5, 4, 30, 20))
     assert shown.shape == (20, 30, 3)
     for k, band in enumerate((2, 1, 0)):

@@ -21,7 +21,7 @@ from barpc.base.statistics import SURE
 from barpc.cameras import open_camera
 from barpc.cli import cli
 from barpc.pipeline import AdjustResult, adjust
-from barpc.pipeline.calibrate import _FinishedRun, _OnLine, _refuse_unsure, _row_direction
+from barpc.pipeline.calibrate import _CalibratedRun, _OnLine, _refuse_unsure, _row_direction
 from barpc.pipeline.calibrations import calibrations_of, common_errors, read_calibration
 from barpc.pipeline.proof import PASSED_STATES, prove
 from barpc.report import Run
@@ -402,7 +402,7 @@ def test_runs_of_one_direction_are_refused_with_the_one_that_is_missing(line: Se
         ties = SensorTies.of(f"run{i}", made.views, made.tracks, made.cameras, made.ground)
         directions = np.array([_row_direction(v, s) for v, s in zip(made.views, made.cameras, strict=True)])
         on_line = _OnLine([0, 1], Line(SIZE[0], np.zeros(2), np.zeros(2)), np.full(2, SIZE[0]))
-        found.append(_FinishedRun(Path(f"run{i}"), "", ties, directions, ("a", "b"), on_line, np.arange(2)))
+        found.append(_CalibratedRun(Path(f"run{i}"), "", ties, directions, ("a", "b"), on_line, np.arange(2)))
     assert np.abs(np.concatenate([one.directions for one in found]) - 192.0).max() < 1.0
     learnt = learn([one.ties for one in found])
     with pytest.raises(InputError, match=r"rows run across those of these, near 102 degrees of north are needed"):

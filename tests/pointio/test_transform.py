@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from barpc.base.errors import InputError
-from barpc.pointio.tables import read_transform
+from barpc.pointio.motions import read_transform
 from tests.pointio.conftest import refused
 
 MATRIX = np.eye(4)

@@ -18,12 +18,13 @@ from barpc.ba.terms.term import Finding
 from barpc.base.options import FitOptions, RunOptions
 from barpc.report import quality_checks
 from barpc.report import verdict as verdicts
+from barpc.report.constraints import held_lines
 from barpc.report.measures.block import explanations
-from barpc.report.outcome import Added, Run
-from barpc.report.quality_checks import held_lines
+from barpc.report.outcome import MANY_REJECTED, Added, Run
+from barpc.report.quality_checks import view_status
 from barpc.report.summary.views import FitEntry
 from barpc.report.summary.words import enu, metres
-from barpc.report.verdict import block_verdict, view_status
+from barpc.report.verdict import block_verdict
 from barpc.scene import Tracks
 from barpc.tie.detail import Gap
 from barpc.tie.reference import PEAK, ReferenceControl, ViewMatch
@@ -89,7 +90,7 @@ def test_the_figures_that_decide():
         quality_checks.GOOD_RMSE,
         quality_checks.MIN_TIE_POINTS,
         quality_checks.ENOUGH_GCPS,
-        verdicts.MANY_REJECTED,
+        MANY_REJECTED,
     )
     assert found == (0.5, 30, 3, 0.3)
     found = (quality_checks.SMOOTH_LEFT, verdicts.PRIOR_WIDENED, verdicts.NOISE_LIMIT, verdicts.SURELY)

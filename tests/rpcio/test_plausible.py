@@ -13,7 +13,7 @@ from rasterio.transform import Affine
 
 import barpc
 from barpc.base.errors import FitError, InputError, Remark, RpcError
-from barpc.rpcio.plausible import RasterFrame, doubts_of, reach
+from barpc.rpcio.plausible import RasterFrame, doubts_of, reach_of_corners
 from barpc.sensor.rpc import RPC
 from tests.rpcio.conftest import ended
 
@@ -45,7 +45,7 @@ def test_rpcs_of_coarser_and_finer_products_are_named(times: int) -> None:
 @pytest.mark.parametrize("off", [(500, 0), (-500, 0), (0, 500), (0, -500), (500, -500)])
 def test_an_rpc_that_is_half_an_image_off_is_named(off: tuple[int, int]) -> None:
     assert kinds(the_rpc().crop(*off)) == ["ground"]
-    assert 1.5 < reach(the_rpc().crop(*off), SIZE) < 2.0
+    assert 1.5 < reach_of_corners(the_rpc().crop(*off), SIZE) < 2.0
 
 
 def test_parts_with_their_own_rpc_and_bands_are_right() -> None:
@@ -76,7 +76,7 @@ def test_right_images_have_no_doubt(shared_data: Path) -> None:
 def test_the_case_from_the_field(shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rpcs = [shared_data / f"field_cases/pan_with_ms_rpc/view_0{i}_RPC.TXT" for i in range(3)]
     given = [f"{view},camera={rpc}" for view, rpc in zip(VIEWS, rpcs, strict=True)]
-    assert all(5.0 < reach(barpc.read_rpc(rpc), SIZE) < 7.0 for rpc in rpcs)
+    assert all(5.0 < reach_of_corners(barpc.read_rpc(rpc), SIZE) < 7.0 for rpc in rpcs)
     assert ended("adjust", *given, "-o", tmp_path / "run") == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1

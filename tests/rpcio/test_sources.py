@@ -22,7 +22,7 @@ from barpc.rpcio import (
     write_rpc_vrt,
 )
 from barpc.rpcio.acquisition import read_acquisition
-from barpc.rpcio.sources import described, only_physical
+from barpc.rpcio.sources import only_physical, stated_in_xml
 from tests.rpcio.carriers import seen_by_gdal
 from tests.rpcio.conftest import dimap_v2, grid, rpc_domain, write_image
 
@@ -229,7 +229,7 @@ def test_a_side_file_that_gdal_does_not_look_for_is_found_where_the_image_has_no
 )
 def test_a_vendor_s_xml_says_how_large_its_image_is(tmp_path, text, size):
     (tmp_path / "a.xml").write_text(text)
-    assert described(tmp_path / "a.xml") == (size, False)
+    assert stated_in_xml(tmp_path / "a.xml") == (size, False)
     assert not only_physical(tmp_path / "a.xml")
 
 
@@ -237,7 +237,7 @@ def test_an_xml_without_an_rpc_may_hold_a_physical_camera(tmp_path, rpc):
     (tmp_path / "a.xml").write_text("<isd><ATT><ATTLIST>1 2</ATTLIST></ATT></isd>")
     (tmp_path / "b.xml").write_text(dimap_v2(rpc))
     assert [only_physical(tmp_path / name) for name in ("a.xml", "b.xml", "c.xml")] == [True, False, False]
-    assert described(tmp_path / "a.xml") == (None, True)
+    assert stated_in_xml(tmp_path / "a.xml") == (None, True)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from barpc.rpcio import read_rpc
 from barpc.scene import Tracks, View
 from barpc.sensor.rpc import RPC, altitude_range
 from barpc.tie import TieResult, find_tracks
-from barpc.tie.matchers.matching import MATCHERS
+from barpc.tie.matchers.pair_search import MATCHERS
 from tests.geotiffs import write_image
 from tests.scenes import ImageOptions, Scene
 from tests.tie.stages import common_tracks

@@ -14,10 +14,10 @@ from barpc.base.tasks import Work, store_of
 from barpc.scene import Tracks, View
 from barpc.tie.matchers.features import Keypoints, locate
 from barpc.tie.pairing.epipolar import EpipolarSegments
-from barpc.tie.pairing.overlaps import EVERYWHERE, Pair, Scope, best_pairs, possible_pairs
+from barpc.tie.pairing.overlaps import WHOLE_SCOPE, Pair, Scope, best_pairs, possible_pairs
 
 
-def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = EVERYWHERE) -> list[Pair]:
+def select_pairs(views: Sequence[View], options: TieOptions, scope: Scope = WHOLE_SCOPE) -> list[Pair]:
     """The best partners of every view, and a spanning tree."""
     pairs = possible_pairs(views, options, scope)
     return pairs if scope.only else best_pairs(pairs, len(views), options.neighbours)

@@ -14,8 +14,8 @@ import barpc.tie.pixels as reading
 from barpc.base.errors import DisconnectedError, TiePointError
 from barpc.scene import Tracks
 from barpc.tie import Matches, Scope, TieOptions, find_tracks
+from barpc.tie.linking import pair_counts
 from barpc.tie.pairing.epipolar import epipolar_segments
-from barpc.tie.tracks import pair_counts
 from tests.lanes import rest_slow
 from tests.tie.stages import common_tracks
 

@@ -14,7 +14,7 @@ from barpc.tie import TieOptions
 from barpc.tie.matchers import matching
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
-from barpc.tie.matchers.matching import _latest, _PairSearch
+from barpc.tie.matchers.pair_search import PairSearch, _latest
 from barpc.tie.matchers.report import PairReport, better, enough
 from barpc.tie.pairing.epipolar import EpipolarSegments
 from tests.tie.test_pairs import camera, views
@@ -76,13 +76,13 @@ class Scripted:
 
 
 @pytest.fixture
-def search(in_table) -> Callable[..., _PairSearch]:
+def search(in_table) -> Callable[..., PairSearch]:
     """`search(matcher, **options)`: the search of a pair of like cameras with it."""
 
-    def made(matcher: Any, keypoints: Any = None, **options: Any) -> _PairSearch:
+    def made(matcher: Any, keypoints: Any = None, **options: Any) -> PairSearch:
         ends = tuple(views(camera(0.0), camera(0.0)))
         chosen = TieOptions(matcher=in_table(lambda *_: matcher), **options)
-        return _PairSearch(ends, keypoints or (join_keypoints([]),) * 2, chosen)
+        return PairSearch(ends, keypoints or (join_keypoints([]),) * 2, chosen)
 
     return made
 

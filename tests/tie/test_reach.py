@@ -19,7 +19,7 @@ from barpc.pipeline.loading import load_views
 from barpc.tie import TieOptions, find_tracks
 from barpc.tie.matchers import structural
 from barpc.tie.matchers.features import join_keypoints
-from barpc.tie.matchers.matching import _PairSearch
+from barpc.tie.matchers.pair_search import PairSearch
 from barpc.tie.pairing.epipolar import epipolar_segments
 from barpc.tie.pairing.overlaps import reach_of
 from barpc.tie.patches.oriented import PatchTile
@@ -98,7 +98,7 @@ def test_segments_around_an_epipole_stay_near_their_points() -> None:
 def test_a_search_in_parts_finds_what_a_search_in_one_finds(monkeypatch, sized: Sized, scene) -> None:
     """Bands without votes: every point is looked for alone; how many are correlated together changes nothing."""
     options = TieOptions(matcher="structure", search=20.0)
-    search = _PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
+    search = PairSearch(tuple(scene.views), (join_keypoints([]), join_keypoints([])), options)
     coarse = search.offset
     assert coarse is not None
     whole = structural._GridSearch(*scene.views, 1, coarse).matches()
