@@ -38,7 +38,7 @@ from barpc.report.results import (
 from barpc.report.summary import LeftOutEntry, Summary
 from barpc.report.summary.block import AXES
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import NAMED, counted, enu, median, metres
+from barpc.report.summary.words import NAMED, counted, enu, median, metres, two_digits
 
 _SHAPE = [MOTIONS.index(name) for name in ("tilt east", "tilt north", "twist", "bend east", "bend north")]
 _IMAGE_CHECKED = "The image was checked"
@@ -67,7 +67,7 @@ def block_verdict(run: Run, views: Sequence[ViewEntry]) -> dict[str, Any]:
     look = [view for view in views if view.advice and view.status != "failed"]
     reasons = [view.reservation for view in bad + look]
     reasons += [LeftOutEntry(path, reason).reason_text for path, reason in run.left_out]
-    whole, points = [*_block_reasons(run, views)], [*_ground_reasons(run)]
+    whole, points = [*_block_reasons(run, views)], [*_ground_reasons(run, views)]
     reasons += whole + points
     bands = [*_carried_lines(run)]
     words = {"adjust": adjusted_lines, "check": checked_lines, "match": matched_lines}[run.kind]
@@ -263,17 +263,19 @@ def _of_known_heights(found: Adjustment) -> Iterator[str]:
         )
 
 
-def _ground_reasons(run: Run) -> Iterator[str]:
+def _ground_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
     """Yield reservations on ground points, their files, the reference and altimetry."""
     adjustment, gcps = run.adjustment, run.gcps
     if adjustment is not None:
         yield from reference_reasons(run, adjustment.options.dem_sigma)
-        if (heights := adjustment.altimetry) is not None and heights.why_not:
+        if (heights := adjustment.altimetry) is not None:
             counts = f"{heights.agree} of {heights.near} on the tie points' surface agree, of {heights.given} given"
-            yield (
-                f"The altimetry was not used: {heights.why_not} ({counts}). Check its positions and vertical datum, or "
-                "leave it out."
-            )
+            check = f"({counts}). Check its positions and vertical datum, or leave it out."
+            if heights.why_not:
+                yield f"The altimetry was not used: {heights.why_not} {check}"
+            elif heights.spread > max(NOISE_LIMIT * heights.expected, median([view.gsd_m for view in views])):
+                ratio = two_digits(heights.spread / heights.expected)
+                yield f"The altimetry scatters about the surface by {ratio} times what it states {check}"
         if gcps is not None and adjustment.control is not None:
             yield from control_reasons(gcps.names, adjustment.control)
     for points in (gcps, run.check_points):

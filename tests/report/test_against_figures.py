@@ -25,7 +25,7 @@ from barpc.report.runfiles import ObservationTable, RunFiles
 from barpc.report.summary import published_schema
 from barpc.report.summary.block import DatumEntry
 from barpc.report.summary.views import ViewEntry
-from barpc.report.summary.words import enu, metres
+from barpc.report.summary.words import enu, metres, two_digits
 from barpc.report.verdict import summarize
 from tests.lanes import rest_slow
 from tests.report.worlds import WORLDS
@@ -238,6 +238,14 @@ def _(s, agree, near_, spread, expected, motion):
     assert (spread, expected) == (metres(one.spread_m), metres(one.expected_m))
     assert motion == f"they shifted it by {enu(one.motion_enu_m)}"
     assert share(s, "altimetry", parts=("up",))[0] > 0.5
+
+
+@says(rf"The altimetry scatters about the surface by {NUM} times what it states \((\d+) of (\d+) on .*\)\. Check .*")
+def _(s, ratio, agree, near_):
+    one = s.scene.altimetry
+    assert ratio == two_digits(one.spread_m / one.expected_m)
+    assert (int(agree), int(near_)) == (one.num_agreeing, one.num_near)
+    assert one.spread_m > 2.5 * one.expected_m
 
 
 @says(rf"More than {NUM} % of the tie points of (.*) were rejected; neighbours err in random directions, .*")

@@ -725,6 +725,23 @@ def test_altimetry_says_how_well_it_agrees_or_why_it_holds_nothing():
     assert reason.startswith("The altimetry was not used: they lie elsewhere (")
 
 
+@pytest.mark.parametrize(
+    ("spread", "expected", "words"),
+    [
+        (1.24, 0.5, ""),
+        (1.26, 0.5, "by 2.5 times"),
+        (5.0, 0.5, "by 10 times"),
+        (0.49, 0.1, ""),
+        (0.51, 0.1, "by 5.1 times"),
+    ],
+)
+def test_altimetry_that_scatters_by_a_pixel_and_more_than_it_states_needs_a_look(spread, expected, words):
+    test = SimpleNamespace(agree=70, near=80, spread=spread, expected=expected, motion=np.ones(3), given=90, why_not="")
+    reasons = block_verdict(run_of(adjusted(altimetry=test)), views())["reasons"]
+    assert len(reasons) == bool(words)
+    assert words in "".join(reasons)
+
+
 @pytest.mark.parametrize(("whole", "sharp", "said"), [(87, 0, True), (87, 100, False), (0, 87, False)])
 def test_matches_at_whole_pixels_are_told_unless_as_many_are_sharper(whole, sharp, said):
     pair = {"status": "ok", "names": ("A", "B")}
