@@ -84,10 +84,7 @@ def test_cameras_farther_off_than_stated_blame_no_point(seeds) -> None:
 @pytest.mark.parametrize(
     ("count", "wrong", "size", "least"),
     rest_slow(
-        starmap(
-            pytest.param,
-            [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)],
-        ),
+        starmap(pytest.param, [(6, 3, 8.0, 14), (9, 4, 100.0, 19), (5, 1, 3.0, 16), (5, 1, 30.0, 19), (6, 3, 30.0, 19)])
     ),
 )
 def test_the_right_points_are_used_and_no_other(count, wrong, size, least) -> None:
@@ -425,7 +422,7 @@ def controlled(seed: int, points: int, views: int, sigma: float, tracks: int) ->
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("worlds", "most"), [(6, 1), pytest.param(40, 2, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("worlds", "most"), [(6, 1), (40, 2)])
 def test_of_forty_worlds_with_control_as_stated_none_loses_it(worlds: int, most: int) -> None:
     unused = 0
     for seed in range(worlds):

@@ -27,6 +27,7 @@ from barpc.ba.constraints.registration import (
     search_shift,
 )
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
+from barpc.base.options import AdjustOptions
 from barpc.cameras import open_camera
 from barpc.scene import Altimetry, GroundPoints, Tracks, View
 from barpc.sensor.corrected import Corrected, Correction
@@ -284,15 +285,8 @@ def test_heights_that_contradict_control_points_are_not_used(scene: Any):
     chosen = np.arange(0, 900, 180)
     point, view = np.repeat(np.arange(5), 3), np.tile(np.arange(3), 5)
     rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-    gcps = GroundPoints(
-        tuple("abcde"),
-        true[chosen],
-        np.full((5, 3), 0.3),
-        point,
-        view,
-        tracks.xy[rows] + rng.normal(0, 0.1, (15, 2)),
-        np.full(15, 0.3),
-    )
+    xy = tracks.xy[rows] + rng.normal(0, 0.1, (15, 2))
+    gcps = GroundPoints(tuple("abcde"), true[chosen], np.full((5, 3), 0.3), point, view, xy, np.full(15, 0.3))
     alone = adjust_tracks(views, tracks, gcps=gcps)
     geoid = adjust_tracks(views, tracks, gcps=gcps, altimetry=heights(6, off=-48.0))
     assert geoid.altimetry is not None
@@ -308,8 +302,6 @@ def test_heights_that_contradict_control_points_are_not_used(scene: Any):
 @pytest.mark.slow
 def test_heights_and_a_terrain_hold_together(scene: Any):
     """A terrain 3 m too high with 5 m stated does not move what the heights know."""
-    from barpc.base.options import AdjustOptions
-
     views, tracks, true = scene
 
     def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:

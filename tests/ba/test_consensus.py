@@ -79,13 +79,7 @@ def test_groups_without_noise_are_two(share: float, noise: float) -> None:
 
 @pytest.mark.landing(2)
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("share", "apart"),
-    [
-        (0.9, 1.5),
-        *(pytest.param(*row, marks=pytest.mark.slow) for row in ((0.3, 1.2), (0.5, 1.0), (0.25, 3.0))),
-    ],
-)
+@pytest.mark.parametrize(("share", "apart"), [(0.9, 1.5), (0.3, 1.2), (0.5, 1.0), (0.25, 3.0)])
 def test_a_mixture_is_the_likeliest_one(share: float, apart: float) -> None:
     z = groups(400, share, apart)
     found, expected = told(z), likeliest(z)
@@ -139,10 +133,8 @@ def across(problem: Problem, projected: Any, pair: int) -> tuple[np.ndarray, np.
 def residual_of(problem: Problem, projected: Any, offset: np.ndarray, pair: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (2, K) of which a pair's first ones are across the epipolar lines by so much; the rows in use."""
     first, second, normal = across(problem, projected, pair)
-    residual, use = (
-        np.zeros((2, len(problem.structure.view))),
-        np.zeros(len(problem.structure.view), dtype=bool),
-    )
+    residual = np.zeros((2, len(problem.structure.view)))
+    use = np.zeros(residual.shape[1], dtype=bool)
     for n, value in enumerate(offset):
         residual[:, first[n]] += value / np.sqrt(2) * normal[n, :2]
         residual[:, second[n]] += value / np.sqrt(2) * normal[n, 2:]

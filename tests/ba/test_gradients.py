@@ -112,13 +112,7 @@ def _point_priors():
     index = np.array([0, 2])
     none = np.zeros(0, dtype=int)
     gcps = GroundPoints(
-        ("a", "b"),
-        ground_from_ecef(points[index]),
-        [[0.2, 0.3, 0.5]] * 2,
-        none,
-        none,
-        np.zeros((0, 2)),
-        np.zeros(0),
+        ("a", "b"), ground_from_ecef(points[index]), [[0.2, 0.3, 0.5]] * 2, none, none, np.zeros((0, 2)), np.zeros(0)
     )
     return points, {
         "ground_control": ground_control(gcps, index),

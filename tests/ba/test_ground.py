@@ -160,10 +160,7 @@ def test_blocks_with_and_without_errors_in_common_are_joined() -> None:
     gcps = GroundPoints(
         ("a",), _ground(points[:1]), [[0.1, 0.2, 0.4]], [0], [0], np.zeros((1, 2)), np.ones(1)
     )  # fmt: skip
-    control, flat = (
-        ground_control(gcps, np.array([0])),
-        flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0),
-    )
+    control, flat = ground_control(gcps, np.array([0])), flat_heights(points, np.array([1, 2]), 300.0, 2.0, 6.0)
     none = replace(heights(3, dem=None), weak=np.zeros(3, dtype=bool))
     joined = held_by(replace(none, control=(control,), placed=flat), points)
     assert joined.index.tolist() == [0, 1, 2]

@@ -25,8 +25,8 @@ TABLE = cases()
 SEEDS = (0, 1, 2)
 EDGES = tuple(np.arange(1, 8) * 2500.0)
 FEW_STEPS = ("steps 0.1 px", 1000)  # steps and splines are found in both
-SHAKEN = [((1,), 1500), pytest.param(SEEDS, 3000, marks=pytest.mark.nightly)]
-FOUND = [FEW_STEPS, pytest.param("all", 3000, marks=pytest.mark.nightly)]
+SHAKEN = [((1,), 1500), (SEEDS, 3000)]
+FOUND = [FEW_STEPS, ("all", 3000)]
 
 
 @once
@@ -66,7 +66,7 @@ def shaken(made, view, wave):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("seeds", "tracks"), [SHAKEN[0], pytest.param(SEEDS, 3000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("seeds", "tracks"), SHAKEN)
 def test_jitter_is_followed_to_the_noise_and_heights_are_not_bent(seeds, tracks):
     name, many = "jitter 0.5 at 1 Hz", {"tracks": tracks}
     assert 0.005 < medians(name, lambda j: j.across, seeds, **many) < 0.02  # of tie points with 0.1 px

@@ -178,7 +178,7 @@ def test_an_image_that_was_turned_a_little_is_met_in_the_image_with_all_its_ties
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("view", [0, pytest.param(1, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("view", [0, 1])
 @as_stated()
 def test_a_step_beside_an_image_that_was_turned_is_the_only_one_found_and_is_followed(turned, view) -> None:
     """Beside a model in space what the turn leaves looks like steps, too."""
@@ -527,10 +527,7 @@ def test_a_camera_that_turns_faster_and_faster_is_followed_by_a_drift_of_a_furth
     assert found.held_out_rms.max() < 0.11
 
 
-@pytest.mark.parametrize(
-    ("rms", "shared", "waves"),
-    [(0.029, 0.029, False), (0.031, 0.0, True), (0.0, 0.031, True)],
-)
+@pytest.mark.parametrize(("rms", "shared", "waves"), [(0.029, 0.029, False), (0.031, 0.0, True), (0.0, 0.031, True)])
 def test_waves_are_what_is_smooth_or_what_neighbours_share(rms, shared, waves) -> None:
     outcome = outcome_of(rms)
     outcome.smooth.shared = np.array([0.0, shared])

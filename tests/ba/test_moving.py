@@ -315,12 +315,7 @@ def test_rows_of_which_more_ties_move_than_stand_are_told() -> None:
         assert all(one.moves and one.start == 0.0 and one.stop < 0.2 * rows for one in found)
 
 
-CASES = [
-    (2, 0.2, 2.0, 1, 0.02),
-    (3, 0.25, 6.0, 3, 0.1),
-    (3, 0.35, 2.0, 0, 0.02),
-    (4, 0.45, 1.5, 2, 0.05),
-]
+CASES = [(2, 0.2, 2.0, 1, 0.02), (3, 0.25, 6.0, 3, 0.1), (3, 0.35, 2.0, 0, 0.02), (4, 0.45, 1.5, 2, 0.05)]
 
 
 @pytest.mark.landing(1)
@@ -365,7 +360,7 @@ def test_vehicles_are_no_group(seed: int) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("axis", rest_slow([1, 0], mark=pytest.mark.nightly))
+@pytest.mark.parametrize("axis", [1, 0])
 def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
     block = simulate_block(3, 700, seed=7, attitude=10e-6, position=2.0)
     ties, size = block.tracks, block.views[1].size[axis]

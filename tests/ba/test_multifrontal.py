@@ -35,8 +35,7 @@ def _matrix(pairs: np.ndarray, n: int, q: int, seed: int = 0) -> Blocks:
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
-    ("sites", "leaf", "kept"),
-    diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9]),
+    ("sites", "leaf", "kept"), diagonal([(4, 15, 1), (7, 6, 3), (60, 1, 2), (1, 1, 1)], [7, 1, 32, 1000], [0.0, 1e9])
 )
 def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(sized: Sized, sites, leaf, kept) -> None:
     sized(front_views=leaf)
@@ -193,12 +192,7 @@ def test_a_prior_of_an_earlier_block_ties_its_views_whatever_they_share(sized: S
     many, names = _square(48), ("view_0045", "view_0002", "view_0020")
     root = np.random.default_rng(0).normal(size=(27, 27)) + 3.0 * np.eye(27)
     prior = BlockPrior(
-        names,
-        "rotation+translation",
-        1,
-        np.ones((3, 9)),
-        root.T @ root,
-        np.array(centers_of(many))[[45, 2, 20]],
+        names, "rotation+translation", 1, np.ones((3, 9)), root.T @ root, np.array(centers_of(many))[[45, 2, 20]]
     )
     both = []
     for most in (0, 10**6):
