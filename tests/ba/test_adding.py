@@ -60,8 +60,6 @@ def test_a_block_that_views_are_taken_off_knows_of_the_others_what_it_knew(kept:
     np.testing.assert_allclose(np.linalg.inv(found.dense()), covariance[np.ix_(at, at)], rtol=1e-8, atol=1e-9)
     assert found.names == tuple(prior.names[i] for i in sorted(kept))
     np.testing.assert_array_equal(found.params, prior.params[np.sort(kept)])
-    assert found.scene is not None
-    assert prior.scene is not None
     whole = prior.scene.own + prior.scene.by_unknown @ covariance @ prior.scene.by_unknown.T
     marginal = found.scene.own + found.scene.by_unknown @ covariance[np.ix_(at, at)] @ found.scene.by_unknown.T
     np.testing.assert_allclose(marginal, whole, rtol=1e-8, atol=1e-8)

@@ -82,7 +82,6 @@ def test_a_wrong_rpc_is_named_and_the_others_are_as_without_it(monkeypatch, chan
     if look != "axes":
         monkeypatch.setattr(foreign_camera, "AMBIGUOUS_VIEWS", 2)
     found, alone = adjust_tracks(block.views, block.tracks), adjust_tracks(*without(block, 2))
-    assert found.apart is not None
     assert found.apart.views == (2,)
     assert found.in_space_rms is None
     assert not found.findings
@@ -297,7 +296,6 @@ def test_a_foreign_rpc_leaves_the_others_as_without_it(seed: int) -> None:
     world = make("foreign", seed)
     (odd,) = world.plan.deliver
     found, worse, shape = beside(world, odd)
-    assert found.apart is not None
     assert found.apart.views == (odd,)
     assert found.in_space_rms is None
     assert abs(worse) < 0.005

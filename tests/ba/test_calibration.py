@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from barpc.ba import AdjustOptions, adjust_tracks
 from barpc.ba.calibration import (
     Learnt,
     Line,
@@ -20,12 +19,11 @@ from barpc.ba.calibration import (
     normal_equations,
     share_shown,
 )
-from barpc.ba.interior import Calibration, CommonErrors, LineCurve
+from barpc.ba.interior import LineCurve
 from barpc.base.errors import InputError
 from barpc.sensor.image_corrections import Calibrated, ColumnSpline
 from barpc.simulate import simulate_block
 from benchmarks.calibrate import SMALL, Scene, Sensor, any_looks, off, others, parts, said, scene
-from tests.ba.conftest import as_stated, centers_of, least_squares
 
 SIZE = (6000, 4000)
 
@@ -186,37 +184,6 @@ def test_blocks_of_other_widths_and_too_few_are_refused() -> None:
     with pytest.raises(InputError, match="of 2 widths"):
         learn([made, made, replace(made, width=50)])
     assert learn([made] * 3).curve.width == SIZE[0]  # three are enough
-
-
-@as_stated()
-def test_errors_in_common_move_the_unknowns_as_the_covariance_says() -> None:
-    """Tie points that one of the errors moved by its standard deviation, adjusted anew."""
-    block = simulate_block(3, 300, seed=2, size=(2000, 2000), noise=0.05)
-    rng = np.random.default_rng(5)
-    curve = ColumnSpline(2000, rng.normal(0, 0.1, (28, 2)))
-    size = 2 * 28
-    root = rng.normal(0, 0.05, (size, 2))
-    used = Calibration("", curve, root @ root.T, "", "a")
-    options = AdjustOptions(jitter="off", drift=1, noise_floor=0.0, model="rotation+translation")
-    common, given = CommonErrors((used, None, used)), {"hold_out": False, "centers": centers_of(block)}
-    first = adjust_tracks(block.views, block.tracks, options, common=common, **given)
-    plain = adjust_tracks(block.views, block.tracks, options, **given)
-    shared = first.covariance.shared
-    assert shared is not None
-    shared = shared.by_unknown
-    assert shared.shape[1] == 2
-    moved = common.moved(block.tracks.view, block.tracks.xy[:, 0])
-    for k in range(2):
-        tracks = replace(block.tracks, xy=block.tracks.xy + moved[k])
-        ends = [
-            least_squares(replace(block, tracks=one.select(plain.inlier)), options, plain.noise)[1]
-            for one in (tracks, block.tracks)
-        ]
-        change = (ends[0].state.params - ends[1].state.params).ravel()
-        np.testing.assert_allclose(change, shared[:, k], atol=0.03 * np.abs(shared[:, k]).max())
-    np.testing.assert_allclose(first.covariance.full, plain.covariance.full + shared @ shared.T)
-    np.testing.assert_allclose(first.covariance.view(0, 2), first.covariance.full[:9, 18:27], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(first.covariance.variances().ravel(), np.diag(first.covariance.full), rtol=1e-6)
 
 
 @pytest.mark.nightly

@@ -138,7 +138,6 @@ def test_ground_that_moves_within_a_pass_moves_by_more_than_matches_err(block: A
         assert np.mean(found.moving != member[tracks.point]) < 0.02
         (one,) = (finding for finding in found.findings if finding.motion is not None)
         # the largest displacement across the base, 0.5 m a pixel: less than the whole motion, which may be height
-        assert one.motion is not None
         assert 1.0 < one.motion.metres < 11.0
 
 
@@ -178,7 +177,6 @@ def test_a_view_that_most_contradict_is_left_out_where_the_others_depend_on_it(m
     three = adjust_tracks(made.views[:3], tracks.select(tracks.view < 3))
     monkeypatch.setattr(models, "SURE_TREND", 1e-9)
     alone = adjust_tracks(made.views, mixed)
-    assert alone.apart is not None
     assert (alone.apart.views, alone.apart.clear) == ((3,), True)
     np.testing.assert_array_equal(alone.params[3], 0.0)
     off = np.abs(alone.params[:3] - three.params).max()

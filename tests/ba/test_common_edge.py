@@ -60,7 +60,6 @@ def test_an_edge_of_all_images_is_told_once() -> None:
     assert one.axis == "columns"
     words = r"about (\d+) on are displaced by (0\.\d+) px in all images.*`detectors = \[(\d+)\]`"
     said = re.search(words, one.sentence)
-    assert said is not None
     assert 198 <= int(said[1]) <= 202
     assert int(said[1]) == int(said[3])
     assert float(said[2]) == pytest.approx(0.5, abs=0.03)
@@ -105,7 +104,6 @@ def test_only_columns_from_the_same_place_in_all_images_are_alike() -> None:
 
 def test_the_prior_is_of_differences_alone() -> None:
     prior = JointPrior.of_alike(places((0, 200.0), (0, 200.0), (0, 200.0)), 3, 5)
-    assert prior is not None
     same = np.tile([7.0, 7.0, 7.0, 0.4, -0.3], (3, 1))
     assert prior.cost(same) == pytest.approx(0.0, abs=1e-6)
     other = same.copy()

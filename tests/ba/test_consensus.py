@@ -73,7 +73,6 @@ def on_one_plane(place: np.ndarray, offset: np.ndarray, spread: np.ndarray) -> n
 def test_groups_without_noise_are_two(share: float, noise: float) -> None:
     z = np.repeat([0.0, 1.0], [round(100 * share), round(100 * (1 - share))])
     found = told(z + noise * np.random.default_rng(0).standard_normal(100))
-    assert found is not None
     assert (found.share, found.apart) == pytest.approx((share, 1.0), abs=1e-6)
 
 
@@ -83,7 +82,6 @@ def test_groups_without_noise_are_two(share: float, noise: float) -> None:
 def test_a_mixture_is_the_likeliest_one(share: float, apart: float) -> None:
     z = groups(400, share, apart)
     found, expected = told(z), likeliest(z)
-    assert found is not None
     assert found.share == pytest.approx(expected[0], abs=2e-3)
     assert found.apart == pytest.approx(expected[1], rel=2e-3)
     assert (found.share, found.apart) == pytest.approx((min(share, 1 - share), apart), rel=0.05)
@@ -146,7 +144,6 @@ def test_two_groups_are_told_by_their_pair_share_and_distance(seen) -> None:
     for pair, views in enumerate([(0, 1), (0, 2), (1, 2)]):
         offset = groups(300, 0.3, 2.0) + 5.0  # what all have in common is a camera's error
         found = two_groups(seen[0].structure, *_given(seen, offset, pair))
-        assert isinstance(found[0], TwoGroups)
         assert [group.views for group in found] == [views]
         assert found[0].share == pytest.approx(0.3, abs=0.01)
         assert found[0].apart == pytest.approx(2.0, abs=0.02)

@@ -77,7 +77,6 @@ def test_all_detectors_of_an_image_are_one_hypothesis() -> None:
     assert {(one.kind, one.view) for one in found.findings} == {("step", 1)}
     assert len(found.findings) == len(EDGES)
     for n, one in enumerate(sorted(found.findings, key=lambda row: row.where[1])):  # type: ignore[index]
-        assert one.where is not None
         assert one.where[1] / seen.size[0, 1] == pytest.approx(EDGES[n], abs=0.01)
         # cameras may follow a trend of the columns: three parameters of either coordinate
         np.testing.assert_allclose(one.size, SIZES[:, n + 1], atol=0.1)

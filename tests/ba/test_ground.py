@@ -209,12 +209,10 @@ def test_how_tie_points_lie_to_a_terrain_is_a_median_and_its_deviation() -> None
     made = replace(heights(dem=hill), weak=np.arange(6) >= 3)
     seen = np.array([1, 1, 1, 1, 1, 0], dtype=bool)
     found = made.test(points, seen)
-    assert found is not None
     assert (found.held, found.known, found.total, found.bias) == (1, 4, 5, 20.0)
     assert found.offset == pytest.approx(5.5, abs=1e-3)  # of 3, 4, 7 and 900
     assert found.spread == pytest.approx(1.4826 * 2.0, abs=2e-3)  # of 2.5, 1.5, 1.5, 894.5
     none = made.test(placed(-2500.0, 0.0, np.full(6, 300.0)), seen)
-    assert none is not None
     assert (none.held, none.known) == (0, 0)
     assert np.isnan([none.offset, none.spread]).all()
     assert replace(made, dem=None).test(points, seen) is None

@@ -128,7 +128,6 @@ def test_terms_that_were_found_are_estimated_with_the_cameras_and_all_ties_come_
     found = one.with_terms()
     (term,) = found.findings
     waves = waves_of(found)
-    assert waves is not None
     own = waves.steps[1, 0] if term.kind == "step" else waves.periods[1]
     np.testing.assert_array_equal(own, term.where if term.kind == "step" else [term.period])
     assert np.isinf(waves.steps[[0, 2]]).all()
@@ -160,7 +159,6 @@ def test_steps_of_all_images_are_terms_where_splines_and_detectors_leave_more() 
     found = one.with_terms()
     waves = waves_of(found)
     assert sorted(term.view for term in found.findings) == [0, 1, 2]
-    assert waves is not None
     assert waves.count == 0
     assert found.outcome.inlier.mean() > 0.99
 
@@ -215,7 +213,6 @@ def test_splines_and_detectors_that_are_asked_for_are_taken_and_none_in_a_sound_
         one = solved(**given)
         found = one.with_splines()
         waves = waves_of(found)
-        assert waves is not None
         assert (waves.count, waves.edges.shape) == (count, (3, edges))
         assert edges == 0 or waves.edges.tolist() == [[2499.5, 8999.5]] * 3  # between pixels
         assert found.asked["jitter"] is one.found.outcome.smooth
@@ -255,7 +252,6 @@ def test_splines_are_as_dense_as_what_shakes_the_images_asks_for(case: tuple[int
     assert one.found.has_waves
     found = one.with_splines()
     taken = waves_of(found)
-    assert taken is not None
     assert least <= taken.count <= 23
     assert found.after.error < 0.5 * one.found.after.error
     off = solved(shaken(0.5, waves), tracks=tracks, jitter="off")
@@ -270,8 +266,6 @@ def test_a_step_that_jitter_hid_is_found_beside_splines() -> None:
     found = with_terms_beside_splines(smooth, beside, one.parts, one.options)
     before, waves = waves_of(smooth), waves_of(found)
     assert ("step", 1) in [(term.kind, term.view) for term in found.findings]
-    assert before is not None
-    assert waves is not None
     assert waves.count == before.count > 0
     assert found.after.error < 0.8 * smooth.after.error
     params = found.final.params[1, found.problem.cameras.unknowns.in_waves][waves.kinds[2]]
@@ -299,7 +293,6 @@ def test_what_was_found_are_unknowns_of_the_images_with_the_sizes_found() -> Non
     ]
     layout = image_terms._layout_of(parts, 4)
     waves, params = layout.additional, layout.start
-    assert params is not None
     assert (waves.count, waves.edges.shape, waves.steps.shape) == (0, (4, 0), (4, 2, 5))
     np.testing.assert_array_equal(waves.steps[2], [rows, decay])
     np.testing.assert_array_equal(waves.steps[1, 0], decay)

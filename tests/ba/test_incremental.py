@@ -70,7 +70,6 @@ def test_strips_and_swings_are_read_as_they_were_written_and_a_new_view_has_none
         return replace(prior_of(), layout=AdditionalParameters(0, **{kind: value}))
 
     found = again(prior(given), tmp_path).waves(("c", "new", "a"))
-    assert found is not None
     np.testing.assert_array_equal(getattr(found, kind)[[2, 0]], given)
     assert np.isinf(getattr(found, kind)[1]).all()
     assert found.size == size
@@ -82,7 +81,6 @@ def test_a_scene_is_read_as_it_was_written_and_a_damaged_one_is_refused(tmp_path
     rng = np.random.default_rng(1)
     scene = EarlierScene(rng.normal(size=(10, 6)), np.eye(10), 300.0)
     found = again(replace(prior_of(), scene=scene), tmp_path).scene
-    assert found is not None
     np.testing.assert_array_equal(found.by_unknown, scene.by_unknown)
     np.testing.assert_array_equal(found.own, scene.own)
     assert found.radius == 300.0
@@ -174,7 +172,6 @@ def test_a_large_block_leaves_a_sparse_matrix_that_says_the_same(sized: Sized, t
     dense = block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0))
     sized(dense_views=0)
     read = again(block_prior(solve(made, fixed=("view_0001",), min_convergence=60.0)), tmp_path)
-    assert read.less is not None
     assert len(read.less) == 3  # all heights are held, and wrong together
     scale = np.sqrt(np.outer(dense.information.diagonal(), dense.information.diagonal()))
     np.testing.assert_allclose(read.dense() / scale, dense.information / scale, atol=2e-8)
@@ -201,7 +198,6 @@ def test_a_layout_of_splines_that_no_block_has_is_refused(tmp_path, splines: int
         assert "do not go together" in refused(given, tmp_path)
         return
     read = again(given, tmp_path)
-    assert read.layout is not None
     assert read.layout.count == splines
     np.testing.assert_array_equal(read.layout.edges, edges)
 
@@ -210,12 +206,10 @@ def test_views_go_on_with_their_own_detectors_and_new_ones_with_none() -> None:
     edges = np.array([[5.0, np.inf], [7.0, 9.0]])
     prior = replace(prior_of(), layout=AdditionalParameters(9, edges))
     waves = prior.waves(("new", "c", "a"))
-    assert waves is not None
     assert waves.count == 9
     np.testing.assert_array_equal(waves.edges, [[np.inf] * 2, [7.0, 9.0], [5.0, np.inf]])
     none = np.zeros((2, 0))
     for layout, some in ((None, False), (AdditionalParameters(0, none), False), (AdditionalParameters(9, none), True)):
         assert (replace(prior, layout=layout).waves(("a",)) is not None) == some
     only_edges = replace(prior, layout=AdditionalParameters(0, edges)).waves(("a",))
-    assert only_edges is not None
     assert only_edges.count == 0

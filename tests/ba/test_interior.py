@@ -11,7 +11,6 @@ from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, pair_heights
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.report.measures.views import _shared_errors, moved_in_space
-from barpc.sensor.corrected import Corrected
 from barpc.sensor.image_corrections import ColumnSpline
 from barpc.sensor.triangulation import intersect_pair
 from barpc.simulate import SimulatedBlock, simulate_block
@@ -51,15 +50,13 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     plain = adjust_tracks(block.views, block.tracks, options, **given)
     np.testing.assert_array_equal(found.points, plain.points)
     assert (found.covariance.reduced.common is not None) == held
-    shared = found.covariance.shared
-    assert shared is not None
+    shared = found.covariance.shared.by_unknown
+    np.testing.assert_allclose(found.covariance.full, plain.covariance.full + shared @ shared.T)
     index = np.flatnonzero(np.isfinite(plain.points).all(axis=1))
     moves, moved = found.covariance.shared_moves(index), common.moved(block.tracks.view, block.tracks.xy[:, 0])
     middle = block.truth.ground.mean(axis=0)
     known = _shared_errors(found, 0, middle)
-    assert known is not None
     sensor, seen = plain.bases[0], np.zeros((2, 0))
-    assert isinstance(sensor, Corrected)
     assert moves.shape[2] == len(moved) == common.count == 4
     assert not moved[:, block.tracks.view == 2].any()
     rows = [np.flatnonzero(block.tracks.view == view) for view in (0, 1)]
@@ -74,10 +71,12 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
                 replace(block, tracks=tracks.select(plain.inlier)), options, plain.noise, given.get("dem")
             )
             sensors = problem.cameras.unknowns.corrected(end.state.params, block.views)
-            ends.append((sensors[0], end.state.points))
+            ends.append((sensors[0], end.state))
             levels.append(intersect_pair(sensors[:2], [tracks.xy[own] for own in rows], alt)[:, 2])
         heights = np.column_stack([heights, (levels[0] - levels[1]) / 2])
-        wanted = (ends[0][1] - ends[1][1])[index] / 2
+        wanted = (ends[0][1].params - ends[1][1].params).ravel() / 2
+        np.testing.assert_allclose(shared[:, k], wanted, atol=0.02 * np.abs(wanted).max())
+        wanted = (ends[0][1].points - ends[1][1].points)[index] / 2
         np.testing.assert_allclose(moves[..., k], wanted, atol=0.02 * np.abs(wanted).max())
         change = (ends[0][0].project(middle) - ends[1][0].project(middle)) / 2
         seen = np.column_stack([seen, change - known[1][:, k]])
@@ -114,7 +113,6 @@ def test_what_images_share_is_in_every_covariance_sparse_and_dense(sized: Sized,
     own, found = (adjust_tracks(block.views, block.tracks, options, common=one, **given).covariance
                   for one in (CommonErrors((None,) * 6), common))  # fmt: skip
     assert found.factor.method == ("dense" if most else "multifrontal")
-    assert found.shared is not None
     q, shared = own.num_unknowns, found.shared.by_unknown
     more = shared @ shared.T
     whole = own.joint(np.arange(6)) + more

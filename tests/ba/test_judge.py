@@ -69,7 +69,6 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
     assert (one.kind, one.view) == ("step", where["view"])
     assert len(found.findings) == 1
     assert found.apart is None  # no RPC of another image
-    assert one.where is not None
     size = block.views[one.view].size[where["axis"]]
     ends = np.array(one.where[1:3]) / size
     assert one.where[0] == where["axis"]
@@ -103,7 +102,6 @@ def test_what_fades_is_named_with_its_length() -> None:
     block, tracks = flawed(3, 2500, where)
     found = adjusted(block, tracks)
     assert [(one.kind, one.view) for one in found.findings] == [("decay", 1)]
-    assert found.findings[0].where is not None
     rows = block.views[1].size[1]
     assert 1.0 / found.findings[0].where[4] == pytest.approx(0.05 * rows, rel=0.25)
     assert np.hypot(*found.findings[0].size) == pytest.approx(4.0, rel=0.1)
@@ -122,7 +120,6 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     assert [one.kind for one in found.findings] == ["transient"] * 4
     assert sorted(one.view for one in found.findings) == [0, 1, 2, 3]
     for one in found.findings:
-        assert one.where is not None
         rate = 1.0 / (0.02 * rows)
         assert one.where[4] == pytest.approx(rate if first == 0.0 else -rate, rel=0.1)
     near = (away < 0.1) & ~found.held_out
@@ -146,7 +143,6 @@ def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[fl
     (one,) = found.findings
     assert (one.kind, one.view, one.where) == ("sinusoid", 1, None)
     rows = block.views[1].size[1]
-    assert one.period is not None
     assert rows / one.period == pytest.approx(rows / period, abs=0.2)  # waves of the image
     assert np.hypot(*one.size) == pytest.approx(px, abs=0.02)
     assert one.or_of == ()
@@ -197,7 +193,6 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
 def test_the_smaller_part_is_said_to_lie_off() -> None:
     block, tracks = flawed(2, 1500, {**ROWS, "start": 0.15, "view": 1})
     found = adjusted(block, tracks).findings[0]
-    assert found.where is not None
     assert found.where[1] < 0.0 < found.where[2] < 0.2 * block.views[found.view].size[1]
 
 
@@ -276,7 +271,6 @@ def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -
     by_kind = {one.kind == "sinusoid": one for one in found.findings}
     assert by_kind[True].period == pytest.approx(rows / 7.0, rel=0.01)
     assert np.hypot(*by_kind[True].size) == pytest.approx(0.8, abs=0.05)
-    assert by_kind[False].where is not None
     ends = np.array(by_kind[False].where[1:3]) / block.views[30].size[1]
     assert np.abs(ends - 0.5).min() < 0.02
     assert not found.left

@@ -150,7 +150,6 @@ def test_a_group_is_proposed_where_its_ties_lie() -> None:
     block, seen = seen_of(made, tracks)
     (one,) = MovingObjects.of(seen)
     group = one.group
-    assert group is not None
     # no unknowns of a camera
     assert (one.NAME, one.view, one.columns.shape[1], len(one.sigma)) == ("moving_objects", -1, 0, 0)
     tracks_of = {(cell, point) for cell, point in zip(group.cell.tolist(), block.point.tolist(), strict=True)}
@@ -289,9 +288,7 @@ def test_control_points_on_ground_that_moved_hold_nothing(seed: int) -> None:
     )
     found = adjust_tracks(made.views, tracks, gcps=gcps)
     (one,) = [f for f in found.findings if f.kind == "moving_objects"]
-    assert one.motion is not None
     assert one.motion.gcps == ("P0", "P1", "P2")
-    assert found.control is not None
     assert found.control.used.tolist() == [False] * 3 + [True] * 3
     assert not found.gcp_inlier[gcps.point < 3].any()
     still = ~inside & (np.bincount(tracks.point) > 0)
@@ -326,7 +323,6 @@ def test_a_cloud_is_named_and_the_scene_is_as_without_it(case: tuple[int, float,
     block, tracks, moves = drifting(views, 900, part, metres, seed, outliers=outliers)
     found, without = (adjust_tracks(block.views, ties) for ties in (tracks, tracks.select(~moves)))
     (one,) = [f for f in found.findings if f.kind == "moving_objects"]
-    assert one.motion is not None
     assert one.motion.share == pytest.approx(part, abs=0.03)
     assert one.motion.metres == pytest.approx(metres, rel=0.15)
     assert one.motion.between == (0, views - 1)
