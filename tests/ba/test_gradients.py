@@ -165,13 +165,6 @@ def test_priors_on_points_have_the_derivatives_of_central_differences(name):
         assert slope == pytest.approx(wanted, rel=1e-6, abs=1e-6)
 
 
-def test_a_terrain_prior_measures_the_distance_along_the_vertical():
-    points, blocks = _point_priors()
-    ground = ground_from_ecef(points[[0, 2]])
-    alt = 100.0 + 800.0 * (ground[:, 0] - 5.4) + 300.0 * (ground[:, 1] - 43)
-    np.testing.assert_allclose(blocks["terrain_heights"].apart(points)[:, 0] * 3.0, ground[:, 2] - alt, atol=1e-6)
-
-
 def test_priors_on_cameras_have_the_derivatives_of_central_differences():
     rng = np.random.default_rng(0)
     params = rng.normal(size=(3, 6))

@@ -10,7 +10,7 @@ import pytest
 from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, pair_heights
 from barpc.ba.interior import Calibration, CommonErrors
 from barpc.base.geodesy import Array, ecef_from_ground, enu_basis, ground_from_ecef
-from barpc.report.measures.views import _shared_errors, moved_in_space
+from barpc.report import Run, summarize
 from barpc.sensor.image_corrections import ColumnSpline
 from barpc.sensor.triangulation import intersect_pair
 from barpc.simulate import SimulatedBlock, simulate_block
@@ -54,9 +54,9 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
     np.testing.assert_allclose(found.covariance.full, plain.covariance.full + shared @ shared.T)
     index = np.flatnonzero(np.isfinite(plain.points).all(axis=1))
     moves, moved = found.covariance.shared_moves(index), common.moved(block.tracks.view, block.tracks.xy[:, 0])
-    middle = block.truth.ground.mean(axis=0)
-    known = _shared_errors(found, 0, middle)
-    sensor, seen = plain.bases[0], np.zeros((2, 0))
+    view, seen = block.views[0], np.zeros((2, 0))
+    middle = view.sensor.localize((np.array(view.size) - 1) / 2, view.altitude)
+    in_image = common.moved(np.array([0]), plain.sensors[0].project(middle)[:1])[:, 0].T
     assert moves.shape[2] == len(moved) == common.count == 4
     assert not moved[:, block.tracks.view == 2].any()
     rows = [np.flatnonzero(block.tracks.view == view) for view in (0, 1)]
@@ -79,15 +79,14 @@ def test_points_and_the_scene_move_as_in_a_block_adjusted_anew(held: bool) -> No
         wanted = (ends[0][1].points - ends[1][1].points)[index] / 2
         np.testing.assert_allclose(moves[..., k], wanted, atol=0.02 * np.abs(wanted).max())
         change = (ends[0][0].project(middle) - ends[1][0].project(middle)) / 2
-        seen = np.column_stack([seen, change - known[1][:, k]])
+        seen = np.column_stack([seen, change - in_image[:, k]])
     pairs = [pair_heights(one, 0, 1) for one in (plain, found)]
     for name, off in (("absolute", heights), ("relative", heights - heights.mean(axis=0))):
         before, after = (getattr(one, name) for one in pairs)
         assert after**2 - before**2 == pytest.approx((off**2).sum(axis=1).mean(), rel=0.05), name
     # what cameras follow of a displacement is not off in the image
-    model = "rotation+translation"
-    before = moved_in_space(sensor, plain.covariance.view(0), model, middle)[1]
-    after = moved_in_space(sensor, found.covariance.view(0), model, middle, None, known)[1]
+    runs = [Run("adjust", block.views, (), block.tracks, adjustment=one) for one in (plain, found)]
+    before, after = (np.array(summarize(run).views[0].correction.center_sigma_px) for run in runs)
     np.testing.assert_allclose(after**2, before**2 + (seen**2).sum(axis=1), rtol=0.03)
     some = index[::7]
     more = found.covariance.points(some) - plain.covariance.points(some)
