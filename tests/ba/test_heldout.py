@@ -27,7 +27,7 @@ from barpc.base.errors import InputError
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.scene import GroundPoints
 from barpc.sensor.corrected import Corrected
-from barpc.simulate import SimulatedBlock, simulate_block
+from barpc.simulate import simulate_block
 from tests.ba.conftest import centers_of
 from tests.constants import chosen
 from tests.distributions import gamma
@@ -118,17 +118,18 @@ def test_a_track_with_an_observation_that_is_not_used_is_never_drawn(made) -> No
     assert (again == out)[block.point != block.point[one]].all()
 
 
-def true_unknowns(made: SimulatedBlock, problem: Problem) -> np.ndarray:
-    """The cameras' unknowns (N, 6) by the truth."""
-    each = zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)
-    return np.array([np.r_[c.rotation * d, c.translation] for c, d in each])
-
-
-def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
-    """With the truth's cameras: white noise of 0.1 px a coordinate."""
+@pytest.fixture(scope="module")
+def flown(made) -> tuple[Block, Problem, np.ndarray]:
+    """A block, its problem, and the cameras' unknowns (N, 6) by the truth."""
     block = block_of(made)
     problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = true_unknowns(made, problem)
+    each = zip(made.truth.corrections, problem.cameras.unknowns.distance, strict=True)
+    return block, problem, np.array([np.r_[c.rotation * d, c.translation] for c, d in each])
+
+
+def test_what_is_kept_out_is_measured_by_its_own_points(made, flown) -> None:
+    """With the truth's cameras: white noise of 0.1 px a coordinate."""
+    block, problem, exact = flown
     found = measure(problem, exact, block)
     assert found.noise.mean() == pytest.approx(1.0, abs=0.12)  # medians, of two views' tracks and of more
     assert (np.abs(found.noise - 1.0) < 0.3).all()
@@ -150,15 +151,13 @@ def test_what_is_kept_out_is_measured_by_its_own_points(made) -> None:
 
 
 @pytest.mark.parametrize("off", [0.3, -0.6, 1.2])
-def test_a_point_is_where_reweighted_rays_meet(made, off: float) -> None:
+def test_a_point_is_where_reweighted_rays_meet(made, flown, off: float) -> None:
     """Of a track of three views one off by some sigmas: three rounds by Geman and McClure's weights at four of them."""
-    block = block_of(made)
-    problem = make_problem(block, OPTIONS, centers_of(made), None)
+    block, problem, params = flown
     point = int(np.flatnonzero(np.bincount(block.point) == 3)[0])
     rows = np.flatnonzero(block.point == point)
     xy = block.xy.copy()
     xy[:, rows[1]] += [off, -0.5 * off]
-    params = true_unknowns(made, problem)
     found = measure(problem, params, replace(block, xy=xy))
     projected = problem.project_points(params, ecef_from_ground(made.truth.ground))
     matrix = projected.by_point[:, :, rows].transpose(2, 0, 1)  # (3, 2, 3)
@@ -296,11 +295,9 @@ def test_the_scatter_is_where_expectation_and_maximisation_end() -> None:
     np.testing.assert_allclose(noise_ratios(squared[order], freedom[order], view[order]), expected, rtol=1e-9)
 
 
-def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made) -> None:
+def test_the_scatter_is_a_ratio_whatever_deviation_is_stated(made, flown) -> None:
     """Residuals and stated deviations twenty times as large scatter as much: degrees of freedom have no unit."""
-    block = block_of(made)
-    problem = make_problem(block, OPTIONS, centers_of(made), None)
-    exact = true_unknowns(made, problem)
+    block, problem, exact = flown
     true = np.full((2, len(block.view)), np.nan)
     for v, (view, correction) in enumerate(zip(made.views, made.truth.corrections, strict=True)):
         rows = block.view == v

@@ -17,7 +17,7 @@ from barpc.ba.select import models
 from barpc.ba.select.beam import Selection
 from barpc.ba.solution import Solution
 from barpc.ba.solving.structure import make_structure
-from barpc.base.errors import BarpcWarning, DisconnectedError, InputError, TiePointError
+from barpc.base.errors import BarpcWarning, DisconnectedError, TiePointError
 from barpc.base.geodesy import ground_from_ecef
 from barpc.scene import GroundPoints, Tracks
 from barpc.sensor.image_corrections import ImageAffine, ImageCorrected
@@ -257,8 +257,6 @@ def test_an_earlier_blocks_drift_goes_on(made) -> None:
         found = adjust_tracks(made.views, made.tracks, AdjustOptions(noise_floor=0.0), centers=centers, prior=prior)
         assert found.params.shape[1] == 6 + 3 * drift
     assert solve(made, **CALM).params.shape[1] in (9, 12)
-    with pytest.raises(InputError, match="use the same"):
-        adjust_tracks(made.views, made.tracks, AdjustOptions(drift=1), centers=centers, prior=prior)
 
 
 @pytest.mark.parametrize(
