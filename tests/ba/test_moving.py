@@ -367,28 +367,22 @@ def test_rows_and_columns_of_one_image_are_no_group(axis: int) -> None:
 
 
 @pytest.mark.nightly
-def test_a_glacier_is_named_that_a_further_degree_of_the_drift_would_follow() -> None:
-    """A pair of which 42 % moves by 2.6 m: a drift of degree 2 leaves 20 m of the scene's shape, and no group."""
-    world = make("glacier", 22)
-    found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
-    assert [one.kind for one in found.findings] == ["moving_objects"]
-    assert found.cameras.unknowns.drift == 1
-    judged = judge(world, found.sensors)
-    assert judged.left < 0.03
-    assert judged.shape < 0.3
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize(("family", "seed"), [("fault", 65), ("fault", 7201), ("glacier", 45)])
-def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("family", "seed", "shape"),
+    [("fault", 65, 0.15), ("fault", 7201, 0.15), ("glacier", 45, 0.15), ("glacier", 22, 0.3)],
+)
+def test_ground_that_moves_across_rows_and_columns_is_named(family: str, seed: int, shape: float) -> None:
     """A fifth of a scene at 2 + 2 dates: beside a fault no row or column stands out (0.22 px were left), or a swing
-    leaves nothing that does (0.22 px), and of a glacier correlated noise alone explains more (0.06 px)."""
+    leaves nothing that does (0.22 px), and of a glacier correlated noise alone explains more (0.06 px). Of a pair 42 %
+    move by 2.6 m: a drift of degree 2 would follow that, leave 20 m of the scene's shape, and no group.
+    """
     world = make(family, seed)
     found = adjust_tracks(world.views, world.tracks, DEM_AS_STATED, world.gcps, world.dem)
     assert [one.kind for one in found.findings] == ["moving_objects"]
+    assert found.cameras.unknowns.drift == 1 or seed != 22
     judged = judge(world, found.sensors)
     assert judged.left < 0.03
-    assert judged.shape < 0.15
+    assert judged.shape < shape
 
 
 @pytest.mark.landing(1)
