@@ -189,13 +189,6 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
     assert np.nanmax(found.held_out_rms) < 0.16
 
 
-@pytest.mark.nightly
-def test_the_smaller_part_is_said_to_lie_off() -> None:
-    block, tracks = flawed(2, 1500, {**ROWS, "start": 0.15, "view": 1})
-    found = adjusted(block, tracks).findings[0]
-    assert found.where[1] < 0.0 < found.where[2] < 0.2 * block.views[found.view].size[1]
-
-
 @pytest.mark.landing(8)
 @pytest.mark.parametrize("seed", rest_slow(range(8)))
 @pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0, 0.3]))
