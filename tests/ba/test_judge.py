@@ -90,8 +90,7 @@ def test_rows_and_columns_that_lie_off_are_named_and_followed(where: Displaced) 
 
 @pytest.mark.nightly
 def test_two_of_them_in_two_images_are_both_found() -> None:
-    block, tracks = flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0})
-    found = adjusted(block, tracks)
+    found = adjusted(*flawed(3, 1500, MIDDLE, {**DETECTOR, "px": 2.0}))
     assert {(one.kind, one.view) for one in found.findings} == {("step", 1), ("step", 2)}
     assert all(one.share < 0.1 and one.off < 0.03 for one in found.left)  # ties beside an end
 
@@ -128,9 +127,9 @@ def test_all_images_that_settle_are_explained_together(first: float) -> None:
     assert not found.moving.any()
 
 
-def swing(px: float, period: float) -> Displaced:
+def swing(px: float, period: float, view: int = 1) -> Displaced:
     """Rows of an image swing."""
-    return {"view": 1, "axis": 1, "start": 0.0, "stop": 1.1, "px": px, "period": period}
+    return {"view": view, "axis": 1, "start": 0.0, "stop": 1.1, "px": px, "period": period}
 
 
 @pytest.mark.landing(2)
@@ -160,8 +159,7 @@ def test_rows_that_swing_are_named_with_their_period_and_followed(size: tuple[fl
 
 @pytest.mark.slow
 def test_of_a_pair_a_swing_is_that_of_one_or_of_either() -> None:
-    block, tracks = flawed(2, 2000, swing(0.2, 300.0))
-    found = adjusted(block, tracks)
+    found = adjusted(*flawed(2, 2000, swing(0.2, 300.0)))
     (one,) = found.findings
     assert one.kind == "sinusoid"
     assert 1 in (one.view, *one.or_of)
@@ -174,16 +172,13 @@ def test_of_a_pair_a_swing_is_that_of_one_or_of_either() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_swing_below_the_floor_is_none(seed: int) -> None:
-    block, tracks = flawed(3, 4000, swing(0.02, 200.0), seed=seed)
-    found = adjusted(block, tracks)
-    assert not found.findings
+    assert not adjusted(*flawed(3, 4000, swing(0.02, 200.0), seed=seed)).findings
 
 
 @pytest.mark.slow
 def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -> None:
     where = {"view": 0, "axis": 1, "start": 0.6, "stop": 1.1, "px": 25.0, "length": 0.8}
-    block, tracks = flawed(2, 1500, where)
-    found = adjusted(block, tracks)
+    found = adjusted(*flawed(2, 1500, where))
     assert found.findings[0].kind == "decay"
     assert found.inlier[~found.held_out].mean() > 0.95
     assert np.nanmax(found.held_out_rms) < 0.16
@@ -193,8 +188,7 @@ def test_what_fades_after_a_large_step_is_followed_from_where_the_judge_ends() -
 @pytest.mark.parametrize("seed", rest_slow(range(8)))
 @pytest.mark.parametrize("outliers", rest_slow([0.1, 0.0, 0.3]))
 def test_nothing_is_found_where_nothing_is(seed: int, outliers: float) -> None:
-    block, tracks = flawed(2 + seed % 3, 800, seed=100 + seed, outliers=outliers)
-    found = adjusted(block, tracks)
+    found = adjusted(*flawed(2 + seed % 3, 800, seed=100 + seed, outliers=outliers))
     assert not found.findings
     assert not found.left
 
@@ -219,8 +213,7 @@ def test_rows_that_wander_are_not_taken_for_strips() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("options", [{"jitter": "off"}, {"drift": 0}], ids=str)
 def test_who_asked_for_no_such_unknowns_is_told_and_gets_none(options: dict[str, Any]) -> None:
-    block, tracks = flawed(3, 600, MIDDLE)
-    found = adjusted(block, tracks, **options)
+    found = adjusted(*flawed(3, 600, MIDDLE), **options)
     assert found.findings
     assert found.left
     assert not any(isinstance(sensor, Splined) for sensor in found.sensors)
@@ -253,18 +246,16 @@ def test_what_cannot_be_judged_is_adjusted_all_the_same(monkeypatch: pytest.Monk
 def test_in_a_block_of_many_views_two_flaws_far_from_each_other_are_followed() -> None:
     """More unknowns than all views may have together, so that explanations are tried on parts of the block."""
     jump = {"view": 30, "axis": 1, "start": 0.5, "stop": 1.1, "px": 3.0}
-    block, tracks = flawed(60, 3000, jump, seed=2)
-    view, rows = tracks.view == 55, block.views[55].size[1]
-    swung = 0.8 * np.sin(2.0 * np.pi * 7.0 * tracks.xy[:, 1:] / rows) * np.array([0.6, 0.8])
-    given = replace(tracks, xy=tracks.xy + view[:, None] * swung)
-    found = adjusted(block, given)
+    rows = 20000
+    block, tracks = flawed(60, 3000, jump, swing(0.8, rows / 7.0, view=55), seed=2)
+    found = adjusted(block, tracks)
     assert {(one.kind in ("step", "decay"), one.kind == "sinusoid", one.view) for one in found.findings} == {
         (True, False, 30), (False, True, 55),
     }  # fmt: skip
     by_kind = {one.kind == "sinusoid": one for one in found.findings}
     assert by_kind[True].period == pytest.approx(rows / 7.0, rel=0.01)
     assert np.hypot(*by_kind[True].size) == pytest.approx(0.8, abs=0.05)
-    ends = np.array(by_kind[False].where[1:3]) / block.views[30].size[1]
+    ends = np.array(by_kind[False].where[1:3]) / rows
     assert np.abs(ends - 0.5).min() < 0.02
     assert not found.left
     assert found.inlier[np.isin(tracks.view, [30, 55]) & ~found.held_out].mean() > 0.95
