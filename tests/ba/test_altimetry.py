@@ -17,6 +17,8 @@ import pytest
 
 from barpc.ba import Adjustment, adjust_tracks, altimetry
 from barpc.ba.constraints import registration
+from barpc.ba.constraints.block import join
+from barpc.ba.constraints.gauge import gauge_report
 from barpc.ba.constraints.registration import (
     PATCH_POINTS,
     GivenHeights,
@@ -26,6 +28,9 @@ from barpc.ba.constraints.registration import (
     register,
     search_shift,
 )
+from barpc.ba.robust.heldout import keep_out
+from barpc.ba.select.parts import Parts
+from barpc.ba.solution import solve_block
 from barpc.base.geodesy import ecef_from_ground, enu_basis, ground_from_ecef
 from barpc.base.options import AdjustOptions
 from barpc.cameras import open_camera
@@ -240,6 +245,13 @@ def heights(seed: int, wrong: float = 0.0, off: float = 0.0, n: int = 300) -> Al
     return Altimetry(ground(*xy.T, alt), np.full(n, 0.3), np.zeros(n))
 
 
+def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+    """The relief, 3 m too high."""
+    n = len(lon)
+    azimuth, _, distance = (np.array(x) for x in GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist()))
+    return 233.0 + relief(distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth)))
+
+
 def error(adjusted: Any, true: np.ndarray) -> np.ndarray:
     """Mean east, north, up [m] of the adjusted tie points minus the truth."""
     found = ground_from_ecef(adjusted.points)
@@ -299,13 +311,6 @@ def test_heights_that_contradict_control_points_are_not_used(scene: Any):
 def test_heights_and_a_terrain_hold_together(scene: Any):
     """A terrain 3 m too high with 5 m stated does not move what the heights know."""
     views, tracks, true = scene
-
-    def terrain(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
-        n = len(lon)
-        azimuth, _, distance = (np.array(x) for x in GEOD.inv([LON] * n, [LAT] * n, lon.tolist(), lat.tolist()))
-        east, north = distance * np.sin(np.radians(azimuth)), distance * np.cos(np.radians(azimuth))
-        return 233.0 + relief(east, north)
-
     options = AdjustOptions(dem_sigma=2.0, dem_bias_sigma=5.0)
     after = adjust_tracks(views, tracks, options, dem=terrain, altimetry=heights(8), hold_out=False)
     assert not after.altimetry.why_not
@@ -387,36 +392,25 @@ def test_what_a_plane_is_told_is_the_covariance_of_an_m_estimate(noise: float, r
     assert found.rivals == max((rest <= low + width).sum() - n for n, low in enumerate(rest))
 
 
-@pytest.mark.parametrize(("whole", "most", "every"), [(False, 100, 1), (True, 100, 2), (False, 24, 2), (True, 40, 2)])
-def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(monkeypatch, sized, whole, most, every):
-    """And at no more than so many: of 47 with a height near them, whose surface is the only one that is asked."""
-    rng = np.random.default_rng(0)
-    middle = ecef_from_ground(np.array([5.0, 44.0, 300.0]))
-    points = middle + rng.uniform(-400.0, 400.0, (60, 3))
-    seen = np.arange(60) < 47
-    heights = Altimetry(ground_from_ecef(points), np.full(60, 0.5), np.full(60, 2.0))
-    held: list[Any] = []
+@pytest.mark.parametrize(("whole", "most", "every"), [(False, 900, 1), (True, 900, 2), (False, 420, 2), (True, 600, 2)])
+def test_a_motion_is_held_at_every_second_tie_point_beside_a_terrain(scene: Any, sized, whole, most, every):
+    """And at no more than so many; they bend by what was known of tilts before, over where all of them lie."""
+    views, tracks, _ = scene
+    block = join(views, tracks, None, AdjustOptions())
+    parts = Parts(block, keep_out(block), np.zeros(len(block.view), dtype=np.int64))
+    found = solve_block(parts.inner, parts.outer, AdjustOptions(), terrain if whole else None, None, None)
     sized(altimetry_points=most)
-    monkeypatch.setattr(altimetry, "_covariance_without_heights", lambda covariance, found, ties: np.eye(7))
-    monkeypatch.setattr(altimetry, "TieSurface", SimpleNamespace(of=lambda local: local))
-    monkeypatch.setattr(altimetry, "register", lambda surface, *_: surface)
-    monkeypatch.setattr(altimetry, "_tested", lambda registered, many: f"{len(registered)} of {many}")
-    monkeypatch.setattr(altimetry, "_why_not", lambda *_: "")
-    monkeypatch.setattr(altimetry, "_is_held", lambda *_: False)
-    monkeypatch.setattr(altimetry, "_registered_ties", lambda *given: held.append(given))
-    monkeypatch.setattr(altimetry, "_solved_with_heights", lambda *_: SimpleNamespace(after="after"))
-    monkeypatch.setattr(altimetry, "is_better", lambda one, other, outer: False)
-    outcome = SimpleNamespace(covariance=lambda free: None)
-    found: Any = SimpleNamespace(
-        seen=seen, final=SimpleNamespace(points=points), outcome=outcome, problem=SimpleNamespace(free=None),
-        heights=SimpleNamespace(dem="a DEM" if whole else None), after="before",
-    )  # fmt: skip
-    block: Any = SimpleNamespace(num_tracks=60)
-    tried, said = altimetry.hold_by_altimetry(found, block, block, heights)
-    assert said == "47 of 60"
-    assert tried.after == "after"
-    ((_, ties, at, *_),) = held
-    np.testing.assert_array_equal(ties, np.arange(0, 47, every))
-    center = points[:47].mean(axis=0)
-    local = ((points[:47] - center) @ enu_basis(ground_from_ecef(center)).T)[:, :2]
-    np.testing.assert_allclose(at, local[ties] / np.sqrt((local**2).sum(axis=1).mean()))
+    tried, said = altimetry.hold_by_altimetry(found, parts.inner, parts.outer, heights(3))
+    assert not said.why_not
+    ties, held = np.flatnonzero(found.seen), tried.heights.placed
+    np.testing.assert_array_equal(held.index, ties[::every])
+    points = found.final.points[ties]
+    center = points.mean(axis=0)
+    local = ((points - center) @ enu_basis(ground_from_ecef(center)).T)[:, :2]
+    east, north = (local / np.sqrt((local**2).sum(axis=1).mean()))[::every].T
+    covariance = found.outcome.covariance(found.problem.free)
+    tilts = gauge_report(covariance, found.final.points, found.final.points, found.seen).by_unknown[3:5]
+    known = np.sqrt(np.diag(tilts @ covariance.solve(tilts.T)).max())
+    bend = held.common[:, 2, -3:] / np.stack([east**2, east * north, north**2], axis=1)
+    np.testing.assert_allclose(bend, np.full(bend.shape, bend[0, 0]), rtol=1e-6)
+    assert bend[0, 0] / np.linalg.norm(held.rows[0, 2]) == pytest.approx(100.0 * known, rel=0.01)  # beside a floor
