@@ -1,4 +1,4 @@
-"""The order of elimination of graphs that adversaries would tie: each is cut at once, and where it can be, well."""
+"""The order of elimination, of sites and of graphs that adversaries would tie: cut at once, and if it can be, well."""
 
 from __future__ import annotations
 

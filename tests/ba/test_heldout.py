@@ -1,4 +1,4 @@
-"""Tracks that are kept out: drawn as if at random, always the same, and what they say of the cameras."""
+"""Tracks that are kept out: drawn as if at random, always the same; what they, and known points, say of the cameras."""
 
 from __future__ import annotations
 
