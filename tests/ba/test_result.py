@@ -119,6 +119,7 @@ def test_heights_of_a_pair_move_as_its_cameras_do(made, found, pair) -> None:
     assert (heights.views, heights.count) == (pair, count)
     assert heights.absolute == pytest.approx(absolute, rel=1e-3)
     assert heights.relative == pytest.approx(relative, rel=1e-3)
+    assert relative < 0.2 * absolute
 
 
 def test_heights_are_measured_at_some_of_many_points_and_at_none_of_none(made, found, sized: Sized) -> None:

@@ -64,6 +64,13 @@ def scene() -> Scene:
     return Scene(tuple(views), tuple(exact), np.array([*centers, middle]), tracks, ground, check)
 
 
+@pytest.fixture(scope="module")
+def held(scene: Scene) -> Adjustment:
+    """Adjusted, the radar view being exact."""
+    options = AdjustOptions(fixed=("radar",), noise_floor=1e-9)
+    return adjust_tracks(scene.views, scene.tracks, options, centers=scene.centers)
+
+
 def seen_by_radar(scene: Scene, result: Adjustment) -> Array:
     """Where the exact radar sees the adjusted points, against where it sees the true ones: median [m]."""
     radar = scene.exact[2]
@@ -82,11 +89,9 @@ def test_a_block_of_radar_and_optical_views_is_adjusted_to_its_noise(scene: Scen
     assert 0.9 <= result.noise <= 1.1
 
 
-def test_an_exact_radar_view_gives_the_block_its_place(scene: Scene) -> None:
+def test_an_exact_radar_view_gives_the_block_its_place(scene: Scene, held: Adjustment) -> None:
     views, tracks = scene.only(2)
     without = adjust_tracks(views, tracks, centers=scene.centers[:2])
-    options = AdjustOptions(fixed=("radar",), noise_floor=1e-9)
-    held = adjust_tracks(scene.views, scene.tracks, options, centers=scene.centers)
     assert np.abs(seen_by_radar(scene, without)).max() >= 2.0
     assert np.abs(seen_by_radar(scene, held)).max() <= 0.15
     off = np.linalg.norm(held.points - ecef_from_ground(scene.ground), axis=1)
@@ -94,13 +99,13 @@ def test_an_exact_radar_view_gives_the_block_its_place(scene: Scene) -> None:
     assert np.nanmedian(off) <= 0.5 * np.nanmedian(alone)
 
 
-def test_held_out_points_are_seen_where_the_exact_cameras_see_them_once_the_place_is_known(scene: Scene) -> None:
+def test_held_out_points_are_seen_where_the_exact_cameras_see_them_once_the_place_is_known(
+    scene: Scene, held: Adjustment
+) -> None:
     """Relative to each other: the points that the first view sees, carried over to the second."""
-    options = AdjustOptions(fixed=("radar",), noise_floor=1e-9)
-    result = adjust_tracks(scene.views, scene.tracks, options, centers=scene.centers)
     image = np.stack([camera.project(scene.check) for camera in scene.exact], axis=1)
     view, *seen = rows_of(image)
-    for cameras, low, high in ((result.sensors, 0.0, 0.1), ([v.sensor for v in scene.views], 1.0, 100.0)):
+    for cameras, low, high in ((held.sensors, 0.0, 0.1), ([v.sensor for v in scene.views], 1.0, 100.0)):
         residuals = triangulate(cameras, view, *seen).residuals
         optical = residuals[view < 2]
         assert low <= np.sqrt((optical**2).sum(axis=1).mean()) <= high

@@ -13,6 +13,7 @@ import scipy.optimize
 from barpc.ba import AdjustOptions
 from barpc.ba.constraints.block import first_state, join, make_problem
 from barpc.ba.solving import solve
+from barpc.ba.solving.problem import Problem
 from barpc.ba.solving.solve import Minimum, State, has_converged
 from barpc.base.errors import AdjustError
 from barpc.simulate import simulate_block
@@ -207,12 +208,18 @@ def test_auto_asks_scipy_for_the_minimum_of_up_to_200_unknowns(
     assert found.said == (taken, tolerance, "projected")
 
 
-def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(monkeypatch) -> None:
-    """Far off, points are nowhere: going back from there by their linearisation would not bring them back."""
+@pytest.fixture
+def begun() -> tuple[Problem, State, np.ndarray]:
+    """A small problem, where it begins, and the weights of its observations."""
     options, made = AdjustOptions(), simulate_block(3, 60, attitude=1e-6, position=0.2)
     block = join(made.views, made.tracks, None, options)
     problem = make_problem(block, options, None, None)
-    state, _ = first_state(problem, block, options, None)
+    return problem, first_state(problem, block, options, None)[0], block.use / block.sigma
+
+
+def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(begun, monkeypatch) -> None:
+    """Far off, points are nowhere: going back from there by their linearisation would not bring them back."""
+    problem, state, weight = begun
 
     def astray(residual: Any, start: Any, jacobian: Any, **_: Any) -> Any:
         least = float((residual(start) ** 2).sum())
@@ -222,7 +229,7 @@ def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(mo
         return SimpleNamespace(x=start, nfev=4, message="ended.", success=True)
 
     monkeypatch.setattr(scipy.optimize, "least_squares", astray)
-    found = solve.minimise(problem, state, block.use / block.sigma)
+    found = solve.minimise(problem, state, weight)
     np.testing.assert_array_equal(found.state.points, state.points)
     np.testing.assert_array_equal(found.state.params, state.params)
     assert found.state.cost == found.reduced.cost == min(found.state.history)
@@ -230,13 +237,10 @@ def test_a_step_of_least_squares_that_fails_leaves_the_points_where_they_were(mo
 
 @pytest.mark.parametrize("nearer", [False, True])
 def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_near(
-    monkeypatch, caplog, nearer
+    begun, monkeypatch, caplog, nearer
 ) -> None:
     """Whether a matrix of astray points is positive definite depends on the version of LAPACK."""
-    options, made = AdjustOptions(), simulate_block(3, 60, attitude=1e-6, position=0.2)
-    block = join(made.views, made.tracks, None, options)
-    problem = make_problem(block, options, None, None)
-    state, _ = first_state(problem, block, options, None)
+    problem, state, weight = begun
     whole, fails = scipy.linalg.cholesky, []
 
     def cholesky(matrix: Any, **given: Any) -> Any:
@@ -263,7 +267,7 @@ def test_a_matrix_that_is_rounding_is_no_matter_far_off_and_ends_least_squares_n
     monkeypatch.setattr(type(problem), "reduce", followed)
     monkeypatch.setattr(scipy.linalg, "cholesky", cholesky)
     monkeypatch.setattr(scipy.optimize, "least_squares", tries)
-    found = solve.minimise(problem, state, block.use / block.sigma)
+    found = solve.minimise(problem, state, weight)
     assert found.settled
     assert ("scipy" in found.status) is not nearer
     assert ("going on by Levenberg-Marquardt" in caplog.text) is nearer

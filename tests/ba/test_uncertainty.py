@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtri, ndtr
 
-from barpc.ba import AdjustOptions, adjust_tracks, block_prior, pair_heights
+from barpc.ba import AdjustOptions, adjust_tracks, block_prior
 from barpc.ba.constraints.incremental import BlockPrior
 from barpc.ba.parameters.priors import DRIFT_SIGMA
 from barpc.base.errors import InputError
@@ -117,19 +117,6 @@ def test_points_err_as_predicted_neither_more_nor_less():
         inverse = np.linalg.inv(found.covariance.points(np.arange(60)))
         ratio.append(np.einsum("ni,nij,nj->n", error, inverse, error).mean() / 3.0)
     assert 0.6 < np.mean(ratio) < 1.6
-
-
-def test_relative_heights_are_known_better_than_absolute_ones():
-    block = simulate_block(3, 200, seed=9, noise=NOISE)
-    found = solve(block)
-    index = np.arange(0, 200, 10)
-    covariance = found.covariance.points(index)
-    up = enu_basis(block.truth.ground[0])[2]
-    heights = pair_heights(found, 0, 1)
-    assert heights.count > 50
-    assert heights.relative < 0.2 * heights.absolute
-    assert heights.absolute == pytest.approx(np.sqrt(up @ covariance.mean(axis=0) @ up), rel=0.3)
-    assert pair_heights(found, 1, 0).relative == pytest.approx(heights.relative, rel=1e-9)
 
 
 def test_the_gauge_report_names_the_height_as_the_weakest_mode(adjusted):

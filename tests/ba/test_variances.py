@@ -48,16 +48,18 @@ def large(n: int, model: str = "rotation", drift: int = 0, cautious: bool = Fals
 
 
 def learnt(
-    v: Variances, params: np.ndarray, known: np.ndarray, last: PriorTest | None = None, now: np.ndarray | None = None
-) -> tuple[CameraPrior, PriorTest]:
+    v: Variances, params: np.ndarray, known: np.ndarray, last: PriorTest | None = None, now: np.ndarray | None = None,
+    fixed: Any = (),
+) -> tuple[CameraPrior, PriorTest]:  # fmt: skip
     """What a block says with unknowns (N, q) that its observations determine by so much, of further ones nothing.
 
-    `now` are the standard deviations that it was solved with, where these are not the given ones.
+    `now` are the standard deviations that it was solved with, where these are not the given ones; `fixed` are numbers
+    of unknowns that are not estimated.
     """
     n, size = v.given.sigma.shape
     mean, share, sigma = v.given.mean.copy(), np.zeros((n, size)), v.given.sigma if now is None else now
     mean[:, : params.shape[1]], share[:, : known.shape[1]] = params, known
-    free = np.ones(n * size, dtype=bool)
+    free = ~np.isin(np.arange(n * size), fixed)
     variance = (1.0 - share) * np.where(np.isfinite(sigma), sigma, 1.0) ** 2
     covariance = SimpleNamespace(free=free, is_large=False, of_views=lambda: variance[:, :, None] * np.eye(size))
     problem: Any = SimpleNamespace(camera_prior=replace(v.given, sigma=sigma), free=free)
@@ -104,6 +106,13 @@ def test_squares_and_freedom_are_those_of_the_unknowns_that_are_determined() -> 
     params[1, 0] = 99.0
     tested = learnt(v, params, known)[1]
     np.testing.assert_allclose([tested.ratio, tested.freedom], [5.0 / 1.75, 1.75])
+    # nor one that is fixed, nor one without a prior of its own, nor one that is less known than before
+    assert learnt(v, params, known, fixed=[2])[1].freedom == pytest.approx(1.5)
+    without = v.given.sigma.copy()
+    without[0, 1] = np.inf
+    assert learnt(v, params, known, now=without)[1].freedom == pytest.approx(1.25)
+    known[0, 0] = -0.25
+    assert learnt(v, params, known)[1].freedom == pytest.approx(0.75)
 
 
 def test_drifts_are_as_large_as_they_show_with_the_given_ones_counting_for_four() -> None:
@@ -326,17 +335,6 @@ def test_priors_are_the_same_within_a_share_of_their_logarithms() -> None:
     for factor, same in ((1.0, True), (1.21, True), (1 / 1.21, True), (1.23, False), (1 / 1.23, False)):
         assert same_prior(prior, CameraPrior(prior.mean, prior.sigma * [[1.0, factor, 1.0]]), 0.2) == same
     assert same_prior(prior, CameraPrior(prior.mean, np.array([[1.0, np.inf, np.inf]])), 0.2)
-
-
-def test_what_is_determined_is_what_the_prior_alone_does_not_say() -> None:
-    v = variances(2)
-    full = np.diag([4.0, 2.0, 1.0, 0.0, 5.0, 4.0])
-    free = np.array([1, 1, 1, 0, 1, 1], dtype=bool)
-    blocks = np.stack([full[:3, :3], full[3:, 3:]])
-    covariance: Any = SimpleNamespace(free=free, is_large=False, of_views=lambda: blocks)
-    np.testing.assert_allclose(v._known(covariance, v.given), seen([[0.0, 0.5, 0.75], [0.0, 0.0, 0.0]]))
-    loose = CameraPrior(v.given.mean, np.where(np.arange(3) == 1, np.inf, v.given.sigma))
-    np.testing.assert_allclose(v._known(covariance, loose), seen([[0.0, 0.0, 0.75], [0.0, 0.0, 0.0]]))
 
 
 # --- on a block ---------------------------------------------------------------------------------------------------
@@ -665,6 +663,7 @@ def test_a_matrix_that_does_not_factorise_leaves_the_priors_as_they_are(at_minim
     np.testing.assert_array_equal(tested.scale, 1.0)
     assert not tested.odd.any()
     assert tested.failed
+    assert tested.shared == 1.0
     assert not caplog.records  # the last one alone is told: on the way to it much is tried
 
 
@@ -696,7 +695,3 @@ def test_views_that_state_an_accuracy_share_what_they_are_off_by(model: str, unk
     assert learnt(v, params, known)[1].shared == pytest.approx(expected)
     np.testing.assert_array_equal(shared(v, 0.49 / freedom * known), 1.0)  # nothing is determined
     np.testing.assert_array_equal(shared(replace(v, stated=None), known), 1.0)
-
-
-def test_what_is_not_said_to_be_shared_is_not() -> None:
-    assert PriorTest(1.0, 2.0, np.ones(1), np.zeros(1, dtype=bool), ()).shared == 1.0
