@@ -247,7 +247,7 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole_put_together_of_any_
         place = size + 3 * p + np.arange(3)
         _assert_close(found, inverse[np.ix_(place, place)], 1e-4)
     for columns in (1, 5, size - 1, size, 1000):
-        sized(columns_kept=columns * size)
+        sized(columns_kept=columns * size, dense_views=0)
         full = case.covariance.full
         _assert_close(full, inverse[:size, :size], 1e-4)
         np.testing.assert_array_equal(full, full.T)
@@ -292,9 +292,10 @@ def test_modes_are_the_motions_the_weakest_first_and_what_goes_with_them():
     assert weakest_modes(np.diag([0.0] * 6 + [-1e-18]))[-1].sigma == 0.0  # less than nothing is rounding
 
 
+@pytest.mark.parametrize("dense_views", [100, 0])
 @pytest.mark.parametrize("small", [0, 900])
-def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, sized, small):
-    sized(dense_unknowns=small)
+def test_blocks_of_views_are_the_same_whether_the_whole_is_kept_or_not(case, sized, small, dense_views):
+    sized(dense_unknowns=small, dense_views=dense_views)
     q = case.params.shape[1]
     inverse = np.linalg.inv(case.dense[0])
     fresh = case.covariance

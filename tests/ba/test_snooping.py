@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from barpc.ba import Adjustment, AdjustOptions, adjust_tracks, adjustment
+from barpc.ba import Adjustment, AdjustOptions, adjust_tracks
 from barpc.ba.control.snooping import CRITICAL, ControlTest, global_test
 from barpc.base.geodesy import enu_basis, metres_per_unit
 from barpc.base.options import RunOptions
 from barpc.report import Run, summarize
-from barpc.scene import GroundPoints
+from barpc.scene import GroundPoints, Reference
 from barpc.sensor.geometry import sight_enu
 from barpc.simulate import SimulatedBlock, simulate_block
 from benchmarks.referee import cases, judge, make
 from tests import distributions as stats
 from tests.ba.conftest import INDEPENDENT, centers_of
 from tests.ba.test_referee import hills
+from tests.constants import Sized
 from tests.costs import once
 from tests.lanes import rest_slow
 
@@ -278,24 +278,21 @@ def test_a_point_is_checked_by_a_tenth_of_redundancy(redundancy, checked) -> Non
     assert tested.checked == checked
 
 
-@pytest.mark.parametrize(("count", "tested"), [(0, 0), (2000, 2000), (2001, 1001), (4001, 1334)])
-def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(monkeypatch, count: int, tested: int) -> None:
-    """And all control points that are held and were kept; no tie points."""
-    point = np.concatenate([np.arange(10), np.arange(10, 14), 14 + np.arange(count)])
-    inlier = np.ones(len(point), dtype=bool)
-    inlier[10] = False
-    held = SimpleNamespace(index=np.concatenate([[3], np.arange(10, 13), 14 + np.arange(count)]))
-    outcome = SimpleNamespace(problem=SimpleNamespace(point_prior=held), inlier=inlier, residual=None, weight=None)
-    block: Any = SimpleNamespace(point=point, num_tracks=10, num_known=14)
-    asked: list[np.ndarray] = []
-    monkeypatch.setattr(adjustment, "image_test", lambda *given: asked.append(given[-1]) or np.ones(len(given[-1])))
-    found: Any = SimpleNamespace(outcome=outcome, final=None)
-    w = adjustment._control_w(found, block, None)  # type: ignore[arg-type]
-    assert np.flatnonzero(np.isfinite(w)).tolist() == asked[0].tolist()
-    assert asked[0][:2].tolist() == [11, 12]  # 13 is not held: it was found wrong
-    assert len(asked[0]) == 2 + tested
-    outcome.problem.point_prior = None
-    assert np.isnan(adjustment._control_w(found, block, None)).all()  # type: ignore[arg-type]
+def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(sized: Sized) -> None:
+    """And all control points that are held and were kept."""
+    sized(scene_points=20)
+    block = simulate_block(3, 100, seed=5, num_gcps=36, num_checks=0)
+    gcps, first = block.gcps, np.arange(36) < 6
+    points = gcps.select(~first)
+    reference = Reference(replace(points, sigma=np.full((30, 3), 0.5)), np.full(3, 0.5), np.zeros((3, 2)))
+    given = blundered(replace(gcps, sigma=np.full((36, 3), 0.3)).select(first), {4: 30.0})
+    found = adjust_tracks(block.views, block.tracks, None, given, reference=reference, hold_out=False)
+    np.testing.assert_array_equal(np.isfinite(found.gcp_w), found.gcp_inlier & (given.point != 4))  # it is not held
+    kept = np.flatnonzero(found.reference_inlier)
+    kept = kept[np.argsort(points.view[kept], kind="stable")]
+    every = -(-len(kept) // 20)
+    assert every > 2
+    assert np.flatnonzero(np.isfinite(found.reference_w)).tolist() == sorted(kept[::every])
 
 
 @pytest.mark.parametrize(
