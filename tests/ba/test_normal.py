@@ -8,19 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from barpc.ba import AdjustOptions
+from barpc.ba.constraints.block import join, make_problem
 from barpc.ba.solving.covariance import Covariance
 from barpc.ba.solving.linear import Blocks, Factor
 from barpc.ba.solving.normal import (
     TRIANGLE,
     Common,
     Reduced,
-    _assemble,
     cholesky3,
     point_products,
     solve_lower,
     solve_transposed,
     whiten,
 )
+from barpc.base.geodesy import ecef_from_ground
+from barpc.simulate import simulate_block
+from tests.ba.conftest import centers_of
 
 
 def whole(lower: np.ndarray) -> np.ndarray:
@@ -111,10 +115,12 @@ def test_the_blocks_of_views_are_those_on_the_diagonal_however_the_matrix_is_kep
     )
 
 
-@pytest.mark.parametrize(("views", "plain"), [(32, True), (33, False)])  # of 9 unknowns
+@pytest.mark.parametrize(("views", "plain"), [(32, True), (33, False)])
 def test_a_matrix_of_what_is_one_front_anyway_is_an_array(views: int, plain: bool) -> None:
-    structure: Any = SimpleNamespace(pair_view=np.zeros((0, 2), dtype=int))
-    matrix = _assemble(structure, np.zeros((views, 9, 9)), np.zeros((0, 9, 9)))
+    made = simulate_block(views, 12 * views, seed=1, num_checks=0)
+    block = join(made.views, made.tracks, None, AdjustOptions())
+    problem = make_problem(block, AdjustOptions(), centers_of(made), None)
+    matrix = problem.reduce(problem.camera_prior.mean, ecef_from_ground(made.truth.ground), 1.0 / block.sigma).matrix
     assert isinstance(matrix, np.ndarray) == plain
     assert isinstance(matrix, Blocks) != plain
 
