@@ -197,10 +197,7 @@ def test_the_solver_that_is_asked_for_is_the_one_that_runs(dirty, caplog):
         assert ("scipy least_squares" in found.status) == (names[-1] == "scipy")
 
 
-@pytest.mark.parametrize(
-    "views", [3, pytest.param(22, marks=pytest.mark.slow), pytest.param(23, marks=pytest.mark.slow)]
-)
-def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(views, monkeypatch):
+def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(monkeypatch):
     entered = []
 
     def counting(*args, **kwargs):
@@ -209,12 +206,10 @@ def test_a_block_is_minimised_by_the_least_squares_of_scipy_by_default(views, mo
 
     real = scipy.optimize.least_squares
     monkeypatch.setattr(scipy.optimize, "least_squares", counting)
-    block = simulate_block(views, 60 * views, seed=21)
+    block = simulate_block(3, 180, seed=21)
     found = adjust_tracks(block.views, block.tracks, AdjustOptions(min_convergence=0.01))
-    assert bool(entered) == (9 * views <= 200)
-    if entered:
-        assert entered[-1].message.rstrip(".") in found.status
-        assert f"{entered[-1].nfev} evaluations" in found.status
+    assert entered[-1].message.rstrip(".") in found.status
+    assert f"{entered[-1].nfev} evaluations" in found.status
 
 
 def test_prior_sigmas_stand_at_their_unknowns(dirty):

@@ -277,14 +277,6 @@ def test_a_dem_holds_the_height_of_the_scene():
     assert held.gauge.sigma[2] < 0.5 < free.gauge.sigma[2]
 
 
-def test_tracks_under_a_small_angle_are_held_and_said_to_be():
-    block = simulate_block(3, 300, seed=8)
-    with pytest.warns(BarpcWarning, match="constrained in height"):
-        found = solve(block, min_convergence=90.0, hold_out=False)
-    assert found.held.all()
-    assert np.isfinite(found.params).all()
-
-
 def test_groups_without_common_tie_points_are_named(block):
     tracks = block.tracks
     split = tracks.select((tracks.view < 5) == (tracks.view[np.searchsorted(tracks.point, tracks.point)] < 5))
