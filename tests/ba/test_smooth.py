@@ -220,9 +220,9 @@ def test_terms_of_a_block_that_is_not_large_are_worked_out_once(
 
 
 def test_terms_that_observations_hardly_tell_apart_stay_small() -> None:
-    """All of a view in a narrower and narrower stripe of columns: its powers are nearly the same."""
+    """All of a view in a narrower and narrower stripe of columns, and in one: its powers are nearly the same."""
     col, row = anywhere(400)
-    for width in np.geomspace(1e-3, 0.5, 60):
+    for width in (0.0, *np.geomspace(1e-3, 0.5, 60)):
         smooth = made((400,), np.stack([0.5 + width * col, row]))
         found = smooth.part(noise(400, 0.1), np.ones(400))
         assert np.sqrt((found**2).mean()) < 0.03

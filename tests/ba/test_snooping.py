@@ -284,11 +284,13 @@ def test_of_a_reference_of_many_points_every_nth_is_tested_in_the_images(sized: 
     block = simulate_block(3, 100, seed=5, num_gcps=36, num_checks=0)
     gcps, first = block.gcps, np.arange(36) < 6
     points = gcps.select(~first)
+    points = replace(points, xy=points.xy + 30.0 * (np.arange(len(points.xy)) % 9 == 0)[:, None])
     reference = Reference(replace(points, sigma=np.full((30, 3), 0.5)), np.full(3, 0.5), np.zeros((3, 2)))
     given = blundered(replace(gcps, sigma=np.full((36, 3), 0.3)).select(first), {4: 30.0})
     found = adjust_tracks(block.views, block.tracks, None, given, reference=reference, hold_out=False)
     np.testing.assert_array_equal(np.isfinite(found.gcp_w), found.gcp_inlier & (given.point != 4))  # it is not held
     kept = np.flatnonzero(found.reference_inlier)
+    assert 0.8 < len(kept) / len(points.xy) < 0.95
     kept = kept[np.argsort(points.view[kept], kind="stable")]
     every = -(-len(kept) // 20)
     assert every > 2
