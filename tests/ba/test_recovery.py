@@ -159,6 +159,14 @@ def test_where_no_drift_is_asked_for_no_spline_takes_its_place(seed):
     assert plain.params.shape[1] == 6
 
 
+@pytest.mark.slow
+def test_a_drift_is_followed_where_the_model_has_one():
+    drifting = simulate_block(4, 300, seed=1, drift=20e-6)
+    plain, found = (solve(drifting, drift=drift, jitter="off", **EVERY) for drift in (0, 1))
+    assert drifting.held_out_rms(list(plain.sensors)) > 1.0
+    assert 0.005 < drifting.held_out_rms(list(found.sensors)) < 0.05
+
+
 @pytest.mark.parametrize(
     ("model", "bound"),
     [
