@@ -139,7 +139,7 @@ def test_an_image_may_get_its_own_rpc_as_a_file_beside_it(image: Path) -> None:
 # --- windows ----------------------------------------------------------------------------------------------
 
 
-CAMERA = Camera(Map(lean=1.0), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))  # type: ignore[arg-type]
+CAMERA = Camera(Map(lean=1.0), Path("flat"), "rpb", (200, 100), (0.0, 2000.0))
 
 
 def window(bbox: Any, alt: float | None = 0.0, dem: Any = None, camera: Camera = CAMERA) -> Any:
