@@ -141,11 +141,14 @@ def test_no_name_is_more_than_a_file_that_is_not_there(made, name) -> None:
 def test_a_large_file_is_hashed_where_its_times_are_not_those_noted(made, tmp_path, monkeypatch) -> None:
     size, hash_of = sealed.READ_WHOLE + 1, hashlib.file_digest
     path, image = "../../in/a.tif", tmp_path / "in/a.tif"
+    hashed = list[object]()
+    monkeypatch.setattr(hashlib, "file_digest", lambda *given: (hashed.append(given), hash_of(*given))[1])
+    assert Sealed.open(made).find(path, sha(b"a"), 1) == image
+    assert len(hashed) == 1  # a small one, whose times are those noted
     image.write_bytes(b"a" * size)
     with Workspace(made, adds=True) as run:
         run.note({path: Stamp.of(image.stat())})
-    hashed = list[object]()
-    monkeypatch.setattr(hashlib, "file_digest", lambda *given: (hashed.append(given), hash_of(*given))[1])
+    hashed.clear()
 
     def find(**how: bool) -> Path | None:
         return Sealed.open(made).find(path, sha(b"a" * size), size, **how)
