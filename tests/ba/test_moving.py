@@ -395,7 +395,7 @@ def test_errors_that_neighbours_share_are_no_moving_ground(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.costs(9)
+@pytest.mark.costs(7)
 def test_ground_that_moved_beyond_a_row_of_all_images_is_no_jitter() -> None:
     """A fault of 1.2 m across the scan of four images: splines fit a half of it, and motion all that they had cut."""
     world = make("fault", 4)
