@@ -63,13 +63,6 @@ def test_solutions_and_blocks_of_the_inverse_are_those_of_the_dense_matrix(sized
         np.testing.assert_allclose(found.pairs, blocks[i, :, j, :], atol=1e-13)
 
 
-def test_a_matrix_is_the_same_dense_and_sparse() -> None:
-    made = _matrix(np.array([[0, 2], [0, 3], [1, 3], [2, 3]]), 4, 3)
-    sparse = made.sparse()
-    assert sparse.nnz == (4 + 2 * 4) * 9
-    np.testing.assert_array_equal(sparse.toarray(), made.plain())
-
-
 def test_the_block_of_a_pair_is_found_where_it_is_and_nowhere_else() -> None:
     pairs = np.array([[0, 1], [0, 4], [1, 2], [1, 3], [3, 4]])
     matrix = _matrix(pairs, 5, 2)

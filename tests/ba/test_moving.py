@@ -216,12 +216,6 @@ def test_the_score_of_a_region_is_what_a_fit_with_its_motion_gains() -> None:
         assert gains[n] == pytest.approx(gained, rel=0.15, abs=1.0)
 
 
-def test_where_no_track_takes_part_no_group_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("barpc.ba.terms.moving_ground.proposal", lambda *_: None)
-    seen: Any = SimpleNamespace(linear=SimpleNamespace(view=np.zeros(3, dtype=int)), ground=0, base=0, extra=0, sigma=0)
-    assert MovingObjects.of(seen) == []
-
-
 def test_the_place_of_a_group_is_said_and_no_view_is_left_alone() -> None:
     made, tracks, moves = drifting(3, 300, 0.1, 1.0)
     block = join(made.views, tracks, None, AdjustOptions())

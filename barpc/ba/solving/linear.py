@@ -54,16 +54,6 @@ class Blocks:
         kept = (place[self.pair_view] >= 0).all(axis=1)
         return Blocks(self.diagonal[views], self.pairs[kept], place[self.pair_view[kept]])
 
-    def sparse(self) -> sp.csr_array:
-        """Return the matrix (N q, N q) as a sparse array of scipy."""
-        n, q, _ = self.diagonal.shape
-        (i, j), every = self.pair_view.T, np.arange(n)
-        row, col = np.concatenate([every, i, j]), np.concatenate([every, j, i])
-        order = np.lexsort((col, row))
-        data = np.concatenate([self.diagonal, self.pairs, self.pairs.transpose(0, 2, 1)])[order]
-        indptr = np.searchsorted(row[order], np.arange(n + 1))
-        return sp.csr_array(sp.bsr_array((data, col[order], indptr), shape=(n * q, n * q)))
-
     @classmethod
     def of(cls, matrix: Array | sp.csr_array, size: int) -> Blocks:
         """Return the blocks of a symmetric matrix (N q, N q) of q = `size` unknowns per view."""

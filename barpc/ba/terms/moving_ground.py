@@ -125,12 +125,10 @@ def _uniform_group(linear: Linear, ground: GroundMotion) -> Group:
     return Group(by_move, np.full(by_move.shape[1], TIMES), cell, np.full(len(cell), 0.5))
 
 
-def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group | None:
-    """Return the start of a fit of the most likely moving group, beside the fit `base`; None without tracks."""
+def proposal(linear: Linear, ground: GroundMotion, base: MixtureFit, extra: Array, sigma: Array) -> Group:
+    """Return the start of a fit of the most likely moving group, beside the fit `base`."""
     few, group = linear.thinned(), _uniform_group(linear, ground)
     cell, rows = group.cell, few.in_tracks
-    if not rows.any():
-        return None
     starts = [replace(group, share=share) for share in _start_shares(linear, group, base, extra, sigma)]
     # fits are iterated to the end, as a few iterations do not show which start is the best
     ended = [(Mixture(few, extra, sigma, base, one).run(cooled=COOLED**2), one) for one in starts]

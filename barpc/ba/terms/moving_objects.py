@@ -31,11 +31,9 @@ class MovingObjects(Term):
 
     @classmethod
     def of(cls, residuals: Residuals) -> list[Self]:
-        """Return the most likely moving group; empty: there is none."""
+        """Return the most likely moving group."""
         linear = residuals.linear
         one = moving_ground.proposal(linear, residuals.ground, residuals.base, residuals.extra, residuals.sigma)
-        if one is None:
-            return []
         none, cost = np.zeros((2, 0, len(linear.view))), moving_ground.price_of_group(linear, one.cell)
         return [cls(-1, none, np.zeros(0), cost, group=one)]
 
