@@ -19,7 +19,8 @@ from barpc.sensor.rpc import RPC
 from barpc.sensor.triangulation import triangulate
 from tests.everywhere import rows_of
 from tests.geotiffs import write_blank, write_image
-from tests.reliability.trials import SAMPLES, crop
+from tests.reliability.trials import SAMPLES as SAMPLES
+from tests.reliability.trials import crop
 
 FOLDER = SAMPLES[0].parent
 START, SIDE = 300, 288  # of a part

@@ -126,6 +126,7 @@ def test_the_cameras_of_a_pass_are_asked_for_all_others_at_once() -> None:
 
     (view,) = simulate_block(2, 20, seed=1, num_checks=0).views[:1]
     rpc = view.sensor
+    assert isinstance(rpc, RPC)
     parts = rpc.ground_scale, rpc.image_offset, rpc.image_scale
     moved = [Asked(rpc.coeffs, rpc.ground_offset + [0.1 * n, 0.0, 0.0], *parts) for n in range(40)]
     views = [replace(view, name=f"v{n}", sensor=one) for n, one in enumerate(moved)]

@@ -393,7 +393,7 @@ def test_the_reach_is_that_of_pixels_on_the_ground_or_a_kilometre(search, reach)
 def test_each_image_is_asked_for_its_own_observations(view, far) -> None:
     """Of two points one lies nine hundredths of a degree off: six pixels of the coarser camera, not of the other."""
     degrees = (0.01, 0.02)
-    views = [replace(flat()[0], sensor=Plain(step)) for step in degrees]
+    views = [replace(flat()[0], sensor=Plain(step)) for step in degrees]  # type: ignore[arg-type]
     points = made(
         (0, 1, 3.0 / 0.02, 1.0 / 0.02), (1, view, 2.0 / degrees[view], 1.0 / degrees[view]), (0, 0, 300.0, 100.0),
         lonlatalt=[[3.0, 1.0, 10.0], [2.0, 1.09, 10.0]],
@@ -402,7 +402,7 @@ def test_each_image_is_asked_for_its_own_observations(view, far) -> None:
 
 
 def test_where_a_pixel_has_no_size_the_reach_is_a_kilometre() -> None:
-    views = [replace(flat()[0], sensor=Plain(0.01, size=np.nan))]
+    views = [replace(flat()[0], sensor=Plain(0.01, size=np.nan))]  # type: ignore[arg-type]
     assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.008, 10.0]), 6.0, views) == []
     assert told(made((0, 0, 0.0, 0.0), lonlatalt=[0.0, 0.010, 10.0]), 6.0, views) != []
 

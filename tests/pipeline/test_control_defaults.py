@@ -60,6 +60,7 @@ def test_altitudes_that_are_all_the_same_are_a_default(level: float, adjusted, t
     with pytest.raises(ReservationError) as caught:  # which has the result
         adjusted(VIEWS, written(tmp_path / "g.csv", lambda _: level), tmp_path, check=True)
     found = caught.value.result
+    assert isinstance(found, AdjustResult)
     said = " ".join([found.record.headline, *found.record.reasons])
     assert str(caught.value) == said.replace("--dem", "dem")  # keywords
     assert found.record.status == "look"

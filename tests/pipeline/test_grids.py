@@ -437,7 +437,7 @@ def test_with_grids_a_camera_that_no_rpc_holds_is_no_failure(block, tmp_path):
 @pytest.fixture(scope="module")
 def gridded(block, tmp_path_factory) -> Path:
     """The folder of a run with grids; nothing is written there."""
-    folder = tmp_path_factory.mktemp("gridded") / "a"
+    folder: Path = tmp_path_factory.mktemp("gridded") / "a"
     adjust(block[0], folder, RunOptions(matches=block[1], matches_only=True, grids=True))
     return folder
 

@@ -98,13 +98,14 @@ def test_a_terrain_counts_from_what_the_options_say_and_every_reference_is_looke
     where = Affine(0.001, 0, 5.3, 0, -0.001, 43.3)
     dem = str(write_dem(tmp_path / "d.tif", "EPSG:4326", np.full((200, 200), 200.0, np.float32), transform=where))
     geoid = str(write_geoid(tmp_path / "g.gtx", 40.0))
-    for given, height in (({"geoid": geoid}, 240.0), ({"heights": "ellipsoidal"}, 200.0)):
-        found = side_inputs(RunOptions(dem=dem, **given), views(1))
+    above_it, above_none = RunOptions(dem=dem, geoid=geoid), RunOptions(dem=dem, heights="ellipsoidal")
+    for options, height in ((above_it, 240.0), (above_none, 200.0)):
+        found = side_inputs(options, views(1))
         assert found is not None
         assert found(5.4, 43.2) == pytest.approx(height)
     (tmp_path / "r.tif").write_bytes(b"no image")
     with pytest.raises(ImageError, match=r"r\.tif"):
-        side_inputs(RunOptions(dem=dem, reference=(dem, str(tmp_path / "r.tif")), heights="ellipsoidal"), views(1))
+        side_inputs(replace(above_none, reference=(dem, str(tmp_path / "r.tif"))), views(1))
 
 
 def test_heights_count_within_the_images_and_some_way_around_them(tmp_path) -> None:

@@ -200,7 +200,7 @@ def test_zeros_and_pixels_that_are_no_numbers_are_the_same_whatever_their_sign(t
     given = []
     for number, sign in enumerate((1.0, -1.0)):
         shown = pixels_of().astype(np.float32)
-        shown[:, :2] = np.copysign(np.float32([0.0, np.nan]), sign)
+        shown[:, :2] = np.copysign(np.array([0.0, np.nan], np.float32), sign)
         given.append(placed(tmp_path, "ab"[number], shown, number))
     refused(given, "same pixels")
 
