@@ -14,7 +14,6 @@ from barpc.base.keywords import PathLike
 from barpc.base.manifest import SUMS
 from barpc.base.safe_io import plain_path
 from barpc.base.verb_options import ExportOptions
-from barpc.export.colmap import colmap, image_links
 from barpc.export.files import FileContents, asp, cars, points, s2p, satnerf, stac
 from barpc.export.light import dated
 from barpc.export.shots import Scene, read_scene, relative_link
@@ -25,8 +24,21 @@ __all__ = ["TARGETS", "export_run"]
 logger = logging.getLogger(__name__)
 _DEFAULTS = ExportOptions()
 
+
+def _for_trainers(scene: Scene, out: Path, how: ExportOptions) -> FileContents:
+    from barpc.export.colmap import colmap  # pinholes, which only this target needs
+
+    return colmap(scene, out, how)
+
+
 TARGETS: dict[str, Callable[[Scene, Path, ExportOptions], FileContents]] = {
-    make.__name__: make for make in (satnerf, colmap, s2p, cars, asp, stac, points)
+    "satnerf": satnerf,
+    "colmap": _for_trainers,
+    "s2p": s2p,
+    "cars": cars,
+    "asp": asp,
+    "stac": stac,
+    "points": points,
 }
 """Tool -> the files made for it, by name, of a scene, the folder where they will lie, and options."""
 
@@ -37,7 +49,11 @@ def export_run(folder: PathLike, target: str, out: PathLike, how: ExportOptions 
     scene = _checked_scene(folder, target, out, how)
     files = TARGETS[target](scene, out.absolute(), how)
     inputs = [Path(shot.file) for shot in scene.shots if "\0" not in shot.file]
-    links = image_links(scene) if how.exact else {}
+    links = {}
+    if how.exact:
+        from barpc.export.colmap import image_links
+
+        links = image_links(scene)
     content = {shot.file: one.sha256 for shot in scene.shots if (one := shot.run.inputs.get(shot.entry.path))}
     known = {name: content[image] for name, image in links.items() if image in content}
     with Workspace(out, overwrite=how.overwrite, keep=inputs, names=[*files, SUMS]) as workspace:

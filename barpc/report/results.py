@@ -54,7 +54,7 @@ def by_altimetry(found: Adjustment) -> bool:
 
 
 def adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield what an adjustment found: residuals, terms, the position, what an earlier run says."""
+    """Yield the sentences of an adjustment: residuals, terms, the position, an earlier run."""
     assert run.adjustment is not None
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
     gauge, gcps = run.adjustment.gauge, run.gcps
@@ -204,7 +204,7 @@ def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
 
 
 def checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield what a check found: the residuals of the cameras as delivered."""
+    """Yield the sentences of a check: the residuals of the cameras as delivered."""
     rmse = median([view.rmse_before for view in views])
     if np.isfinite(rmse):
         yield (
@@ -218,6 +218,6 @@ def checked_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def matched_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield the counts of a match."""
+    """Yield the sentences of a match: its counts."""
     counts = counted(len(views), "image"), counted(len(run.tracks), "observation")
     yield f"{counted(run.tracks.num_points, 'tie point')} of {counts[0]}, {counts[1]}."

@@ -18,6 +18,7 @@ from barpc.base.options import RunOptions
 from barpc.cli import COMMANDS
 from barpc.report.summary import published_schema
 from tests.docs.pages import DOCS, PRESENT, ROOT, blocks, flags
+from tests.scenes.__main__ import command as draw_scene
 
 GENERAL = {"--help", "--version", "--quiet", "--verbose", "--debug", "--json"}
 """Flags of every verb."""
@@ -45,7 +46,8 @@ def other_flags() -> set[str]:
     """Flags that scripts of the repository declare."""
     sources = [path.read_text(encoding="utf-8") for folder in SCRIPTS for path in folder.rglob("*.py")]
     sources += [(ROOT / ".ci" / "nightly").read_text(encoding="utf-8")] if (ROOT / ".ci").exists() else []
-    return OTHERS | set(re.findall(r"(?:add_argument|click\.option)\(\s*\"(--[a-z-]+)\"", "\n".join(sources)))
+    of_scenes = {flag for one in draw_scene.params for flag in one.opts}
+    return OTHERS | of_scenes | set(re.findall(r"add_argument\(\s*\"(--[a-z-]+)\"", "\n".join(sources)))
 
 
 def unknown_flags(code: str) -> set[str]:

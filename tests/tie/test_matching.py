@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from barpc.tie import TieOptions
-from barpc.tie.matchers import matching
+from barpc.tie.matchers import pair_search
 from barpc.tie.matchers.features import join_keypoints
 from barpc.tie.matchers.matcher import NO_MATCHES, Matches, Prediction
 from barpc.tie.matchers.pair_search import PairSearch, _latest
@@ -89,9 +89,9 @@ def search(in_table) -> Callable[..., PairSearch]:
 
 def test_a_matcher_without_keypoints_has_its_frame_at_the_middles_of_the_tiles_that_both_share(search, monkeypatch):
     asked: list[Any] = []
-    monkeypatch.setattr(matching, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
+    monkeypatch.setattr(pair_search, "shared_tiles", lambda *_: [[(0, 0, 100, 50), (100, 20, 60, 40)]])
     monkeypatch.setattr(
-        matching, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
+        pair_search, "epipolar_segments", lambda a, b, points: asked.append(points) or SimpleNamespace(axis=None)
     )
     search(SimpleNamespace(detects=False))
     assert [points.tolist() for points in asked] == [[[50.0, 25.0], [130.0, 40.0]]]
