@@ -1,4 +1,4 @@
-"""Ground points and altimetry of a run, held against its cameras."""
+"""Ground points and altimetry of a run: files are read, and their points checked against the cameras."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from barpc.sensor.geometry import footprint, ground_sample_distance
 from barpc.sensor.triangulation import triangulate
 from barpc.tie.pairing.overlaps import reach_of
 
-IMAGE_MARGIN = 1.5  # px beyond the centres of the outermost pixels that a matcher may still mean
-_MAX_CAMERA_ERROR = 1000.0  # m: ten times what delivered cameras are wrong by where they are bad
-_ALT_REACH = 500.0  # m beyond a camera's altitudes: a geoid is 100 m, and ranges miss relief by some hundred
+IMAGE_MARGIN = 1.5  # px beyond the centres of the outermost pixels that points of a matcher may lie
+_MAX_CAMERA_ERROR = 1000.0  # m: ten times the error of poor cameras as delivered
+_ALT_REACH = 500.0  # m beyond a camera's altitude range: 100 of geoid height, and some hundred of relief that it misses
 _LEAST_FOR_UNIT, _LEAST_MISFIT = 3, 3.0
-"""Points in several images, and metres that altitudes scatter by, that tell the unit."""
+"""Least number of points in several images, and least scatter of altitudes [m], to suspect another unit."""
 _MISTAKES = {
     "longitude and latitude are exchanged: GeoJSON and image tags give longitude first, .gcp files latitude, and a CSV "
     "names its columns": ((1, 0), (1, 1)),
@@ -38,7 +38,7 @@ _MISTAKES = {
         (-1, -1),
     ),
 }
-"""What people do to coordinates -> the columns that longitude and latitude are taken from, and their signs."""
+"""Mistake in coordinates -> columns that hold longitude and latitude, then the pairs of signs to try."""
 
 
 def load_gcps(
@@ -46,8 +46,8 @@ def load_gcps(
 ) -> GroundPoints | None:
     """Return the ground points of several files, one after the other; None without files.
 
-    Points that cannot be where they are said to be, images that are no views, and files that cannot be read are an
-    InputError, or with `keep_going` left out and named in `left_out`. Altitudes that are not known come from `dem`.
+    InputError for implausible points, names of images that are not in the run, and files that cannot be read. With
+    `keep_going` these are left out instead and listed in `left_out`. Missing altitudes are taken from `dem`.
     """
     frame = ControlReference(options.gcp_crs, options.geoid, options.heights, tuple(paths))
     parts = [_load_control(path, views, options, dem, frame) for path in paths]
@@ -88,10 +88,10 @@ def _load_control(
 def _gcps_with_altitudes(
     points: GroundPoints, views: Sequence[View], options: RunOptions, dem: Dem | None
 ) -> tuple[GroundPoints, list[str]]:
-    """Return the points with altitudes of a DEM where theirs are 0, which tools write for unknown ones; and remarks on
-    those without either.
+    """Return the points, missing altitudes (0, as programs write for unknown ones) taken from a DEM, and remarks.
 
-    These constrain the images horizontally only: in height, the middle and range of the cameras' altitudes are assumed.
+    Points without a height of the DEM constrain the images horizontally only: they get the middle of the cameras'
+    altitude ranges, and a sigma that leaves their mean as uncertain as these.
     """
     unknown = points.lonlatalt[:, 2] == 0.0
     if not unknown.any():
@@ -104,7 +104,7 @@ def _gcps_with_altitudes(
         known[unknown] = np.isfinite(height)
         ground[known, 2] = height[np.isfinite(height)]
         given = options.adjust.dem_bias_sigma or (KNOWN_BIAS if dem.known else DEM_BIAS)
-        # what all heights of a DEM are wrong by does not average
+        # the error common to all n heights does not average out: times sqrt(n), the mean keeps it
         sigma[known, 2] = np.hypot(options.adjust.dem_sigma, given * np.sqrt(max(known.sum(), 1)))
         points = replace(points, said=(*points.said, f"{what}: the DEM's are taken for {known.sum()} of them"))
         unknown &= ~known
@@ -116,7 +116,7 @@ def _gcps_with_altitudes(
 
 
 def _with_height_above_dem(dem: Dem | None, points: GroundPoints, options: RunOptions) -> GroundPoints:
-    """Return the points with their median height above a DEM of known vertical datum."""
+    """Return the points, `datums` with their median height above a DEM of known datum: evidence on their own."""
     ground = points.lonlatalt[points.lonlatalt[:, 2] != 0.0]
     if dem is None or not dem.known or not points.datums:
         return points
@@ -130,7 +130,7 @@ def _with_height_above_dem(dem: Dem | None, points: GroundPoints, options: RunOp
 
 
 def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> Iterator[tuple[BoolArray, str]]:
-    """Yield the points (G,) that cannot be meant, and why; the first reason counts. `search` (M,): `reach_of` [px]."""
+    """Yield masks of implausible points (G,), and why; the first reason counts. `search` (M,): camera errors [px]."""
     low, high = np.array([view.alt_range for view in views])[points.view].T
     alt = points.lonlatalt[points.point, 2]
     shown, pixel = _image_positions(points, views, np.clip(alt, low, high))
@@ -161,13 +161,13 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
 
 
 def _beyond(points: GroundPoints, views: Sequence[View], xy: Array) -> BoolArray:
-    """Return which places (M, 2) [px] of the observations lie outside their images."""
+    """Return the mask (M,) of observations whose positions `xy` (M, 2) [px] are outside their images."""
     size = np.array([view.size for view in views])[points.view]
     return np.asarray(((xy < -IMAGE_MARGIN) | (xy > size - 1 + IMAGE_MARGIN)).any(axis=1))
 
 
 def _gcp_pixels(points: GroundPoints, views: Sequence[View]) -> Array:
-    """Return where the cameras of the observations show their points (M, 2) [px], altitudes within their ranges."""
+    """Return the projected points of the observations (M, 2) [px], their altitudes clipped to the cameras' ranges."""
     ground, xy = points.lonlatalt[points.point].copy(), np.empty_like(points.xy)
     for v in np.unique(points.view):
         rows = points.view == v
@@ -177,7 +177,7 @@ def _gcp_pixels(points: GroundPoints, views: Sequence[View]) -> Array:
 
 
 def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:
-    """Return how the altitudes of points seen in several images fit these in another unit; empty where they do not."""
+    """Return the message that triangulated points show another unit of the altitudes; empty if they do not."""
     several = np.bincount(points.point, minlength=len(points.names)) > 1
     if several.sum() < _LEAST_FOR_UNIT:
         return ""
@@ -202,12 +202,12 @@ def _in_another_unit(points: GroundPoints, views: Sequence[View]) -> str:
 
 
 def _any(points: GroundPoints, observed: BoolArray) -> BoolArray:
-    """Return the points (G,) for which a condition holds in any of their observations (M,)."""
+    """Return the mask of points (G,) with a condition `observed` (M,) true in any of their observations."""
     return np.bincount(points.point, observed, minlength=len(points.names)) > 0
 
 
 def _image_positions(points: GroundPoints, views: Sequence[View], alt: Array) -> tuple[Array, Array]:
-    """Return where each image shows a point (M, 3) at altitudes (M,) [m], and the pixel size there (M,) [m]."""
+    """Return the observations localized at altitudes `alt` (M,) [m]: lon, lat, alt (M, 3), and pixel size (M,) [m]."""
     ground, pixel = np.empty((len(alt), 3)), np.empty(len(alt))
     for v in np.unique(points.view):
         rows = points.view == v
@@ -217,14 +217,14 @@ def _image_positions(points: GroundPoints, views: Sequence[View], alt: Array) ->
 
 
 def _distance(points: GroundPoints, shown: Array, columns: tuple[int, int], signs: tuple[int, int]) -> Array:
-    """Return the metres (M,) from where images show points to where these are said to be, taken from `columns`."""
+    """Return the distances (M,) [m] from localized positions `shown` to those given, lon and lat from `columns`."""
     level = points.lonlatalt[points.point][:, columns] * signs
     given = np.column_stack([level, shown[:, 2]])
     return np.asarray(np.linalg.norm(ecef_from_ground(given) - ecef_from_ground(shown), axis=1))
 
 
 def load_altimetry(paths: Sequence[str], views: Sequence[View], heights: str | None = None) -> Altimetry | None:
-    """Return the heights of several files in the images, one after the other; None without files.
+    """Return the altimetry of several files, one after the other, as far as images cover it; None without files.
 
     InputError for a file that cannot be read or has no height in the images.
     """
@@ -244,7 +244,7 @@ def _heights_of(path: str, views: Sequence[View], heights: str | None) -> Altime
 
 
 def _within_bounds(lonlatalt: Array, views: Sequence[View]) -> BoolArray:
-    """Return the places (n, 3) within the ground bounds of any image, or near them."""
+    """Return the mask of places (n, 3) in the ground bounds of any image, with a margin for camera errors."""
     found = np.zeros(len(lonlatalt), dtype=bool)
     for view in views:
         ring = footprint(view.sensor, view.size, view.altitude)

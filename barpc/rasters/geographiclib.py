@@ -1,7 +1,7 @@
-"""Geoid grids of GeographicLib (.pgm), with the methods of a dataset.
+"""Geoid grids of GeographicLib (.pgm), read like a dataset of rasterio.
 
-16-bit numbers from the north pole down, from Greenwich on, one a node; comments of the header state an offset and a
-scale: height of the geoid [m] = offset + scale * number.
+A grid has a 16-bit number per node, in rows from the north pole southwards that run from Greenwich eastwards. Comments
+in the header state an offset and a scale: height of the geoid [m] = offset + scale * number.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _PGM_HEADER = re.compile(rb"P5\s++((?:#[^\n]*+\n\s*+)*+)(\d{1,6})\s++(\d{1,6})\s
 
 @dataclass(frozen=True)
 class Pgm:
-    """An open grid with the methods of a dataset for `barpc.rasters.dem`, under rasterio's names."""
+    """An open grid with those attributes and methods of a dataset of rasterio that `barpc.rasters.dem` uses."""
 
     file: BinaryIO
-    start: int  # of the numbers [bytes]
+    start: int  # position of the first number in the file [bytes]
     shape: tuple[int, int]
     offsets: tuple[float]
     scales: tuple[float]
@@ -39,7 +39,7 @@ class Pgm:
 
     @property
     def transform(self) -> Affine:
-        """From col, row to lon, lat [deg], nodes at the centres of cells."""
+        """Affine map from col, row to lon, lat [deg]; nodes are the centres of cells."""
         rows, cols = self.shape
         east, south = 360.0 / cols, 180.0 / (rows - 1)
         return Affine(east, 0.0, -east / 2, 0.0, -south, 90.0 + south / 2)
@@ -50,7 +50,7 @@ class Pgm:
         return BoundingBox(*array_bounds(*self.shape, self.transform))
 
     def read(self, _band: int, window: Window, masked: bool) -> Any:
-        """Read the numbers of a window, of its rows alone: a grid of one arc minute has half a gigabyte."""
+        """Return the numbers of a window. Only its rows are read: a grid of one arc minute has half a gigabyte."""
         (top, bottom), columns = window.toranges()[0], slice(*window.toranges()[1])
         self.file.seek(self.start + 2 * top * self.shape[1])
         numbers = np.frombuffer(self.file.read(2 * (bottom - top) * self.shape[1]), dtype=">u2")
@@ -59,7 +59,7 @@ class Pgm:
 
 @contextmanager
 def open_pgm(path: PathOrUrl) -> Iterator[Pgm]:
-    """Open a geoid grid; InputError where it is none of GeographicLib's."""
+    """Open a geoid grid; InputError if it is not in GeographicLib's format."""
     with opened(path, GRID) as file:
         found = _PGM_HEADER.match(file.read(65536))
         if found is None:

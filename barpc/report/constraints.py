@@ -24,13 +24,14 @@ _GCP_WORDS = {
     "rejected": ("{} rejected, as the others contradict {}", "Check coordinates, axes and image positions"),
     "contradicts": ("{} used, with residuals above 4 standard deviations", "Check coordinates and stated accuracies"),
 }
+"""Status of GCPs -> sentence about their number, advice."""
 
 
 _CHECK_DEM = "Check its heights, their datum, and the cameras."
 
 
 def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> Iterator[str]:
-    """Yield the effect of ground control; `known`: the uncertainty of the scene's position, as a clause."""
+    """Yield whether GCPs are used, agree and are checked; `known`: clause on the uncertainty of the scene."""
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
     held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
     with_points = f"With {counted(held, 'GCP')}" if held else "Without ground control"
@@ -43,7 +44,7 @@ def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[V
         yield f"{with_points}, {scale:.0f} times less accurate than stated, {known}."
     else:
         yield f"The {counted(held, 'GCP')} in use do not agree: the uncertainty of the scene's position is unknown."
-    # rejected ones have checked them
+    # a rejected GCP shows that the others are checked
     if held == is_seen.sum() > 0 and tested is not None and tested.agrees and not tested.checked:
         yield f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show."
     alone = np.unique(gcps.view)
@@ -52,7 +53,7 @@ def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[V
 
 
 def reference_lines(run: Run) -> Iterator[str]:
-    """Yield the matches with a reference and the offsets of the delivered cameras."""
+    """Yield the number of matches with a reference, and the offsets of the delivered cameras from it."""
     found = run.reference
     if found is None or found.control is None:
         return
@@ -110,7 +111,7 @@ def control_reasons(names: Sequence[str], tested: ControlTest) -> Iterator[str]:
 
 
 def reference_reasons(run: Run, stated: float) -> Iterator[str]:
-    """Yield reservations on the reference: refused, distorted, or on heights less accurate than `stated` [m]."""
+    """Yield reservations on the reference: not used, distorted, or its DEM less accurate than `stated` [m]."""
     found = run.reference
     if found is None:
         return
@@ -139,7 +140,7 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
     terrain, options = adjustment.terrain, adjustment.options
     if terrain is None or not terrain.shows:
         return
-    by_reference = bool(adjustment.reference_inlier.any())  # which stands on it: no tie point does
+    by_reference = bool(adjustment.reference_inlier.any())  # its points have heights of the DEM
     if not terrain.total:
         yield from ["The DEM constrains nothing: there are no tie points."] * (not by_reference)
         return
@@ -160,7 +161,7 @@ def dem_lines(adjustment: Adjustment) -> Iterator[str]:
 
 
 def deformation_reasons(adjustment: Adjustment) -> Iterator[str]:
-    """Yield the reservation on control that asks for another shape of an image than tie points do."""
+    """Yield the reservation on control that would deform an image while its tie points do not require this."""
     if (one := adjustment.deformed) is not None:
         control = listed([CONTROL_WORDS[kind] for kind in one.control])
         yield (
@@ -202,5 +203,5 @@ def dem_reasons(adjustment: Adjustment) -> Iterator[str]:
 
 
 def lengths(values: Iterable[float]) -> str:
-    """Return lengths in readable units."""
+    """Return lengths [m] as text in readable units."""
     return ", ".join(map(metres, values))

@@ -21,18 +21,18 @@ from barpc.report.summary.views import ViewEntry
 from barpc.report.summary.words import NAMED, counted, enu, median, metres, two_digits
 
 PRIOR_WIDENED = 2.0  # Cameras less accurate than stated by more than this factor need review
-_DETECTORS = 3  # displaced parts of the columns of an image from which they have one sentence
-_SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # causes whose sentence says how many were rejected
-_SAY_WHERE = "rejected", "place"  # causes whose sentence says where in the image
+_LEAST_DETECTORS = 3  # least displaced column ranges of an image that one sentence summarises
+_SAY_REJECTED = "contradicted", "rejected", "wrong_matches"  # reservations whose sentence gives the share rejected
+_SAY_WHERE = "rejected", "place"  # reservations whose sentence names the region of the image
 
 
 def common_scale(found: Adjustment) -> float:
-    """Return by how much the standard deviations of all cameras were widened."""
+    """Return the factor on the prior standard deviations of all cameras: the smallest, as single ones may have more."""
     return float(np.min(found.prior.scale)) if len(found.prior.scale) else 1.0
 
 
 def unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], *, matter: bool) -> Iterator[str]:
-    """Yield the worst region of each image: of those above `LEAST_MOVED`, or of the images without such a region."""
+    """Yield the worst region of each image: if `matter`, where it exceeds `LEAST_MOVED`, else where it does not."""
     said = {view.name for view in views if view.cause in _SAY_WHERE}
     worst: dict[str, tuple[bool, str]] = {}
     regions: list[tuple[LeftEntry | HeldOutEntry, str]] = [
@@ -40,7 +40,7 @@ def unmet_places(run: Run, adjustment: Adjustment, views: Sequence[ViewEntry], *
         for one in left_entries(adjustment)
         if (what := inconsistency(one))
     ]
-    # what was solved with may agree with what it bent
+    # used tie points may agree with a distortion that they caused, check tie points do not
     regions += [(one, f"{one.sentence}.") for one in held_out_places(run.met_worse, adjustment.names)]
     for region, sentence in sorted(regions, key=lambda row: not matters(row[0])):
         worst.setdefault(region.image, (matters(region), sentence))
@@ -54,7 +54,7 @@ def by_altimetry(found: Adjustment) -> bool:
 
 
 def adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
-    """Yield the sentences of an adjustment: residuals, terms, the position, an earlier run."""
+    """Yield the sentences of an adjustment: residuals, position, model terms, an earlier run, control."""
     assert run.adjustment is not None
     before, after = (median([getattr(view, key) for view in views]) for key in ("rmse_before", "rmse_after"))
     gauge, gcps = run.adjustment.gauge, run.gcps
@@ -66,7 +66,7 @@ def adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
         yield "There are no tie points: control alone constrains the cameras."
     if len(run.tracks) or gcps is not None:
         yield f"The adjustment moved the scene by {enu(gauge.shift)}."
-    yield from _known_lines(run, run.adjustment, views)
+    yield from _position_lines(run, run.adjustment, views)
     unsaid = [view for view in views if view.lost > MANY_REJECTED and view.cause not in _SAY_REJECTED]
     if many := [view.name for view in unsaid if anywhere(view, run)]:
         # errors in one image reject tie points of the others, too
@@ -94,12 +94,12 @@ def adjusted_lines(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
 
 
 def _explanation_sentences(found: Adjustment) -> Iterator[str]:
-    """Yield the sentences of explanations of the residuals; one for three or more displaced detectors of an image."""
+    """Yield a sentence per explanation of the residuals; one for `_LEAST_DETECTORS` or more detectors of an image."""
     rows = [one for one in explanations(found) if one.name != FOREIGN_CAMERA]
     detectors = [one for one in rows if (one.name, one.axis) == ("step", AXES[0]) and not one.candidates]
     for one in rows:
         alike = [each for each in detectors if each.image == one.image]
-        if len(alike) < _DETECTORS or all(one is not each for each in alike):
+        if len(alike) < _LEAST_DETECTORS or all(one is not each for each in alike):
             yield one.sentence
         elif one is alike[0]:
             edges = sorted(each.first for each in alike if each.first)
@@ -112,7 +112,7 @@ def _explanation_sentences(found: Adjustment) -> Iterator[str]:
 
 
 def _unseen_lines(found: Adjustment) -> Iterator[str]:
-    """Yield the displacement of rows or columns with the largest error of heights that nothing would have shown."""
+    """Yield the undetectable displacement of rows or columns that causes the largest height error."""
     unseen = found.unseen
     if unseen is None or unseen.shown is not None:
         return
@@ -140,7 +140,7 @@ def _pointing_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> 
 
 
 def _added_lines(added: Added, num: int) -> Iterator[str]:
-    """Yield the images added, and the changes that they ask of the cameras of the earlier run."""
+    """Yield the number of images added to an earlier run, and the changes of its cameras that they require."""
     new = counted(num - added.met, "image")
     old = counted(added.images, "image")
     yield f"{new} added to the {old} of {added.run}; {added.met} of these have new tie points."
@@ -161,7 +161,7 @@ def _added_lines(added: Added, num: int) -> Iterator[str]:
 
 
 def lines_of_earlier(added: Added | None) -> Iterator[str]:
-    """Yield the contradiction between new images and cameras of an earlier run that were held."""
+    """Yield the contradiction between new images and the fixed cameras of an earlier run."""
     if added is not None and added.contradicted is not None:
         name, held, free = added.contradicted
         yield (
@@ -170,31 +170,32 @@ def lines_of_earlier(added: Added | None) -> Iterator[str]:
         )
 
 
-def _is_placed(run: Run, found: Adjustment) -> bool:
-    """Whether altimetry, a reference or cameras that are held constrain the scene's position."""
+def _is_position_given(run: Run, found: Adjustment) -> bool:
+    """Whether altimetry, a reference or fixed cameras constrain the scene's position."""
     return bool(by_altimetry(found) or (run.reference and run.reference.control) or run.known or found.options.fixed)
 
 
 def by_cameras_alone(run: Run, found: Adjustment) -> bool:
     """Whether nothing but the accuracies of the cameras constrains the scene's position."""
     by_terrain = found.terrain is not None and bool(found.terrain.shows and found.terrain.held)
-    return run.gcps is None and not by_terrain and not _is_placed(run, found)
+    return run.gcps is None and not by_terrain and not _is_position_given(run, found)
 
 
-def _known_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
+def _position_lines(run: Run, found: Adjustment, views: Sequence[ViewEntry]) -> Iterator[str]:
     """Yield the uncertainty of the scene's position, and its source."""
     known = f"the scene's position is uncertain by {lengths(found.gauge.sigma)} (east, north, up; 1 sigma)"
     if run.gcps is not None:
         yield from held_lines(found.control, run.gcps, views, known)
     elif by_cameras_alone(run, found):
         yield f"Without ground control, {known}."
-    elif _is_placed(run, found):
+    elif _is_position_given(run, found):
         yield f"{known[0].upper()}{known[1:]}."
     else:
         yield f"With the DEM, {known}."
 
 
 def _residual_sentence(rms: tuple[Array, Array], num: int) -> str:
+    """Return the sentence on RMS residuals of check points: (2,) in the images [px], (3,) on the ground [m]."""
     image, ground = rms
     points = counted(num, "check point")
     if not np.isfinite(image).all():

@@ -1,4 +1,4 @@
-"""Matches linked to tracks, and tracks evenly thinned."""
+"""Link matches to tracks, and thin tracks evenly."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from barpc.tie.pairing.area import Area
 from barpc.tie.pairing.overlaps import Pair
 
 NEEDED = 4
-"""Tracks of a pair: across the epipolar lines they are a shift and three that could contradict it."""
-_FULL_CELL = 4
-"""Tracks of a cell where an image of full cells holds the number wanted."""
+"""Least tracks of a pair: across the epipolar lines one determines a shift, and three can contradict it."""
+_MEAN_PER_CELL = 4
+"""Mean observations per cell of an image with the number wanted: it determines the size of cells."""
 
 
-_QUOTAS = (1, 2, _FULL_CELL, 8, 16)
-"""Tracks that a cell takes, round by round: from one on, or long tracks, which fill cells of all their views, would
-leave none for the borders that fewer views see."""
+_QUOTAS = (1, 2, _MEAN_PER_CELL, 8, 16)
+"""Observations allowed in a cell, round by round. With a first quota above one, long tracks, which are taken first and
+fill cells of all their views, would leave none for borders that fewer views see."""
 
 
 def tracks_inside(views: Sequence[View], tracks: Tracks, area: Area | None) -> Tracks:
-    """Return the tracks with ground points in an area (None: all); TiePointError where there is none."""
+    """Return the tracks with ground points in an area (None: all tracks); TiePointError if there are none."""
     if area is None or not len(tracks):
         return tracks
     cameras = [view.sensor for view in views]
@@ -46,7 +46,7 @@ def require_tracks(
     reports: Sequence[PairReport],
     joined: Sequence[int] = (),
 ) -> None:
-    """Raise as `require_matches`, for the pairs that keep `NEEDED` tracks or more."""
+    """Raise the errors of `require_matches`; pairs with fewer than `NEEDED` tracks count as not matched."""
     left, counts = [], pair_counts(tracks)
     for pair, report in zip(pairs, reports, strict=True):
         common = counts.get(pair.views, 0)
@@ -59,7 +59,7 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
     """Link matches of pairs into tracks by shared points; tracks with two points of a view are rejected.
 
     The order of the pairs does not matter: tracks are ordered by their first observation. An observation's sigma is
-    that of the best match it took part in.
+    that of its most accurate match.
     """
     if not any(len(m) for m in matches):
         return Tracks(*(np.empty(0, np.int64),) * 2, np.empty((0, 2)), np.empty(0))
@@ -71,11 +71,11 @@ def link(pairs: Sequence[tuple[int, int]], matches: Sequence[Matches]) -> Tracks
     label = connected_labels(len(points), node.reshape(-1, 2))
     best = np.lexsort((sigma, node))
     once = best[np.unique(node[best], return_index=True)[1]]
-    return _clean(view[once], label[node[once]], xy[once], sigma[once])
+    return _ordered_tracks(view[once], label[node[once]], xy[once], sigma[once])
 
 
-def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
-    """Return the rows grouped by track and sorted by view; tracks with two points of one view dropped."""
+def _ordered_tracks(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
+    """Return tracks in order of their first observations, rows by view; those with two points of a view are dropped."""
     order = np.lexsort((view, label))
     view, label, xy, sigma = view[order], label[order], xy[order], sigma[order]
     twice = (np.diff(view) == 0) & (np.diff(label) == 0)
@@ -90,14 +90,14 @@ def _clean(view: IntArray, label: IntArray, xy: Array, sigma: Array) -> Tracks:
 
 
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
-    """Thin tracks evenly: long and accurate ones first, about `most` observations in an image.
+    """Thin tracks evenly over the images: long and accurate ones first, at most `most` observations in an image.
 
-    `sizes` are those (width, height) of the images. A track is taken where a cell of one of its views is not full yet.
+    `sizes` (width, height) of the images [px]. A track is taken if its cell in any of its views is not full.
     """
     count = np.bincount(tracks.view, minlength=len(sizes))
     if not len(tracks) or (count <= most).all():
         return tracks
-    side = np.sqrt([_FULL_CELL * width * height / most for width, height in sizes])
+    side = np.sqrt([_MEAN_PER_CELL * width * height / most for width, height in sizes])
     columns, rows = (np.array(sizes) / side[:, None]).astype(np.int64).T + 2
     first_cell = np.concatenate([[0], np.cumsum(columns * rows)])
     col, row = np.floor((tracks.xy + 0.5) / side[tracks.view][:, None]).astype(np.int64).clip(0).T
@@ -107,7 +107,7 @@ def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], most: int) -> Tracks:
 
 
 def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_views: int) -> BoolArray:
-    """Return the mask of tracks that are taken, greedily, in rounds of growing quota where images have empty parts."""
+    """Return the mask of tracks taken: greedily, in rounds of growing quota per cell. `cell`: of each observation."""
     starts = np.searchsorted(tracks.point, np.arange(tracks.num_points + 1))
     worst = np.maximum.reduceat(tracks.sigma, starts[:-1])
     # Knuth's multiplicative hash: an order without direction among equals
@@ -134,7 +134,7 @@ def _fill_cells(tracks: Tracks, cell: list[int], num_cells: int, most: int, num_
 
 
 def pair_counts(tracks: Tracks) -> dict[tuple[int, int], int]:
-    """Count the tracks that pairs of views, ascending, have in common; only pairs that have any."""
+    """Return the number of common tracks of each pair of views, ascending, that has any."""
     (first, second), num = row_pairs(tracks.point), int(tracks.view.max(initial=0)) + 1
     keys, counts = np.unique(tracks.view[first] * num + tracks.view[second], return_counts=True)
     return {divmod(key, num): count for key, count in zip(keys.tolist(), counts.tolist(), strict=True)}

@@ -1,4 +1,4 @@
-"""The passes of a matcher over one pair of views: blind ones for the cameras' relative error, then narrow bands."""
+"""Search for matches of a pair of views: blind passes for the cameras' relative error, then narrow bands."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from barpc.tie.pixels import tiles
 MATCHERS: dict[str, type[Matcher]] = {"guided": Guided, STRUCTURE: GradientStructure, FINE_STRUCTURE: FineStructure}
 """Name -> matcher."""
 BAND_HALFWIDTH = 3.0
-"""Half the width of the band about the corrected epipolar line, at most [px]."""
+"""Largest half width of the band about the corrected epipolar line [px]."""
 _PASSES = ((20.0, 1500), (80.0, 2000), (float("inf"), 3000))
-"""Blind passes: half width [px] (the last: `search`), points of A that are tried."""
+"""Blind passes: half width of the band [px] (at most `PairSearch.reach`), number of points of A to try."""
 _SIGNIFICANT_PEAK = 6.0  # standard deviations
 _NEIGHBOURS_COUNTED, _SPARSE_FACTOR = 3, 2.0
-"""A point has no matches near where so many lie so many times as far from it as from another."""
-BOTH = Pair((0, 1), 1.0, 0.0)  # two views, of which nothing else is asked
-LOOSE_FALSE_SHARE = 0.05  # share of false matches among those that a search goes on from
-Ends = tuple[View, View]
+"""A point is isolated if its third-nearest match is farther than twice the median of that distance for matches."""
+BOTH = Pair((0, 1), 1.0, 0.0)  # the two views of a search as a pair; overlap and angle are not used
+LOOSE_FALSE_SHARE = 0.05  # largest share of false matches among those that the next pass starts from
+Ends = tuple[View, View]  # images A and B of a pair
 
 
 def matcher_named(name: str) -> type[Matcher] | Hook:
-    """Return the matcher that an option names: a row of `MATCHERS`, or the function or class `module:name`."""
+    """Return the matcher named by an option: an entry of `MATCHERS`, or the function or class `module:name`."""
     return MATCHERS[name] if name in MATCHERS else hooked(name)
 
 
@@ -56,15 +56,15 @@ def _latest(where: Callable[[Array], EpipolarSegments]) -> Callable[[Array], Epi
 
 
 class _Peak(NamedTuple):
-    """Result of a blind pass."""
+    """Result of a blind pass: the peak of the errors across the epipolar lines."""
 
     prediction: Prediction  # where to search next
-    share: float  # of the matches that stand in the peak
-    significance: float  # in standard deviations beyond chance
+    share: float  # of the matches that lie in the peak
+    significance: float  # excess over the number expected by chance [standard deviations]
 
 
 class PairSearch:
-    """The passes over one pair of views."""
+    """Search for matches of one pair of views, pass by pass."""
 
     def __init__(self, views: Ends, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> None:
         self._views, self._options = views, options
@@ -73,7 +73,7 @@ class PairSearch:
         points = keypoints[0].xy
         boxes = [tiles(view.size, options.tile) for view in views]
         self._windows = cache(lambda: shared_tiles(views, [BOTH], boxes, options.search)[0])
-        if not self._matcher.detects:
+        if not self._matcher.detects:  # without keypoints, tiles have the predictions
             middles = [(col + 0.5 * width, row + 0.5 * height) for col, row, width, height in self._windows()]
             points = np.array(middles).reshape(-1, 2)
         self._points, first = points, epipolar_segments(*views, points)
@@ -81,17 +81,17 @@ class PairSearch:
         self._frame = _latest(lambda xy: first if xy is points else epipolar_segments(*views, xy, first.axis))
 
     def loosened(self, keypoints: tuple[Keypoints, Keypoints], options: TieOptions) -> PairSearch:
-        """Return the search with looser thresholds; its predictions stay the same."""
+        """Return the search with the looser thresholds of `options`, without repeating blind passes in vain."""
         other = copy(self)
         if self._matcher.detects:
             other._matcher = matcher_named(options.matcher)(options, keypoints)
-        if self._options.ratio < CLEAR_RATIO:  # nor which matches are clear, but for this
+        if self._options.ratio < CLEAR_RATIO:  # blind passes use smaller ratios only: others have the same result
             vars(other).pop("offset", None)
         return other
 
     @property
     def patch(self) -> float:
-        """Side of the template about a point [px]; 0: none."""
+        """Side of the template about a point [px]; 0 without templates."""
         return float(getattr(self._matcher, "patch", 0.0))
 
     def errors(self, found: Matches) -> Array:
@@ -109,15 +109,15 @@ class PairSearch:
         return found.select(np.sort(np.unique(pixels, axis=0, return_index=True)[1]))
 
     def trusted(self, prediction: Prediction, false_share: float) -> tuple[Matches, float]:
-        """Return the matches among which at most a share is false, and that share as estimated.
+        """Return the best matches of which at most `false_share` are false, and the estimated share.
 
-        Bands shifted to either side hold no true match: theirs tell how many false ones come with a score. (The
-        "decoys" of peptide identification: Elias and Gygi 2007.)
+        Bands shifted to either side (decoys) hold no true match: the number of their matches up to a score estimates
+        that of false ones (target-decoy search: Elias and Gygi 2007).
         """
         found, aside = self._distinct(prediction), 2.0 * prediction.half_width + INVALID_MARGIN
         decoys = [np.sort(self._distinct(replace(prediction, aside=side * aside)).score) for side in (-1.0, 1.0)]
         few, many = np.sort([np.searchsorted(decoy, found.score, side="right") for decoy in decoys], axis=0)
-        # some in one of them are true where an image's rows lie as far off
+        # displaced rows may have true matches in one decoy band: if the counts differ, the lower is used
         false = np.where(many - few > SURELY * np.sqrt(few + many), few, 0.5 * (few + many))
         share = false / np.arange(1, len(found) + 1)
         good = np.flatnonzero(share <= false_share)
@@ -126,12 +126,13 @@ class PairSearch:
 
     @cached_property
     def offset(self) -> Prediction | None:
-        """Corrected prediction by blind passes of growing width for the cameras' relative error.
+        """Prediction corrected for the cameras' relative error; None without a significant peak.
 
-        The first pass in whose peak most matches stand decides, else the one with the most significant peak, if any.
+        Blind passes of growing width find it: the first with `SUFFICIENT_SHARE` of the matches in its peak, else the
+        one with the most significant peak.
         """
         best: _Peak | None = None
-        passes = {min(width, self.reach): probes for width, probes in _PASSES}  # of one width the last
+        passes = {min(width, self.reach): probes for width, probes in _PASSES}  # of equal widths the last: most probes
         for width, probes in passes.items():
             found = self._blind(width, probes)
             if found is not None and (best is None or found.significance > best.significance):
@@ -141,9 +142,9 @@ class PairSearch:
         return None if best is None else best.prediction
 
     def further(self, tight: Matches) -> Matches:
-        """Return the matches with those at other offsets: of points without matches near them, where these show a peak.
+        """Return the matches and those of isolated points at other offsets, if a blind pass shows any.
 
-        From some row on, or column, an image may lie elsewhere.
+        Rows or columns of an image beyond some edge may be displaced against the rest.
         """
         for _ in range(STEPS if self._matcher.detects and len(tight) >= FEW else 0):
             peak = self._beside(tight)
@@ -155,7 +156,7 @@ class PairSearch:
         return tight
 
     def _beside(self, found: Matches) -> _Peak | None:
-        """Return a blind pass over the points without matches near them, about the offset of the matches found."""
+        """Return the peak of a blind pass over the isolated points, in a band that includes the offset of `found`."""
         places, offset = found.xy[:, 0], float(np.median(self.errors(found)[:, 1]))
         tree = kd_tree(places)
 
@@ -172,11 +173,11 @@ class PairSearch:
         )
 
     def _blind(self, width: float, probes: int, bare: Callable[[Array], BoolArray] | None = None) -> _Peak | None:
-        """Return the peak of the errors across the epipolar lines of some points, if it is significant.
+        """Return the peak of the errors across the epipolar lines of `probes` points, if it is significant.
 
-        Only of points that are `bare` where that is given.
+        `bare`: mask of points (N, 2) [px] of A to use; None: all.
         """
-        every = self._frame  # and not this search: what it found would keep it, and it what it found
+        every = self._frame  # closures must not refer to self: its cached `offset` would refer back to it
 
         def everywhere(xy: Array) -> EpipolarSegments:
             where = every(xy)
@@ -189,7 +190,7 @@ class PairSearch:
             return None
         errors = self.errors(found)
         values = np.sort(errors[:, 1])
-        window = 2 * DUPLICATE_DISTANCE  # px, in which true matches fall
+        window = 2 * DUPLICATE_DISTANCE  # px: extent of true matches
         count = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
         start, most = int(count.argmax()), int(count.max())
         middle = float(np.median(values[start : start + most]))
@@ -210,7 +211,7 @@ class PairSearch:
         return _Peak(self._predicted(corrected, BAND_HALFWIDTH), most / len(values), float(significance))
 
     def local(self, tight: Matches) -> Prediction:
-        """Return the corrected prediction: each point in a band about its neighbours' places by the matches so far."""
+        """Return the prediction corrected by the errors of the nearest matches: a narrow band for each point."""
         errors, places = self.errors(tight), tight.xy[:, 0]
         tree, every = kd_tree(places), self._frame
         slope, spread = gradient(places, errors[:, 1]), robust_spread(coherent(places, errors[:, 1])[1])
