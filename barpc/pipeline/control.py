@@ -148,7 +148,7 @@ def _implausible(points: GroundPoints, views: Sequence[View], search: Array) -> 
         yield mistaken, what
         far &= ~mistaken
     yield outside, "outside its image, and inside it by the camera: col from the left, row from the top, in its pixels"
-    most = np.max(away[far[points.point]], initial=0.0) / 1e3
+    most = np.nanmax(away[far[points.point]], initial=0.0) / 1e3
     yield far, f"as far as {most:,.0f} km from where the images show it, by their cameras"
     wild = (alt < low - _ALT_REACH) | (alt > high + _ALT_REACH)
     ends = f"{np.min(low, initial=np.inf):.0f} to {np.max(high, initial=-np.inf):.0f} m"

@@ -33,7 +33,8 @@ _CHECK_DEM = "Check its heights, their datum, and the cameras."
 def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[ViewEntry], known: str) -> Iterator[str]:
     """Yield whether GCPs are used, agree and are checked; `known`: clause on the uncertainty of the scene."""
     is_seen = np.bincount(gcps.point, minlength=len(gcps.names)) > 0
-    held = int(np.count_nonzero(is_seen if tested is None else is_seen & tested.used))
+    is_used = is_seen if tested is None else is_seen & tested.used
+    held = int(np.count_nonzero(is_used))
     with_points = f"With {counted(held, 'GCP')}" if held else "Without ground control"
     scale = 1.0 if tested is None or tested.agreed is None else tested.agreed.scale
     if tested is None or tested.agrees:
@@ -47,9 +48,10 @@ def held_lines(tested: ControlTest | None, gcps: GroundPoints, views: Sequence[V
     # a rejected GCP shows that the others are checked
     if held == is_seen.sum() > 0 and tested is not None and tested.agrees and not tested.checked:
         yield f"Nothing checks {'it' if held == 1 else 'them'}: an error in a GCP would not show."
-    alone = np.unique(gcps.view)
-    if held and len(alone) == 1 and len(views) > 1:
-        yield f"Only {views[alone[0]].name} shows GCPs: they do not constrain the scene along its lines of sight."
+    alone = np.unique(gcps.view[is_used[gcps.point]])
+    if len(alone) == 1 and len(views) > 1:
+        name = views[alone[0]].name
+        yield f"Only {name} shows GCPs that are used: they do not constrain the scene along its lines of sight."
 
 
 def reference_lines(run: Run) -> Iterator[str]:

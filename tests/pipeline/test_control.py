@@ -343,6 +343,9 @@ def test_a_point_is_told_by_any_of_its_images_and_how_far_is_the_farthest_of_the
     ((which, what),) = [row for row in told(points) if row[1].startswith("as far as")]
     assert which == [0, 2]
     assert what == "as far as 219 km from where the images show it, by their cameras"
+    sky = made((0, 0, np.nan, 10e2), (0, 1, 30e2, 10e2), (1, 1, 33e2, 10e2), lonlatalt=[[33, 10, 100], [31, 10, 100]])
+    ((_, what),) = [row for row in told(sky) if row[1].startswith("as far as")]
+    assert what.startswith("as far as 329 km")  # one of the observations sees no ground
 
 
 def test_beyond_a_pole_there_is_no_ground_however_near_it_would_be() -> None:

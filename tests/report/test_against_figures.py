@@ -82,7 +82,9 @@ SENTENCES |= {
         [*map(int, counts)] == [s.tracks.num_tracks, len(s.views), s.tracks.num_observations]
     ),
     r"The adjustment moved the scene by ([-+].* up)\.": lambda s, shift: shift == enu(s.scene.shift_enu_m),
-    r"Only (\S+) shows GCPs: .*": lambda s, image: {name for gcp in s.gcps for name in gcp.images} == {image},
+    r"Only (\S+) shows GCPs that are used: .*": lambda s, image: (
+        {name for gcp in s.gcps if gcp.status in ("used", "contradicts") for name in gcp.images} == {image}
+    ),
     r"By the reference, the delivered cameras are off by (.*)\.": lambda s, offsets: (
         offsets
         == listed([f"{np.hypot(*v.offset_en_m):.1f} m ({v.name})" for v in s.reference.views if v.offset_en_m], 5)

@@ -552,8 +552,13 @@ def test_control_is_said_to_hold_the_place_and_when_nothing_checks_it():
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), fits=False))
     assert "Nothing checks" not in lines(control(redundancy=np.full(3, 0.05), used=np.zeros(3, bool)))
     alone = gcps(view=(1, 1, 1), point=(0, 1, 2))
-    assert "Only B shows GCPs: they do not constrain the scene along its lines of sight." in lines(control(), alone)
+    assert "Only B shows GCPs that are used: they do not constrain the scene along its lines of sight." in lines(
+        control(), alone
+    )
     assert "Only" not in lines(control())
+    of_both = gcps(view=(1, 1, 0), point=(0, 1, 2))
+    assert "Only B shows GCPs" in lines(control(used=np.array([True, True, False])), of_both)
+    assert "Only" not in lines(control(), of_both)
     assert "Only" not in lines(control(used=np.zeros(3, bool)), alone)
     assert "Only" not in lines(control(), alone, [a_view("B")])
 
