@@ -22,7 +22,6 @@ from barpc.report.runfiles import read_summary
 from barpc.report.summary import Summary
 from barpc.report.summary.views import ViewEntry
 from barpc.rpcio import format_for, hidden_by
-from barpc.rpcio.formats import CORRECTION, GRID_SUFFIX
 from barpc.sensor.sampler import Sample
 
 if TYPE_CHECKING:
@@ -169,13 +168,8 @@ def _verify_cameras(summary: Summary, folder: Path) -> Iterator[Proved]:
     for view in summary.views:
         for name, consumers in view.outputs.items():
             stated = consumers.get("barpc")
-            if view.certified and isinstance(stated, float) and _holds_camera(folder / name):
+            if view.certified and isinstance(stated, float) and format_for(name) is not None:
                 yield _camera(view, folder / name, name, stated)
-
-
-def _holds_camera(path: Path) -> bool:
-    """Return whether a file holds the camera of its whole image."""
-    return path.name.endswith((GRID_SUFFIX, CORRECTION)) or format_for(path) is not None
 
 
 def _camera(view: ViewEntry, path: Path, name: str, stated: float) -> Proved:
