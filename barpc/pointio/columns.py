@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from barpc.base.errors import InputError
 from barpc.base.geodesy import DEFAULT, INFERRED, STATED
+from barpc.pointio.tables import Names, header_of, normalised_word
 from barpc.rasters.vertical import ELLIPSOID, UNKNOWN, Vertical, metres_of
-
-Names = Mapping[str, Sequence[str]]
-"""Quantity -> names that files give its column."""
-
 
 COLUMNS: Names = {
     "lon": ("lon", "long", "longitude", "lng"),
@@ -20,22 +17,6 @@ COLUMNS: Names = {
     "col": ("col", "column", "samp", "sample", "pixel", "px", "pixel_x", "image_x"),
     "row": ("row", "line", "py", "pixel_y", "image_y"),
 }
-
-
-_XY_PAIRS = ("lon", "lat"), ("col", "row")
-"""Meanings of columns x and y: the pair for which the file has no other columns."""
-
-
-def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
-    """Return the column index of each quantity that a header gives a listed name, or x and y (`_XY_PAIRS`)."""
-    lower = [_normalised_word(word) for word in words]
-    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
-    found = {key: places[0] for key, places in hits.items() if places}
-    left = [pair for pair in _XY_PAIRS if set(pair) <= set(names) and not set(pair) <= set(found)]
-    if len(left) == 1:
-        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
-        found = {**either, **found}
-    return found
 
 
 def guessed(words: Sequence[str], known: Names) -> tuple[dict[str, int], list[str], Vertical]:
@@ -81,15 +62,10 @@ def vertical_of_column(word: str) -> Vertical:
 def like_altitudes(words: Sequence[str]) -> list[str]:
     """Return the normalised names that match the pattern of an altitude, for tables without a listed one."""
     return [
-        _normalised_word(word)
+        normalised_word(word)
         for word in words
         if _PATTERNS["alt"].fullmatch(bare := _bare_name(word)) and not _NO_COORDINATE.match(bare)
     ]
-
-
-def _normalised_word(word: str) -> str:
-    """Return a name in lower case, with _ for blanks, without anything in brackets."""
-    return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
 
 
 def _unit_of(word: str) -> tuple[str, str, float]:

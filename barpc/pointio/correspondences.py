@@ -17,10 +17,10 @@ from barpc.base.frozen import load_npz
 from barpc.base.geodesy import ALTITUDES, INFERRED, MAX_COORDINATE, Array, is_lonlat
 from barpc.base.remote import PathOrUrl
 from barpc.base.safe_io import BYTES_PER_NUMBER, TABLE, Kind, read_head
-from barpc.pointio.columns import COLUMNS, Names, header_of, like_altitudes, vertical_of_column
+from barpc.pointio.columns import COLUMNS, like_altitudes, vertical_of_column
 from barpc.pointio.gcp_formats import read_geojson, read_tags
 from barpc.pointio.gcp_tables import GcpTable
-from barpc.pointio.tables import GROUND_SIGMA, first_words, numbers_of, read_table
+from barpc.pointio.tables import GROUND_SIGMA, Names, first_words, header_of, numbers_of, read_table
 from barpc.rasters.dem import HeightGrid, datum_of
 from barpc.rasters.raster import GRID_TAG, driver_of, open_raster, transformed
 from barpc.rasters.vertical import ELLIPSOID, Vertical, geoid_of

@@ -12,8 +12,8 @@ import numpy as np
 
 from barpc.base.errors import InputError, listed
 from barpc.base.geodesy import Array
-from barpc.pointio.columns import Names, guessed
-from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA, Texts, lacking
+from barpc.pointio.columns import guessed
+from barpc.pointio.tables import GROUND_SIGMA, IMAGE_SIGMA, Names, Texts, lacking
 from barpc.rasters.vertical import Vertical
 
 GCP_NAMES: Names = {

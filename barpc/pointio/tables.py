@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -19,12 +19,33 @@ import numpy as np
 from barpc.base.errors import BarpcError, InputError, plain
 from barpc.base.geodesy import Array
 from barpc.base.safe_io import MAX_DIGITS, TABLE, opened_text
-from barpc.pointio.columns import Names, header_of
 from barpc.pointio.names import from_cell
 from barpc.scene import IntArray
 
 GROUND_SIGMA = 1.0  # standard deviation [m] along an axis of a GCP, or of the place of a height, whose file states none
 IMAGE_SIGMA = 0.5  # standard deviation of each image coordinate [px], of GCPs and tie points whose file states none
+
+Names = Mapping[str, Sequence[str]]
+"""Quantity -> names that files give its column."""
+_XY_PAIRS = ("lon", "lat"), ("col", "row")
+"""Meanings of columns x and y: the pair for which the file has no other columns."""
+
+
+def header_of(words: Sequence[str], names: Names) -> dict[str, int]:
+    """Return the column index of each quantity that a header gives a listed name, or x and y (`_XY_PAIRS`)."""
+    lower = [normalised_word(word) for word in words]
+    hits = {key: [lower.index(a) for a in aliases if a in lower] for key, aliases in names.items()}
+    found = {key: places[0] for key, places in hits.items() if places}
+    left = [pair for pair in _XY_PAIRS if set(pair) <= set(names) and not set(pair) <= set(found)]
+    if len(left) == 1:
+        either = {key: lower.index(word) for key, word in zip(left[0], "xy", strict=True) if word in lower}
+        found = {**either, **found}
+    return found
+
+
+def normalised_word(word: str) -> str:
+    """Return a name in lower case, with _ for blanks, without anything in brackets."""
+    return re.sub(r"[\[(].*", "", word.lower()).strip().replace(" ", "_")
 
 
 _DEGREES = re.compile(
