@@ -275,7 +275,7 @@ def _ground_reasons(run: Run, views: Sequence[ViewEntry]) -> Iterator[str]:
                 yield f"The altimetry was not used: {heights.why_not} {check}"
             elif heights.spread > max(NOISE_LIMIT * heights.expected, median([view.gsd_m for view in views])):
                 ratio = two_digits(heights.spread / heights.expected)
-                yield f"The altimetry scatters about the surface by {ratio} times what it states {check}"
+                yield f"The altimetry scatters about the surface by {ratio} times what is expected {check}"
         if gcps is not None and adjustment.control is not None:
             yield from control_reasons(gcps.names, adjustment.control)
     for points in (gcps, run.check_points):

@@ -70,7 +70,7 @@ def _ends(seconds: int):
         signal.signal(signal.SIGALRM, before)
 
 
-def _is_sound(order: Dissection, pairs: np.ndarray, use: np.ndarray) -> None:
+def assert_sound(order: Dissection, pairs: np.ndarray, use: np.ndarray) -> None:
     """Views in use are ordered, each once; those parted are tied through borders only, which belong to later fronts."""
     every = np.concatenate([front.pivots for front in order.fronts])
     assert sorted(every) == np.flatnonzero(use).tolist()
@@ -96,7 +96,7 @@ def test_graphs_of_every_kind_are_cut_soundly(kind) -> None:
     place = rng.normal(0, 110, (n, 2)) if kind != "star" else np.zeros((n, 2))
     with _ends(60):
         order = dissect(pairs, place, np.ones(n, dtype=bool))
-    _is_sound(order, pairs, np.ones(n, dtype=bool))
+    assert_sound(order, pairs, np.ones(n, dtype=bool))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.6])
@@ -104,7 +104,7 @@ def test_who_is_parted_is_tied_through_the_border_only(turn) -> None:
     pairs, place = sites_of(12, 9)
     place = place @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
     use = np.random.default_rng(1).random(len(place)) < 0.95
-    _is_sound(dissect(pairs, place, use), pairs, use)
+    assert_sound(dissect(pairs, place, use), pairs, use)
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def printed(run: Path) -> dict[str, float]:
     return {view["name"]: view["rmse_after"] for view in json.loads((run / "summary.json").read_text())["views"]}
 
 
-def agree(found: Mapping[str, float], said: Mapping[str, float]) -> None:
+def assert_agreement(found: Mapping[str, float], said: Mapping[str, float]) -> None:
     assert len(found) >= 2
     assert found.keys() == said.keys()
     for name, value in found.items():
@@ -84,7 +84,7 @@ def grown(shared_data, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("of", ["triplet", "ventoux", "ventoux_biased"])
 def test_adjust(of: str, request: pytest.FixtureRequest) -> None:
     _, run = request.getfixturevalue(of)
-    agree(residuals(run, {name: by_gdal(run / f"{name}.vrt") for name in printed(run)}), printed(run))
+    assert_agreement(residuals(run, {name: by_gdal(run / f"{name}.vrt") for name in printed(run)}), printed(run))
 
 
 def test_adjust_by_rpcm(triplet: tuple[AdjustResult, Path]) -> None:
@@ -93,7 +93,7 @@ def test_adjust_by_rpcm(triplet: tuple[AdjustResult, Path]) -> None:
     for name in printed(triplet[1]):
         model = rpcm.rpc_from_rpc_file(str(triplet[1] / f"{name}_RPC.TXT"))
         readers[name] = lambda ground, model=model: np.column_stack(model.projection(*ground.T))
-    agree(residuals(triplet[1], readers), printed(triplet[1]))
+    assert_agreement(residuals(triplet[1], readers), printed(triplet[1]))
 
 
 def test_add_to(grown: Path) -> None:
@@ -101,7 +101,9 @@ def test_add_to(grown: Path) -> None:
     folders = grown, grown.parent / "january"
     where = {name: next(one for one in folders if (one / f"{name}.vrt").exists()) for name in printed(grown)}
     assert len(set(where.values())) == 2
-    agree(residuals(grown, {name: by_gdal(folder / f"{name}.vrt") for name, folder in where.items()}), printed(grown))
+    assert_agreement(
+        residuals(grown, {name: by_gdal(folder / f"{name}.vrt") for name, folder in where.items()}), printed(grown)
+    )
 
 
 @pytest.mark.landing(2)
@@ -126,7 +128,7 @@ def test_check_of_what_lies_on_disk_prints_what_the_run_printed(of: str, request
 def test_convert(triplet: tuple[AdjustResult, Path], tmp_path: Path) -> None:
     _, run = triplet
     barpc.convert([run / f"{name}.vrt" for name in printed(run)], out_dir=tmp_path, images="copy", rpc_format="rpb")
-    agree(residuals(run, {name: by_gdal(tmp_path / f"{name}.tif") for name in printed(run)}), printed(run))
+    assert_agreement(residuals(run, {name: by_gdal(tmp_path / f"{name}.tif") for name in printed(run)}), printed(run))
 
 
 @pytest.mark.filterwarnings("ignore::barpc.base.errors.Remark")
@@ -146,7 +148,7 @@ def test_move(triplet: tuple[AdjustResult, Path], tmp_path: Path) -> None:
         return np.column_stack(to_ecef.transform(*there.T, direction="INVERSE"))
 
     readers = {name: by_gdal(tmp_path / f"{name}.vrt") for name in printed(run)}
-    agree(residuals(run, readers, moved), printed(run))
+    assert_agreement(residuals(run, readers, moved), printed(run))
     assert min(residuals(run, readers).values()) > 1.0
 
 
@@ -160,7 +162,7 @@ def test_export(of: str, request: pytest.FixtureRequest, tmp_path: Path) -> None
     for image in json.loads((tmp_path / "s2p/config.json").read_text())["images"]:
         model = rpcm.RPCModel(image["rpc"], dict_format="rpcm")
         readers[Path(image["img"]).stem] = lambda ground, model=model: np.column_stack(model.projection(*ground.T))
-    agree(residuals(run, readers), printed(run))
+    assert_agreement(residuals(run, readers), printed(run))
 
 
 def test_fit(shared_data: Path, tmp_path: Path) -> None:

@@ -242,7 +242,7 @@ def _(s, agree, near_, spread, expected, motion):
     assert share(s, "altimetry", parts=("up",))[0] > 0.5
 
 
-@says(rf"The altimetry scatters about the surface by {NUM} times what it states \((\d+) of (\d+) on .*\)\. Check .*")
+@says(rf"The altimetry scatters about the surface by {NUM} times what is expected \((\d+) of (\d+) on .*\)\. Check .*")
 def _(s, ratio, agree, near_):
     one = s.scene.altimetry
     assert ratio == two_digits(one.spread_m / one.expected_m)

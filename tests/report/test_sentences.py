@@ -740,7 +740,7 @@ def test_altimetry_says_how_well_it_agrees_or_why_it_holds_nothing():
         (0.51, 0.1, "by 5.1 times"),
     ],
 )
-def test_altimetry_that_scatters_by_a_pixel_and_more_than_it_states_needs_a_look(spread, expected, words):
+def test_altimetry_that_scatters_by_a_pixel_and_more_than_expected_needs_a_look(spread, expected, words):
     test = SimpleNamespace(agree=70, near=80, spread=spread, expected=expected, motion=np.ones(3), given=90, why_not="")
     reasons = block_verdict(run_of(adjusted(altimetry=test)), views())["reasons"]
     assert len(reasons) == bool(words)
